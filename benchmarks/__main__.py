@@ -1,0 +1,5 @@
+import sys
+
+from jaxfilters.benchmarks.harness import main
+
+sys.exit(main())

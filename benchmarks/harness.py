@@ -1,0 +1,75 @@
+"""`jaxfilters bench SCENARIO`, also `python -m jaxfilters.benchmarks SCENARIO`.
+
+A scenario is a module in `scenarios/` with `run(*, quick, seed, out) -> dict[str, Metric]`; its docstring says what it
+measures, and its file name, with dashes, is its name.
+"""
+
+import argparse
+import ast
+import importlib
+import json
+import pkgutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxfilters.benchmarks import metrics, scenarios
+from jaxfilters.trackers.shell.devices import use_all_cores
+
+FAILURE = 2
+"""Exit code for wrong arguments, missing packages and files that cannot be written."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one scenario, print its table, write its JSON."""
+    use_all_cores()
+    found = descriptions()
+    options = _parser(found).parse_args(argv)
+    if options.json and not options.json.parent.is_dir():
+        return _fail(f"--json: no folder {options.json.parent}")
+    try:
+        scenario = importlib.import_module(f"{scenarios.__name__}.{options.scenario.replace('-', '_')}")
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("jaxfilters"):
+            raise
+        return _fail(f"{options.scenario} needs {error.name}: pip install 'jaxfilters[bench]'")
+    measured = scenario.run(quick=options.quick, seed=options.seed, out=options.out)
+    print(metrics.table(measured))
+    if options.json:
+        from jaxfilters.benchmarks.environment import environment
+
+        document = metrics.report(options.scenario, measured, environment())
+        options.json.write_text(json.dumps(document, indent=2) + "\n")
+    return 0
+
+
+def descriptions() -> dict[str, str]:
+    """Names of the scenarios and the first lines of their docstrings, read without importing them."""
+    found = {}
+    for folder in scenarios.__path__:
+        for module in pkgutil.iter_modules([folder]):
+            if not module.name.startswith("_"):
+                source = (Path(folder) / f"{module.name}.py").read_text(encoding="utf-8")
+                docstring = ast.get_docstring(ast.parse(source)) or ""
+                found[module.name.replace("_", "-")] = docstring.partition("\n")[0]
+    return dict(sorted(found.items()))
+
+
+def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jaxfilters bench",
+        description="Measure speed and accuracy.",
+        epilog="scenarios:\n" + "\n".join(f"  {name:16} {line}" for name, line in found.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scenario", choices=found, metavar="SCENARIO", help="what to measure, see below")
+    parser.add_argument("--quick", action="store_true", help="fewer seeds and rounds: to see that it runs")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers and the environment there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write the plots of the scenario there")
+    return parser
+
+
+def _fail(message: str) -> int:
+    print(f"jaxfilters bench: error: {message}", file=sys.stderr)
+    return FAILURE

@@ -1,0 +1,1 @@
+"""One file per scenario; each prints a table and returns named metrics."""

@@ -1,0 +1,254 @@
+"""Hand pose from depth: does it pay to carry the velocity of every particle in a Kalman filter?
+
+The plain particle filter on the pose against the Rao-Blackwellized one, without a guide, N = 512, on the paper's data A
+(the pose walks at random) and B (its velocity does) with sensor noise: the comparison of Kajihara and Tanaka, figures
+6, 7 and 10. Once with the improved set-up of the specification, once with the paper's own cost and likelihood
+(`*_paper_cost`). The full run adds, on data B, the other two proposals (`rbpf_paper`, `rbpf_paper_corrected`), a plain
+filter whose noise is as wide as what the Rao-Blackwellized one draws (`pf_wide`), and the tracker with its guide
+(`pf_guided`, `rbpf_guided`). Errors are means after the first ten frames; p-values are those of one-sided paired
+Wilcoxon signed-rank tests over the seeds. A folder given with `--out` receives every run as it finishes, the tables,
+and plots.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxfilters.benchmarks.environment import environment
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.scenarios import _hand_filters as hand
+from jaxfilters.benchmarks.scenarios._accuracy import (
+    LOST,
+    Column,
+    Filtering,
+    Run,
+    Track,
+    append_csv,
+    column,
+    p_value_better,
+    run_all,
+)
+from jaxfilters.benchmarks.scenarios._pf_vs_rbpf_plots import plot_times, plot_tracks
+from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure
+from jaxfilters.filter import Filter
+from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
+from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, START, kinect_v2
+from jaxfilters.proposals import paper, paper_corrected
+from jaxfilters.trackers import hand_depth
+from jaxfilters.typing import AnyKey
+
+NUM_PARTICLES = 512
+COUNTS, QUICK_COUNTS = (64, 128, 256, 512, 1024, 2048), (64, 512)
+ROUNDS, QUICK_ROUNDS = 90, 30
+NUM_SEEDS, QUICK_NUM_SEEDS = 20, 4
+QUICK_NUM_FRAMES = 60
+PAPER_COST = "_paper_cost"
+
+
+def run(
+    *,
+    quick: bool,
+    seed: int,
+    out: Path | None,
+    num_particles: int = NUM_PARTICLES,
+    num_seeds: int | None = None,
+    num_frames: int | None = None,
+) -> dict[str, Metric]:
+    """Measure times, then accuracy; what is not given is as the command line would have it."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    num_seeds = num_seeds or (QUICK_NUM_SEEDS if quick else NUM_SEEDS)
+    num_frames = num_frames or (QUICK_NUM_FRAMES if quick else None)
+    _say(out, _preamble(num_particles, num_seeds, num_frames))
+    times = _measure_times(quick, seed, out)
+    runs = _measure_accuracy(_filters(num_particles, quick), range(seed, seed + num_seeds), num_frames, out)
+    _say(out, _accuracy_table(runs))
+    return time_metrics(times) | accuracy_metrics(runs)
+
+
+def time_metrics(times: dict[int, StepTimes]) -> dict[str, Metric]:
+    """Milliseconds a frame and their ratio, for each number of particles."""
+    metrics = {}
+    for count, measured in times.items():
+        metrics[f"frame_ms_pf_n{count}"] = Metric(_median_ms(measured.pf), "ms", "lower")
+        metrics[f"frame_ms_rbpf_n{count}"] = Metric(_median_ms(measured.rbpf), "ms", "lower")
+        metrics[f"time_ratio_rbpf_over_pf_n{count}"] = Metric(measured.ratio, "", "lower")
+        share = float(np.median(measured.rbpf_predict / measured.rbpf))
+        metrics[f"predict_share_rbpf_n{count}"] = Metric(share, "", "lower")
+    return metrics
+
+
+def accuracy_metrics(runs: list[Run]) -> dict[str, Metric]:
+    """Mean errors, effective sample size and lost runs of every filter on its data, and the paired tests."""
+    metrics = {}
+    for one in _columns(runs):
+        name = _metric_name(one)
+        metrics[f"joint_error_mm_{name}"] = Metric(float(one.of("joint_mm").mean()), "mm", "lower")
+        if one.filter != "frozen":
+            metrics[f"tip_error_mm_{name}"] = Metric(float(one.of("tip_mm").mean()), "mm", "lower")
+            metrics[f"mean_ess_{name}"] = Metric(float(one.of("ess").mean()), "particles", "higher")
+            metrics[f"lost_runs_{name}"] = Metric(float(one.of("lost").sum()), f"of {len(one.runs)}", "lower")
+    for cost in ("", PAPER_COST):
+        for data in "AB":
+            p = _p_value(runs, data, f"rbpf{cost}", f"pf{cost}")
+            metrics[f"p_value_rbpf_better_{data.lower()}{cost}"] = Metric(p, "", "lower")
+    return metrics
+
+
+def _filters(num_particles: int, quick: bool) -> dict[str, dict[str, Filtering]]:
+    both: dict[str, Filtering] = {"frozen": _frozen}
+    for cost, setting in (("", hand.improved()), (PAPER_COST, hand.as_published())):
+        both[f"pf{cost}"] = _filtering(setting, hand.particle_filter(setting, num_particles))
+        both[f"rbpf{cost}"] = _filtering(setting, hand.rao_blackwellized(setting, num_particles))
+    if quick:
+        return {"A": both, "B": both}
+    improved = hand.improved()
+    extra = {
+        f"rbpf_{proposal.__name__}": _filtering(improved, hand.rao_blackwellized(improved, num_particles, proposal))
+        for proposal in (paper, paper_corrected)
+    }
+    wide = hand.particle_filter(improved, num_particles, hand.spread_of_increments(improved))
+    guided = {f"{name}_guided": _guided(name, num_particles) for name in ("pf", "rbpf")}
+    return {"A": both, "B": both | extra | {"pf_wide": _filtering(improved, wide)} | guided}
+
+
+def _filtering(setting: hand.Setting, filter: Filter) -> Filtering:
+    view = hand.View(kinect_v2(), hand_geometry(), setting.segmented)
+    return lambda key, frames: hand.track(filter, key, view, frames)
+
+
+def _guided(name: str, num_particles: int) -> Filtering:
+    """The tracker as users run it, told the size of the hand but not where it starts."""
+    tracker = hand_depth.build(
+        kinect_v2(), hand_depth.HandDepthConfig(filter=name, num_particles=num_particles, scale=1.0)
+    )
+
+    def filtering(key: AnyKey, frames: jax.Array) -> hand.Estimate:
+        state = tracker.start(key, np.asarray(frames[0]))
+        _, found = tracker.advance(state, np.asarray(frames), FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32))
+        return hand.Estimate(*map(jax.numpy.asarray, (found.pose, found.joints, found.ess)))
+
+    return filtering
+
+
+def _frozen(key: AnyKey, frames: jax.Array) -> hand.Estimate:
+    """The pose before the first frame, for ever: the floor."""
+    del key
+    pose = open_palm(jax.numpy.asarray(START, dtype=float))
+    joints = forward_kinematics(pose, hand_geometry()).joints
+    still = hand.Estimate(pose, joints, jax.numpy.full((), jax.numpy.nan))
+    return jax.tree.map(lambda leaf: jax.numpy.broadcast_to(leaf, (len(frames), *leaf.shape)), still)
+
+
+def _measure_times(quick: bool, seed: int, out: Path | None) -> dict[int, StepTimes]:
+    times: dict[int, StepTimes] = {}
+    for count in QUICK_COUNTS if quick else COUNTS:
+        times[count] = measure(count, QUICK_ROUNDS if quick else ROUNDS, seed)
+        _report(_time_row(count, times[count]))
+    _say(out, _time_table(times))
+    if out is not None:
+        plot_times(out / "time_per_frame.png", {n: (_median_ms(t.pf), _median_ms(t.rbpf)) for n, t in times.items()})
+    return times
+
+
+def _measure_accuracy(
+    filters: dict[str, dict[str, Filtering]], seeds: range, num_frames: int | None, out: Path | None
+) -> list[Run]:
+    runs: list[Run] = []
+    begin, drawn = time.monotonic(), set()
+    for new, track in run_all(filters, seeds, num_frames):
+        runs += new
+        if out is not None:
+            append_csv(out / "runs.csv", new)
+            if new[0].data not in drawn:
+                drawn.add(new[0].data)
+                _plot(out, new[0].data, track)
+        errors = "  ".join(f"{one.filter} {one.joint_mm:.1f}" for one in new)
+        _report(f"[{time.monotonic() - begin:5.0f} s] seed {new[0].seed} data {new[0].data}, mm: {errors}")
+    return runs
+
+
+def _plot(out: Path, data: str, track: Track) -> None:
+    for cost in ("", PAPER_COST):
+        estimates = {name: track.estimates[f"{name}{cost}"].pose for name in ("pf", "rbpf")}
+        plot_tracks(out / f"data_{data.lower()}{cost}.png", data, track.truth.poses, estimates)
+
+
+def _columns(runs: list[Run]) -> list[Column]:
+    pairs = dict.fromkeys((run.data, run.filter) for run in runs)
+    return [column(runs, *pair) for pair in sorted(pairs, key=lambda pair: pair[0])]
+
+
+def _metric_name(one: Column) -> str:
+    filter, cost, _ = one.filter.partition(PAPER_COST)
+    return f"{filter}_{one.data.lower()}{cost}"
+
+
+def _p_value(runs: list[Run], data: str, candidate: str, baseline: str) -> float:
+    return p_value_better(*(column(runs, data, name).of("joint_mm") for name in (candidate, baseline)))
+
+
+def _median_ms(seconds: np.ndarray) -> float:
+    return float(1e3 * np.median(seconds))
+
+
+def _preamble(num_particles: int, num_seeds: int, num_frames: int | None) -> str:
+    machine = "  ".join(f"{name} {value}" for name, value in environment().items())
+    return (
+        f"{machine}\n"
+        f"N {num_particles}, {num_seeds} seeds, {num_frames or 150} frames, window {hand.WINDOW}, "
+        f"c_max {1e3 * hand.MAX_ERROR:g} mm\n"
+        f"improved:   union cost, exp(-D/sigma), sigma {1e3 * hand.SIGMA:g} mm tempered to ESS "
+        f"{hand.TEMPERED_SHARE:g} N, soft joint limits, angular velocities damped over {hand.DAMPING_TIME:g} s\n"
+        f"paper cost: rendered pixels, exp(-D^2/2 sigma^2), sigma {1e3 * hand.PAPER_SIGMA:g} mm, nothing else\n"
+    )
+
+
+def _time_table(times: dict[int, StepTimes]) -> str:
+    header = f"{'N':>5} {'PF ms':>8} {'RBPF ms':>8} {'RBPF/PF':>8} {'its predict ms':>15}"
+    return "\n".join([header, *(_time_row(*row) for row in times.items())]) + "\n"
+
+
+def _time_row(count: int, times: StepTimes) -> str:
+    pf, rbpf, predict = map(_median_ms, (times.pf, times.rbpf, times.rbpf_predict))
+    return f"{count:5} {pf:8.2f} {rbpf:8.2f} {times.ratio:8.3f} {predict:15.2f}"
+
+
+_QUANTITIES = ("joint_mm", "tip_mm", "wrist_x_mm", "wrist_y_mm", "wrist_z_mm", "rotation_deg", "angle_deg", "ess")
+
+
+def _accuracy_table(runs: list[Run]) -> str:
+    """One line a filter: means over the seeds, runs above `LOST` mm, p-value of being better than the plain filter."""
+    titles = ("joint", "+-se", "tip", "x", "y", "z", "rot.", "angle", "ess", "lost", "p(<pf)")
+    lines = [
+        f"Mean 3-D errors of joints and tips in mm; RMSE of the wrist in mm, of rotation and angles in degrees; "
+        f"runs above {LOST:g} mm",
+        f"data  {'filter':22}" + "".join(f"{title:>9}" for title in titles),
+    ]
+    for one in _columns(runs):
+        values = [one.of(quantity).mean() for quantity in _QUANTITIES]
+        error = one.of("joint_mm")
+        spread = error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else np.nan
+        baseline = "pf" + (PAPER_COST if PAPER_COST in one.filter else "_guided" if "guided" in one.filter else "")
+        tested = one.filter not in ("frozen", baseline)
+        p = f"{_p_value(runs, one.data, one.filter, baseline):.2g}" if tested else ""
+        cells = [f"{values[0]:.2f}", f"{spread:.2f}", *(f"{value:.2f}" for value in values[1:-1]), f"{values[-1]:.0f}"]
+        cells += [f"{int(one.of('lost').sum())}/{len(one.runs)}", p]
+        lines.append(f"{one.data:5} {one.filter:22}" + "".join(f"{cell:>9}" for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+def _say(out: Path | None, text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+    if out is not None:
+        with (out / "report.txt").open("a", encoding="utf-8") as file:
+            file.write(text + "\n")
+
+
+def _report(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()

@@ -1,0 +1,290 @@
+r"""Rao-Blackwellized particle filter for mixed linear/nonlinear models.
+
+The model is the triangular "model 2" of Schön, Gustafsson and Nordlund 2005, with the nonlinear state on any manifold:
+
+$$x_t = f_n(x_{t-1}) \boxplus (A_n l_{t-1} + w_n),\quad l_t = f_l(x_{t-1}) + A_l l_{t-1} + w_l,\quad
+  y_t \sim p(y_t \mid x_t)\ \text{or}\ y_t = h(x_t) + C l_t + e.$$
+
+Only `x` is sampled. The linear state `l` given the path of `x` is Gaussian: each particle carries its mean, and either
+its own covariance or, where the matrices do not depend on the particle, one that all of them share.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32, PyTree
+
+from jaxfilters import kalman, weights
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.linalg import cholesky, solve_triangular
+from jaxfilters.particle import (
+    ParticleInfo,
+    StandardNormal,
+    check_ensemble,
+    resample,
+    reweight,
+    sample_ensemble,
+    untempered,
+)
+from jaxfilters.proposals import Proposal, exact
+from jaxfilters.resampling import systematic
+from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree
+
+
+class MixedDynamics(NamedTuple):
+    """One step of the model for one particle, about its nonlinear state."""
+
+    f_n: PyTree
+    """Where the nonlinear state goes by itself, a point like `x`."""
+    A_n: Float[Array, "n l"]
+    Q_n: Float[Array, "n n"]
+    f_l: Float[Array, " l"]
+    A_l: Float[Array, "l l"]
+    Q_l: Float[Array, "l l"]
+
+
+class LinearObservation(NamedTuple):
+    """y = h + C l + e with e ~ N(0, R), for one particle."""
+
+    h: Float[Array, " m"]
+    C: Float[Array, "m l"]
+    R: Float[Array, "m m"]
+
+
+class MarginalState(NamedTuple):
+    """Weighted particles of the nonlinear state, each with a Gaussian over the linear one."""
+
+    particles: PyTree
+    """Leaves `(..., N)`."""
+    linear_mean: Float[Array, "l n"]
+    covariance: Float[Array, "..."]
+    """Of the linear state: `(l, l, N)`, or `(l, l)` where all particles share it."""
+    log_weights: Float[Array, " n"]
+    """After an update `logsumexp(log_weights) == 0`."""
+    ancestors: Int32[Array, " n"]
+    noise: Float[Array, "d n"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class RaoBlackwell:
+    """Parameters of a Rao-Blackwellized particle filter."""
+
+    sample_prior: SamplePrior
+    linear_prior: Gaussian
+    dynamics: Callable
+    retract: Callable
+    condition: Callable
+    temper: Temper
+    ess_threshold: float
+    num_particles: int = field(metadata={"static": True})
+    noise: StandardNormal = field(metadata={"static": True})
+    proposal: Proposal = field(metadata={"static": True})
+    scheme: ResamplingScheme = field(metadata={"static": True})
+    covariance_axis: int | None = field(metadata={"static": True})
+    """Ensemble axis of the covariance: -1, or `None` where it is shared."""
+
+
+def add(x: Float[Array, " n"], delta: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Move a point of a vector space."""
+    return x + delta
+
+
+def rao_blackwell(
+    sample_prior: SamplePrior,
+    linear_prior: Gaussian,
+    dynamics: Callable[[PyTree, PyTree], MixedDynamics],
+    log_likelihood: LogLikelihood | None = None,
+    *,
+    num_particles: int,
+    noise_dim: int,
+    observe: Callable[[PyTree], LinearObservation] | None = None,
+    retract: Callable[[PyTree, Array], PyTree] = add,
+    proposal: Proposal = exact,
+    scheme: ResamplingScheme = systematic,
+    ess_threshold: float = 0.5,
+    temper: Temper | None = None,
+) -> Filter:
+    """Rao-Blackwellized particle filter in which every particle has its own covariance.
+
+    Args:
+        sample_prior: `key -> x`, the nonlinear state.
+        linear_prior: Belief about the linear state before the first observation, the same for all particles.
+        dynamics: `(x, control) -> MixedDynamics`.
+        log_likelihood: `(x, y) -> log p(y | x)`, for observations that do not see the linear state.
+        num_particles: Size N of the ensemble.
+        noise_dim: Dimension n of the tangent space of the nonlinear state.
+        observe: `x -> LinearObservation`, for observations that do. Exactly one of the two must be given.
+        retract: `(x, delta) -> x`, how an increment moves the nonlinear state; addition by default.
+        proposal: How the nonlinear state is drawn: `exact` (default), `paper` or `paper_corrected` of
+            `jaxfilters.proposals`.
+        scheme: Resampling scheme.
+        ess_threshold: Resample before a prediction if the effective sample size is below this share of N.
+        temper: Flattens log-likelihoods, e.g. `TemperToShare(0.2)`.
+
+    Raises:
+        ValueError: If an argument is out of range, or not exactly one of `log_likelihood` and `observe` is given.
+    """
+    check_ensemble(num_particles, ess_threshold)
+    return Filter(
+        RaoBlackwell(
+            as_pytree(sample_prior),
+            linear_prior,
+            as_pytree(dynamics),
+            as_pytree(retract),
+            _condition_on(log_likelihood, observe),
+            as_pytree(temper or untempered),
+            float(ess_threshold),
+            num_particles,
+            StandardNormal(noise_dim),
+            proposal,
+            scheme,
+            -1,
+        ),
+        init,
+        _predict,
+        _update,
+    )
+
+
+def rao_blackwell_shared(*args: PyTree, **options: PyTree) -> Filter:
+    """Rao-Blackwellized particle filter whose particles share one covariance; arguments as `rao_blackwell`.
+
+    For models whose matrices `A_n, Q_n, A_l, Q_l, C, R` do not depend on the particle, where every particle would carry
+    the same covariance: one small matrix recursion a frame instead of N. A model that breaks the rule is rejected when
+    it is traced.
+    """
+    own = rao_blackwell(*args, **options)
+    fields = {name: getattr(own.params, name) for name in own.params.__dataclass_fields__}
+    return Filter(RaoBlackwell(**{**fields, "covariance_axis": None}), init, _predict, _update)
+
+
+class Move(NamedTuple):
+    """How one prediction moved the particles: what a proposal needs that looks at the observation and draws again."""
+
+    origin: PyTree
+    """Where the nonlinear state would go by itself, `f_n`."""
+    drift: Float[Array, "d n"]
+    """Mean of its increment, A_n m."""
+    delta: Float[Array, "d n"]
+    """What was drawn beyond the mean."""
+    spread: Float[Array, "..."]
+    """Covariance of the increment given the past, N [26]."""
+    gain: Float[Array, "..."]
+    """What one unit of `delta` adds to the mean of the linear state, A_l K = L [27]."""
+
+
+def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics) -> tuple[Array, Array, Array]:
+    r"""Spread $N$, gain $L$ and next covariance of the linear state, eqs. [26], [27] (corrected) and [29].
+
+    Conditions on $z = A_n l + w_n$ with gain $P A_n^T N^{-1}$, in Joseph form, then propagates through $A_l$: the same
+    as the general recursion of Schön, Gustafsson and Nordlund 2005, without its cancellation.
+    """
+    spread = step.A_n @ covariance @ step.A_n.T + step.Q_n
+    root = cholesky(spread)
+    gain = solve_triangular(root, solve_triangular(root, step.A_n @ covariance), transpose=True).T
+    kept = jnp.eye(gain.shape[0], dtype=gain.dtype) - gain @ step.A_n
+    conditioned = kept @ covariance @ kept.T + gain @ step.Q_n @ gain.T
+    return spread, step.A_l @ gain, step.A_l @ conditioned @ step.A_l.T + step.Q_l
+
+
+def propagate(belief: Gaussian, delta: Float[Array, " n"], step: MixedDynamics) -> Gaussian:
+    r"""Belief about the linear state one step on, given $\delta = z - A_n m$ of the nonlinear one [28], [29]."""
+    _, gain, covariance = condition_on_increment(belief.covariance, step)
+    return Gaussian(step.f_l + step.A_l @ belief.mean + gain @ delta, covariance)
+
+
+def init(model: RaoBlackwell, key: AnyKey) -> MarginalState:
+    """Ensemble drawn from the prior."""
+    prior_key, noise_key = jax.random.split(key)
+    count = model.num_particles
+    prior = model.linear_prior
+    mean = jnp.broadcast_to(prior.mean[:, None], (prior.mean.shape[0], count))
+    covariance = prior.covariance
+    if model.covariance_axis is not None:
+        covariance = jnp.broadcast_to(covariance[..., None], (*covariance.shape, count))
+    return MarginalState(
+        sample_ensemble(prior_key, model.sample_prior, count),
+        mean,
+        covariance,
+        weights.uniform(count),
+        jnp.arange(count, dtype=jnp.int32),
+        model.noise(noise_key, count),
+    )
+
+
+def _predict(model: RaoBlackwell, key: AnyKey, state: MarginalState, control: PyTree) -> MarginalState:
+    return move(model, key, state, control)[0]
+
+
+def move(model: RaoBlackwell, key: AnyKey, state: MarginalState, control: PyTree) -> tuple[MarginalState, Move]:
+    """Predict one step, and say how."""
+    resample_key, noise_key = jax.random.split(key)
+    axis = model.covariance_axis
+    carried = (state.particles, state.linear_mean, None if axis is None else state.covariance)
+    (particles, linear_mean, covariance), log_weights, ancestors = resample(
+        resample_key, carried, state.log_weights, model.scheme, model.ess_threshold
+    )
+    covariance = state.covariance if axis is None else covariance
+    step_axes = MixedDynamics._make((-1, axis, axis, -1, axis, axis))
+    steps = jax.vmap(model.dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
+
+    def advance(step: MixedDynamics, mean: Array, covariance: Array, noise: Array) -> tuple:
+        spread, gain, covariance = condition_on_increment(covariance, step)
+        delta, log_correction = model.proposal(noise, spread, step.Q_n)
+        drift = step.A_n @ mean
+        mean = step.f_l + step.A_l @ mean + gain @ delta
+        x = model.retract(step.f_n, drift + delta)
+        return x, mean, covariance, log_correction, Move(step.f_n, drift, delta, spread, gain)
+
+    particles, linear_mean, covariance, log_correction, moved = jax.vmap(
+        advance, in_axes=(step_axes, -1, axis, -1), out_axes=(-1, -1, axis, -1, Move._make((-1, -1, -1, axis, axis)))
+    )(steps, linear_mean, covariance, state.noise)
+    noise = model.noise(noise_key, model.num_particles)
+    log_weights = log_weights + log_correction
+    return MarginalState(particles, linear_mean, covariance, log_weights, ancestors, noise), moved
+
+
+def _update(
+    model: RaoBlackwell, key: AnyKey, state: MarginalState, observation: PyTree
+) -> tuple[MarginalState, ParticleInfo]:
+    del key
+    return weigh(model, state, observation)
+
+
+def weigh(model: RaoBlackwell, state: MarginalState, observation: PyTree) -> tuple[MarginalState, ParticleInfo]:
+    """Condition every particle's linear state on the observation, and weight it by the evidence of that."""
+
+    def condition(mean: Array, covariance: Array, x: PyTree) -> tuple[Array, Array, Array]:
+        belief, log_likelihood = model.condition(Gaussian(mean, covariance), x, observation)
+        return belief.mean, belief.covariance, log_likelihood
+
+    axis = model.covariance_axis
+    linear_mean, covariance, log_likelihood = jax.vmap(condition, in_axes=(-1, axis, -1), out_axes=(-1, axis, -1))(
+        state.linear_mean, state.covariance, state.particles
+    )
+    log_weights, info = reweight(state.log_weights, log_likelihood, state.ancestors, model.temper)
+    return state._replace(linear_mean=linear_mean, covariance=covariance, log_weights=log_weights), info
+
+
+def _condition_on(log_likelihood: LogLikelihood | None, observe: Callable | None) -> Callable:
+    if log_likelihood is not None and observe is None:
+        return jax.tree_util.Partial(_unseen, as_pytree(log_likelihood))
+    if observe is not None and log_likelihood is None:
+        return jax.tree_util.Partial(_seen, as_pytree(observe))
+    raise ValueError("Exactly one of log_likelihood and observe must be given: whether the linear state is seen.")
+
+
+def _unseen(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTree) -> tuple[Gaussian, Array]:
+    return belief, log_likelihood(x, y)
+
+
+def _seen(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
+    h, C, R = observe(x)
+    belief, info = kalman.joseph.update(belief, y - h, C, R)
+    return belief, info.log_evidence

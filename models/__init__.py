@@ -1,0 +1,1 @@
+"""Geometry, cameras, renderers, observation and motion models."""

@@ -1,0 +1,1 @@
+"""An articulated hand: skeleton, surface, depth likelihood."""

@@ -1,0 +1,112 @@
+"""What a depth camera says about a hand: the part of the frame that is compared, and the log-likelihood of a pose."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfilters.lie import quaternion_normalize, quaternion_to_matrix
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.cost import count_observed, rendered_cost, union_cost
+from jaxfilters.models.hand.limits import limit_log_likelihood
+from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
+from jaxfilters.models.rendering.comparison import DepthTerms, compare_capsules
+
+REACH = 0.14
+"""Radius in metres of the ball about the middle of an average hand that holds it in any pose."""
+FOREARM_BEGINS = 0.0
+"""Metres below the wrist, in the palm's direction of the forearm, from which a reading is arm rather than hand. Where
+the model itself ends: readings beyond it would draw the palm down the arm, frame by frame."""
+
+
+class HandImage(NamedTuple):
+    """A window of a depth frame, with everything but the hand taken out."""
+
+    camera: Pinhole
+    """Of the window."""
+    observed: Float[Array, "rows cols"]
+    """Metres; `inf` is background, NaN says nothing."""
+    observed_count: Int[Array, ""]
+    """Hand pixels among them."""
+
+
+def crop(
+    camera: Pinhole, frame: Float[Array, "rows cols"], center: Float[Array, " 3"], shape: tuple[int, int], stride: int
+) -> tuple[Pinhole, Float[Array, "height width"]]:
+    """The window of `shape` pixels, every `stride`-th of the frame, about the projection of `center` (metres).
+
+    Pixels beyond the border of the frame are NaN. `center` must lie in front of the camera.
+    """
+    rows, cols = shape
+    corner = jnp.round(camera.project(center) - 0.5 * stride * jnp.array([cols - 1, rows - 1]))
+    u = corner[0].astype(int) + stride * jnp.arange(cols)
+    v = corner[1].astype(int) + stride * jnp.arange(rows)
+    inside = ((v >= 0) & (v < frame.shape[0]))[:, None] & ((u >= 0) & (u < frame.shape[1]))
+    pixels = frame.at[v].get(mode="clip").at[:, u].get(mode="clip")
+    return camera.crop(corner, shape, stride), jnp.where(inside, pixels, jnp.nan)
+
+
+def isolate(
+    camera: Pinhole,
+    observed: Float[Array, "rows cols"],
+    pose: Float[Array, " 22"],
+    scale: float | Float[Array, ""] = 1.0,
+) -> Float[Array, "rows cols"]:
+    """The readings near an expected hand; the rest becomes background where it is farther away, else unknown.
+
+    The forearm, which the hand model lacks, is unknown too: comparing it would pull the palm down the arm.
+    """
+    wrist, rotation = pose[:3], quaternion_to_matrix(quaternion_normalize(pose[3:7]))
+    center = hand_center(pose, scale)
+    points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
+    outside = jnp.sum((points - center) ** 2, axis=-1) > (scale * REACH) ** 2
+    behind = observed > center[2] + scale * REACH
+    arm = (points - wrist) @ rotation[:, 1] > scale * FOREARM_BEGINS
+    kept = jnp.where(outside | arm, jnp.nan, observed)
+    return jnp.where(behind, jnp.inf, kept)
+
+
+def hand_image(camera: Pinhole, observed: Float[Array, "rows cols"]) -> HandImage:
+    """An isolated window with its hand pixels counted."""
+    return HandImage(camera, observed, count_observed(observed))
+
+
+def union(terms: DepthTerms, image: HandImage, max_error: float) -> Float[Array, ""]:
+    """Cost over the rendered and the observed hand pixels."""
+    return union_cost(terms, image.observed_count, max_error)
+
+
+def rendered(terms: DepthTerms, image: HandImage, max_error: float) -> Float[Array, ""]:
+    """Cost over the rendered pixels alone, the paper's."""
+    del image
+    return rendered_cost(terms, max_error)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class HandLikelihood:
+    """Log-likelihood of a pose given a `HandImage`: a depth cost in Gibbs form, and soft joint limits."""
+
+    geometry: HandGeometry
+    sigma: Float[Array, ""]
+    """Scale of the cost, metres, positive."""
+    max_error: float = field(metadata={"static": True})
+    """c_max: what a pixel costs at most, metres, positive."""
+    cost_of: Callable[[DepthTerms, HandImage, float], Float[Array, ""]] = field(metadata={"static": True})
+    """`union` or `rendered`."""
+    form: Callable[[Array, Array], Float[Array, ""]] = field(metadata={"static": True})
+    """`gibbs_abs` or `gibbs_sq` of `jaxfilters.models.hand.cost`."""
+
+    def cost(self, pose: Float[Array, " 22"], image: HandImage) -> Float[Array, ""]:
+        """Metres."""
+        capsules = forward_kinematics(pose, self.geometry).capsules
+        terms = compare_capsules(image.camera, capsules, image.observed, self.max_error)
+        return self.cost_of(terms, image, self.max_error)
+
+    def log_likelihood(self, pose: Float[Array, " 22"], image: HandImage) -> Float[Array, ""]:
+        """Up to a constant that is the same for every pose."""
+        return self.form(self.cost(pose, image), self.sigma) + limit_log_likelihood(pose[7:])

@@ -1,0 +1,119 @@
+"""Folding the parts of one pose into one image, each within its window."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfilters.models.rendering.parts import Parts, Surface
+from jaxfilters.models.rendering.windows import Plan, Window
+
+Turn = Callable[..., Array]
+"""`(part, window, start, x, y, image) -> image` with one part drawn in the window that begins at (row, column)."""
+
+
+def over_parts(parts: Parts, plan: Plan | None, shape: tuple[int, ...], turn: Turn, image: Array) -> Array:
+    """`image` after the turn of every part that can be seen; each in the whole image when there is no plan."""
+
+    def with_offsets(part, window, start, image):
+        return turn(part, window, start, *_offsets(start, parts.anchor[part], window), image)
+
+    if plan is None:
+        start = jnp.zeros(2, jnp.int32)
+        count = parts.coefficients.shape[0]
+        return jax.lax.fori_loop(0, count, lambda part, image: with_offsets(part, shape, start, image), image)
+    for index, window in enumerate(plan.sizes):
+
+        def step(place, image, window=window):
+            part = plan.order[place]
+            return with_offsets(part, window, plan.start[part], image)
+
+        image = jax.lax.fori_loop(plan.bounds[index], plan.bounds[index + 1], step, image)
+    return image
+
+
+def nearest_inverse(parts: Parts, plan: Plan | None, surface: Surface, shape: Window) -> Float[Array, "rows cols"]:
+    """Inverse depth of the nearest part at each pixel, 0 for none; not for differentiation."""
+
+    def turn(part, window, start, x, y, nearest):
+        seen, before = surface.inverse_depth(parts.coefficients[part], x, y), cut(nearest, start, window)
+        return put(nearest, jnp.where(seen > before, seen, before), start)
+
+    return over_parts(parts, plan, shape, turn, jnp.zeros(shape, parts.coefficients.dtype))
+
+
+def winning_pieces(
+    parts: Parts, plan: Plan | None, surface: Surface, nearest: Float[Array, "rows cols"]
+) -> Int[Array, "rows cols"]:
+    """Which piece is the nearest at each pixel, counted through all parts; -1 for none.
+
+    A pass of its own: one that keeps depth and index together is ten times slower in XLA.
+    """
+    # The same arithmetic may round differently in another kernel; who wins within that margin does not matter.
+    least = nearest * (1 - 64 * jnp.finfo(nearest.dtype).eps)
+
+    def turn(part, window, start, x, y, winner):
+        limit, winning = cut(least, start, window), cut(winner, start, window)
+        pieces = surface.pieces(parts.coefficients[part], x, y)
+        for index, seen in enumerate(pieces):
+            wins = (seen > 0) & (seen >= limit)
+            winning = jnp.where(wins, (part * len(pieces) + index).astype(jnp.int32), winning)
+        return put(winner, winning, start)
+
+    return over_parts(parts, plan, nearest.shape, turn, jnp.full(nearest.shape, -1, jnp.int32))
+
+
+def smooth_inverse(parts: Parts, surface: Surface, winner: Int[Array, "rows cols"]) -> Float[Array, "rows cols"]:
+    """Inverse depth of the given pieces, 0 for none: exact derivative in the coefficients, with the winners held."""
+    rows = surface.rows(parts.coefficients)
+    # Row and anchor in one table, hence one gather.
+    anchors = jnp.broadcast_to(parts.anchor[:, None], (*rows.shape[:2], 2))
+    table = jnp.concatenate([rows, anchors], axis=-1).reshape(-1, rows.shape[2] + 2)
+    *row, anchor_u, anchor_v = jnp.moveaxis(table[jnp.maximum(winner, 0)], -1, 0)
+    v, u = (jax.lax.broadcasted_iota(table.dtype, winner.shape, axis) for axis in (0, 1))
+    return jnp.where(winner >= 0, surface.smooth(row, u - anchor_u, v - anchor_v), 0.0)
+
+
+def pull_back(
+    parts: Parts,
+    plan: Plan | None,
+    surface: Surface,
+    winner: Int[Array, "rows cols"],
+    cotangent: Float[Array, "rows cols"],
+) -> Float[Array, "k c"]:
+    """The transpose of the derivative of `smooth_inverse`, by sums over windows: scatters are serial on CPUs."""
+    rows, to_coefficients = jax.vjp(surface.rows, parts.coefficients)
+    directions = jnp.eye(rows.shape[2], dtype=rows.dtype)
+
+    def turn(part, window, start, x, y, gradient):
+        seen, weight = cut(winner, start, window), cut(cotangent, start, window)
+
+        def of_piece(piece):
+            index, row = piece
+            slopes = [jax.jvp(lambda r: surface.smooth(r, x, y), (row,), (along,))[1] for along in directions]
+            mine = jnp.where(seen == part * rows.shape[1] + index, weight, 0.0)
+            slopes = jnp.stack([jnp.broadcast_to(slope, window).reshape(-1) for slope in slopes])
+            return jnp.dot(slopes, mine.reshape(-1), precision=jax.lax.Precision.HIGHEST)
+
+        pieces = jnp.arange(rows.shape[1], dtype=jnp.int32), rows[part]
+        return jax.lax.dynamic_update_index_in_dim(gradient, jax.lax.map(of_piece, pieces), part, 0)
+
+    return to_coefficients(over_parts(parts, plan, winner.shape, turn, jnp.zeros_like(rows)))[0]
+
+
+def cut(image: Array, start: Int[Array, " 2"], window: Window) -> Array:
+    """The window of an image that begins at (row, column) `start`."""
+    # A window as large as the image has one place; slices at batched places would be gathers on accelerators.
+    return image if window == image.shape else jax.lax.dynamic_slice(image, start, window)
+
+
+def put(image: Array, piece: Array, start: Int[Array, " 2"]) -> Array:
+    """The image with one window replaced."""
+    return piece if piece.shape == image.shape else jax.lax.dynamic_update_slice(image, piece, start)
+
+
+def _offsets(start, anchor, window):
+    """Offsets (x, y) from the anchor of a window's columns and rows."""
+    y, x = ((start[axis] - anchor[1 - axis]) + jax.lax.broadcasted_iota(anchor.dtype, window, axis) for axis in (0, 1))
+    return x, y

@@ -1,0 +1,40 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.hand.limits import limit_excess, limit_log_likelihood
+from jaxfilters.models.hand.skeleton import ANGLE_LIMITS
+
+pytestmark = pytest.mark.usefixtures("x64")
+LOW, HIGH = ANGLE_LIMITS.T
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_inside_and_on_the_limits_nothing_is_lost(share):
+    assert limit_log_likelihood(jnp.asarray(LOW + share * (HIGH - LOW))) == 0
+
+
+@pytest.mark.parametrize("angle", range(15))
+@pytest.mark.parametrize(("degrees", "expected"), [(3, -0.5), (6, -2.0)])
+def test_three_degrees_beyond_are_one_deviation(angle, degrees, expected):
+    for angles in (HIGH + np.deg2rad(degrees) * np.eye(15)[angle], LOW - np.deg2rad(degrees) * np.eye(15)[angle]):
+        assert limit_log_likelihood(jnp.asarray(angles)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_excesses_of_several_angles_add_up():
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-3, 3, 15)
+    clipped = np.clip(angles, LOW, HIGH)
+    np.testing.assert_allclose(limit_excess(jnp.asarray(angles)), angles - clipped, atol=1e-15)
+    expected = -0.5 * np.sum((np.rad2deg(angles - clipped) / 3) ** 2)
+    assert limit_log_likelihood(jnp.asarray(angles)) == pytest.approx(expected, rel=1e-12)
+    softer = limit_log_likelihood(jnp.asarray(angles), np.deg2rad(6.0))
+    assert softer == pytest.approx(expected / 4, rel=1e-12)
+
+
+def test_gradient_leads_back_inside_and_is_finite_at_the_limit():
+    slope = jax.grad(limit_log_likelihood)
+    np.testing.assert_array_equal(slope(jnp.asarray(HIGH)), 0)
+    assert np.all(slope(jnp.asarray(HIGH + 0.1)) < 0)
+    assert np.all(slope(jnp.asarray(LOW - 0.1)) > 0)

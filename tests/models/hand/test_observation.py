@@ -1,0 +1,71 @@
+"""What is cut out of a frame, and the likelihood made of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.cost import gibbs_abs, gibbs_sq
+from jaxfilters.models.hand.observation import HandLikelihood, crop, hand_image, isolate, rendered, union
+from jaxfilters.models.hand.skeleton import TANGENT_SIZE, forward_kinematics, hand_geometry, open_palm, retract
+from jaxfilters.models.rendering.depth import render_capsules
+
+GEOMETRY = hand_geometry()
+POSE = open_palm(jnp.array([0.0, 0.09, 0.7]))
+CAMERA = Pinhole.from_intrinsics((90.0, 95.0), (64.0, 52.0), (106, 128))
+render = jax.jit(lambda camera, pose: render_capsules(camera, forward_kinematics(pose, GEOMETRY).capsules))
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("center", [(0.0, 0.0, 0.7), (0.45, -0.3, 0.7)])
+def test_a_window_holds_the_pixels_its_camera_says(stride, center):
+    rows, cols = np.mgrid[:106, :128].astype(np.float32)
+    frame = jnp.asarray(1000 * rows + cols)
+    camera, window = crop(CAMERA, frame, jnp.asarray(center), (20, 30), stride)
+    corner = np.asarray(CAMERA.center - camera.center * stride)
+    v, u = np.mgrid[:20, :30] * stride
+    v, u = v + round(corner[1]), u + round(corner[0])
+    inside = (v >= 0) & (v < 106) & (u >= 0) & (u < 128)
+    np.testing.assert_array_equal(np.isnan(window), ~inside)
+    np.testing.assert_array_equal(np.asarray(window)[inside], (1000 * v + u)[inside])
+    middle = np.asarray(CAMERA.project(jnp.asarray(center)))
+    assert np.all(np.abs(corner + stride * np.array([14.5, 9.5]) - middle) <= 0.5 + 1e-3)
+
+
+def test_only_the_hand_is_left():
+    depth = np.array(render(CAMERA, POSE))
+    scene = np.where(np.isinf(depth), 2.0, depth)
+    arm = (slice(66, 75), slice(60, 68))  # below the wrist, at its depth
+    scene[arm] = 0.7
+    scene[0:3, 0:3] = 0.3  # something near the camera, far from the hand
+    scene[50, 64] = np.nan
+    kept = np.asarray(isolate(CAMERA, jnp.asarray(scene), POSE))
+    assert np.isnan(kept[arm]).all()
+    assert np.isnan(kept[0:3, 0:3]).all()
+    assert np.isnan(kept[50, 64])
+    assert np.isposinf(kept[scene == 2.0]).all()
+    hand = np.isfinite(depth) & np.isfinite(kept)
+    assert hand.sum() > 0.95 * (np.isfinite(depth).sum() - 1)
+    np.testing.assert_array_equal(kept[hand], scene[hand])
+
+
+@pytest.mark.parametrize("cost_of", [union, rendered])
+@pytest.mark.parametrize("form", [gibbs_abs, gibbs_sq])
+def test_the_true_pose_is_the_most_likely(cost_of, form):
+    image = hand_image(CAMERA, render(CAMERA, POSE))
+    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(0.002), 0.1, cost_of, form)
+    evaluate = jax.jit(jax.vmap(lambda pose: likelihood.log_likelihood(pose, image), in_axes=-1))
+    deltas = jnp.concatenate([jnp.zeros((TANGENT_SIZE, 1)), 0.02 * jnp.eye(TANGENT_SIZE)[:, :6]], axis=1)
+    values = np.asarray(evaluate(jax.vmap(retract, in_axes=(None, -1), out_axes=-1)(POSE, deltas)))
+    assert values[0] == pytest.approx(0.0, abs=0.01)
+    assert np.all(values[1:] < values[0] - 0.03)
+
+
+def test_angles_beyond_their_limits_are_unlikely():
+    image = hand_image(CAMERA, render(CAMERA, POSE))
+    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    bent_back = POSE.at[12].set(jnp.deg2rad(-9.0))  # PIP: 9 degrees beyond 0, softness 3 degrees
+    difference = likelihood.log_likelihood(bent_back, image) - likelihood.log_likelihood(POSE, image)
+    cost = likelihood.cost(bent_back, image) - likelihood.cost(POSE, image)
+    np.testing.assert_allclose(difference, -0.5 * 3.0**2 - cost, rtol=1e-4)

@@ -1,0 +1,113 @@
+"""Registration: its gradient, its convergence on rendered hands, and the search without a start."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.cost import gibbs_abs
+from jaxfilters.models.hand.motion import per_coordinate
+from jaxfilters.models.hand.observation import HandLikelihood, union
+from jaxfilters.models.hand.registration import (
+    PosePrior,
+    RegistrationConfig,
+    normal_equations,
+    register,
+    target_from_image,
+)
+from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, local, open_palm, retract
+from jaxfilters.models.hand.start import SCALES, Sighting, find_start
+from jaxfilters.models.rendering.depth import render_capsules
+
+GEOMETRY = hand_geometry()
+CAMERA = Pinhole.from_intrinsics((90.0, 90.0), (15.5, 15.5), (32, 32))
+POSE = open_palm(jnp.array([0.0, 0.08, 0.7])).at[7:].add(0.15)
+WIDE = PosePrior(POSE, jnp.diag(per_coordinate(0.05, 0.3, 0.3)))
+CONFIG = RegistrationConfig(widths=(0.03,) * 3 + (0.01,) * 7)
+render = jax.jit(lambda camera, pose: render_capsules(camera, forward_kinematics(pose, GEOMETRY).capsules))
+pull = jax.jit(
+    lambda observed, start: register(CAMERA, target_from_image(CAMERA, observed), GEOMETRY, start, WIDE, CONFIG)
+)
+
+
+def joint_error(pose, truth):
+    difference = forward_kinematics(pose, GEOMETRY).joints - forward_kinematics(truth, GEOMETRY).joints
+    return 1000 * float(jnp.linalg.norm(difference, axis=-1).mean())
+
+
+def test_nearest_hand_pixel_by_brute_force():
+    rng = np.random.default_rng(0)
+    observed = np.where(rng.random((32, 32)) < 0.03, 0.7, np.where(rng.random((32, 32)) < 0.5, np.inf, np.nan))
+    nearest = np.asarray(target_from_image(CAMERA, jnp.asarray(observed, dtype=float)).nearest_hand).reshape(32, 32)
+    hand, (v, u) = np.argwhere(np.isfinite(observed)), np.mgrid[:32, :32]
+    shortest = ((v[..., None] - hand[:, 0]) ** 2 + (u[..., None] - hand[:, 1]) ** 2).min(-1)
+    np.testing.assert_array_equal((v - nearest // 32) ** 2 + (u - nearest % 32) ** 2, shortest)
+    assert np.isfinite(observed.ravel()[nearest]).all()
+
+
+def test_gradient_of_the_surface_term_against_finite_differences():
+    # Outline and front off: what is left is smooth where no pixel changes its closest capsule. Weights are held fixed
+    # (iteratively reweighted least squares), which a wide robust function makes exact to (residual / width)^2 = 1e-4.
+    with jax.enable_x64(True):
+        geometry, pose = hand_geometry(), POSE.astype(float)
+        camera = Pinhole.from_intrinsics((90.0, 90.0), (15.5, 15.5), (32, 32))
+        config = RegistrationConfig(outline_weight=0.0, front_weight=0.0)
+        target = target_from_image(camera, render_capsules(camera, forward_kinematics(pose, geometry).capsules))
+        moved = retract(pose, 0.003 * jnp.cos(jnp.arange(21.0)))
+        width = jnp.asarray(1.0)
+        gradient, _ = normal_equations(camera, target, geometry, moved, width, config)
+
+        def energy(delta):
+            at = retract(moved, delta)
+            bones = forward_kinematics(at, geometry).capsules
+            points = (target.rays * jnp.where(jnp.isfinite(target.depth), target.depth, 0.0)[:, None])[:, None]
+            axis = bones.end - bones.start
+            share = jnp.clip(((points - bones.start) * axis).sum(-1) / (axis**2).sum(-1), 0, 1)
+            distance = jnp.linalg.norm(points - bones.start - share[..., None] * axis, axis=-1) - bones.radius
+            hand = jnp.isfinite(target.depth)
+            scale = config.independent_pixels / config.noise_std**2 / hand.sum()
+            return 0.5 * scale * jnp.sum(jnp.where(hand, distance.min(axis=1) ** 2, 0.0))
+
+        steps = 1e-6 * jnp.eye(21)
+        numeric = jnp.stack([(energy(step) - energy(-step)) / 2e-6 for step in steps])
+        np.testing.assert_allclose(gradient, numeric, rtol=1e-3, atol=1e-3 * float(jnp.abs(numeric).max()))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_displaced_hand_is_pulled_back(seed):
+    # Displaced by 8 mm, 0.1 rad and 8 degrees in every coordinate, seen in pixels that are 8 mm wide.
+    noise = per_coordinate(0.008, 0.1, np.deg2rad(8)) * jax.random.normal(jax.random.key(seed), (21,))
+    start = retract(POSE, noise)
+    found = pull(render(CAMERA, POSE), start)
+    assert joint_error(start, POSE) > 10
+    assert joint_error(found.pose, POSE) < 5
+
+
+def test_information_is_symmetric_positive_and_smaller_for_what_is_hidden():
+    information = pull(render(CAMERA, POSE), POSE).information
+    np.testing.assert_allclose(information, information.T, rtol=1e-4, atol=1e-2)
+    eigenvalues = np.linalg.eigvalsh(np.asarray(information, np.float64))
+    assert eigenvalues.min() > -1e-4 * eigenvalues.max()
+    assert information[2, 2] > 0
+
+
+def test_nothing_seen_leaves_the_prior():
+    found = pull(jnp.full((32, 32), jnp.nan), retract(POSE, jnp.full(21, 0.01)))
+    np.testing.assert_allclose(local(POSE, found.pose), 0, atol=1e-5)
+    np.testing.assert_allclose(found.information, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_a_hand_of_unknown_size_is_found_without_a_start(scale):
+    camera = Pinhole.from_intrinsics((365.0, 365.0), (63.5, 63.5), (128, 128))
+    truth = open_palm(jnp.array([0.02, 0.09, 0.7])).at[7:].set(jnp.tile(jnp.deg2rad(jnp.array([5.0, 8.0, 12.0])), 5))
+    geometry = GEOMETRY.scaled(scale)
+    observed = jax.jit(lambda: render_capsules(camera, forward_kinematics(truth, geometry).capsules))()
+    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    sighting = Sighting(truth[:3] - jnp.array([0.0, 0.055 * scale, 0.0]), jnp.zeros(3))
+    start = find_start(camera, observed, sighting, likelihood, jnp.asarray(SCALES))
+    assert abs(float(start.scale) - scale) < 0.051
+    joints = forward_kinematics(start.pose, GEOMETRY.scaled(start.scale)).joints
+    assert 1000 * np.linalg.norm(joints - forward_kinematics(truth, geometry).joints, axis=-1).mean() < 12
+    assert start.cost < 0.02

@@ -1,0 +1,63 @@
+import importlib
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+SETUPTOOLS = PYPROJECT["tool"]["setuptools"]
+
+
+def folders_with_code():
+    """Import names of all folders with Python files, by the mapping of folders to packages."""
+    names = set()
+    for package, folder in SETUPTOOLS["package-dir"].items():
+        for path in (ROOT / folder).rglob("*.py"):
+            names.add(".".join([package, *path.parent.relative_to(ROOT / folder).parts]))
+    return names
+
+
+def test_every_folder_with_code_is_listed_as_a_package():
+    """A folder that is not listed works in a checkout and is missing from the wheel."""
+    assert set(SETUPTOOLS["packages"]) == folders_with_code()
+    assert len(SETUPTOOLS["packages"]) == len(set(SETUPTOOLS["packages"]))
+
+
+def test_every_package_has_an_init():
+    folders = SETUPTOOLS["package-dir"]
+    for name in SETUPTOOLS["packages"]:
+        mapped = max((package for package in folders if f"{name}.".startswith(f"{package}.")), key=len)
+        folder = ROOT / folders[mapped] / name.removeprefix(mapped).replace(".", "/").strip("/")
+        assert (folder / "__init__.py").exists(), folder
+
+
+def test_data_files_that_are_promised_exist():
+    for package, patterns in SETUPTOOLS["package-data"].items():
+        folder = ROOT / SETUPTOOLS["package-dir"][package]
+        for pattern in patterns:
+            assert list(folder.glob(pattern)), f"{package}: {pattern}"
+
+
+def test_the_version_is_in_the_changelog_and_is_the_installed_one():
+    number = PYPROJECT["project"]["version"]
+    assert f"## [{number}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert version("jaxfilters") == number
+
+
+def test_the_licence_is_the_one_that_is_stated():
+    assert PYPROJECT["project"]["license"] == "Apache-2.0"
+    text = (ROOT / "LICENSE").read_text()
+    assert "Apache License" in text
+    assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_extras_repeat_no_requirement_of_the_library():
+    core = {requirement.split(">")[0] for requirement in PYPROJECT["project"]["dependencies"]}
+    for extra in PYPROJECT["project"]["optional-dependencies"].values():
+        assert not core & {requirement.split(">")[0] for requirement in extra}
+
+
+def test_the_folders_are_one_namespace():
+    for name in ("models", "trackers", "benchmarks"):
+        module = importlib.import_module(f"jaxfilters.{name}")
+        assert Path(module.__file__).parent.name == name

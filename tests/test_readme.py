@@ -1,0 +1,59 @@
+import re
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def block(language, after=""):
+    """The first code block of a language after some text."""
+    return re.search(rf"```{language}\n(.*?)```", README[README.index(after) :], re.DOTALL)[1]
+
+
+def test_the_example_runs_and_finds_the_point():
+    example = {}
+    exec(block("python", after="<!-- example -->"), example)
+    dts = jnp.asarray(np.random.default_rng(0).uniform(0.05, 0.2, 150), jnp.float32)
+    angles = 0.5 * jnp.cumsum(dts)
+    truth = jnp.stack([5 + 3 * jnp.cos(angles), 5 + 3 * jnp.sin(angles)], axis=-1)
+    distances = jnp.linalg.norm(truth[:, None] - example["BEACONS"], axis=-1)
+    noisy = distances + 0.1 * jax.random.normal(jax.random.key(1), distances.shape)
+    means, log_evidence = example["follow"](jax.random.key(2), noisy, dts)
+    # Least squares over the three distances of one moment, of standard deviation 0.1 each, has the error `single`;
+    # a filter that also uses the past stays below it.
+    directions = (truth[:, None] - example["BEACONS"]) / distances[..., None]
+    single = 0.1 * jnp.sqrt(jnp.trace(jnp.linalg.inv(jnp.einsum("tbi,tbj->tij", directions, directions)), 0, 1, 2))
+    error = jnp.linalg.norm(means[:, :2] - truth, axis=-1)
+    assert jnp.sqrt(jnp.mean(error[30:] ** 2)) < jnp.sqrt(jnp.mean(single[30:] ** 2))
+    assert jnp.isfinite(log_evidence)
+
+
+def test_the_example_is_short():
+    lines = block("python", after="<!-- example -->").splitlines()
+    assert len([line for line in lines if line.strip() and not line.startswith(("import", "from"))]) <= 20
+
+
+def test_the_page_opens_with_the_demo_and_the_tests():
+    commands = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    assert commands[0].startswith("python3 -m venv")
+    assert commands[0].strip().endswith("jaxfilters demo")
+    assert commands[1].startswith("python3 -m venv")
+    assert commands[1].strip().endswith("-m pytest")
+    assert all(command.count("\n") == 1 for command in commands[:2])
+
+
+def test_links_lead_somewhere():
+    targets = [target for target in re.findall(r"\]\(([^)]+)\)", README) if not target.startswith("http")]
+    assert targets
+    assert not [target for target in targets if not (ROOT / target).exists()]
+
+
+def test_every_folder_has_its_row():
+    folders = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"]
+    for name, folder in folders.items():
+        assert f"| `{folder}/` | `{name}` |" in README

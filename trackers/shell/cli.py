@@ -1,0 +1,111 @@
+"""The command `jaxfilters`."""
+
+import argparse
+import runpy
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from jaxfilters.trackers.shell.devices import use_all_cores
+
+FAILURE, INTERRUPTED = 2, 130
+"""Exit codes: wrong input or a full disk; Ctrl-C."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code is 0 for success."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    use_all_cores()
+    if argv[:1] == ["bench"]:
+        return _bench(argv[1:])
+    options = _parser().parse_args(argv)
+    # Everything that computes is imported here: `--help` answers at once, and the number of devices is set by now.
+    from jaxfilters.trackers.depth_sequence import InputError
+    from jaxfilters.trackers.shell.checkpoint import CheckpointError
+    from jaxfilters.trackers.shell.results import OutputError
+    from jaxfilters.trackers.shell.track_command import track_hand
+
+    try:
+        track_hand(options)
+    except (InputError, OutputError, CheckpointError) as error:
+        print(f"jaxfilters: error: {error}", file=sys.stderr)
+        return FAILURE
+    except KeyboardInterrupt as interrupt:
+        print(f"\njaxfilters: interrupted; {interrupt or 'nothing was kept'}.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _bench(arguments: list[str]) -> int:
+    """`python -m jaxfilters.benchmarks`: the benchmarks stand above the trackers and are not imported by them."""
+    previous, sys.argv = sys.argv, ["jaxfilters bench", *arguments]
+    try:
+        runpy.run_module("jaxfilters.benchmarks", run_name="__main__")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv = previous
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="jaxfilters", description="Bayesian filters that follow things with cameras.")
+    parser.add_argument("--version", action="version", version=f"jaxfilters {version('jaxfilters')}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    track = commands.add_parser("track", help="follow something in a recording")
+    what = track.add_subparsers(dest="what", required=True, metavar="WHAT")
+    hand = what.add_parser("hand-depth", help="the pose of one hand in depth images")
+    hand.add_argument(
+        "input",
+        nargs="?",
+        type=Path,
+        metavar="INPUT",
+        help="folder of 16-bit PNGs with camera.json, or .npz with depth_mm and K; without it, a synthetic recording",
+    )
+    hand.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    hand.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
+    hand.set_defaults(overwrite=False)
+    _add_filter_options(hand)
+
+    demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
+    demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
+    demo.set_defaults(input=None, resume=False, overwrite=True)
+    _add_filter_options(demo)
+
+    commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
+    return parser
+
+
+def _seed(text: str) -> int:
+    if not -(2**63) <= int(text) < 2**63:
+        raise argparse.ArgumentTypeError(f"a seed must fit into 64 bits; got {text}")
+    return int(text)
+
+
+def _add_filter_options(parser: argparse.ArgumentParser) -> None:
+    """Options that are None unless given, so that the defaults stand in one place, the configuration."""
+    parser.add_argument("--filter", choices=("rbpf", "pf"), help="Rao-Blackwellized (default) or plain particle filter")
+    parser.add_argument("--particles", type=int, dest="num_particles", metavar="N", help="number of particles")
+    parser.add_argument("--stride", type=int, metavar="PIXELS", help="compare every PIXELS-th row and column")
+    parser.add_argument(
+        "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
+    )
+    parser.add_argument("--seed", type=_seed, metavar="SEED", help="random seed")
+    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
+    parser.add_argument(
+        "--guide",
+        action=argparse.BooleanOptionalAction,
+        help="draw particles around what registration finds (default), or from the motion model alone",
+    )
+    parser.add_argument(
+        "--missing",
+        choices=("auto", "background", "unknown"),
+        help="what pixels without a reading are (default: auto, background if more than half of the first frame)",
+    )
+    parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
