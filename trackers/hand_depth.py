@@ -5,7 +5,7 @@ The filter is `rao_blackwell_shared` on the 22-number hand with `HandMotion`; it
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -45,6 +45,7 @@ from jaxfilters.models.hand.skeleton import (
     retract,
 )
 from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
+from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.particle import ParticleInfo, TemperToShare
 from jaxfilters.trackers.depth_sequence import DepthSequence, from_array
@@ -65,6 +66,8 @@ class HandDepthConfig:
     """Every how many pixels one is compared; `None` chooses for a hand at 0.6 m to fill the window."""
     seed: int = 0
     hand: str = "right"
+    surface: str = "capsules"
+    """What particles are rendered as: `capsules`, or the triangle `mesh`, three times slower."""
     scale: float | None = None
     """Size of the hand relative to the average adult's; `None` fits it to the first frame."""
     guide: bool = True
@@ -74,7 +77,12 @@ class HandDepthConfig:
     if they are more than half of the first frame."""
 
     def __post_init__(self) -> None:
-        choices = {"filter": ("rbpf", "pf"), "hand": ("right", "left"), "missing": ("auto", "background", "unknown")}
+        choices = {
+            "filter": ("rbpf", "pf"),
+            "hand": ("right", "left"),
+            "surface": ("capsules", "mesh"),
+            "missing": ("auto", "background", "unknown"),
+        }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
@@ -148,7 +156,8 @@ def build(camera: Pinhole, config: HandDepthConfig | None = None) -> SequenceTra
     config = config or HandDepthConfig()
     stride = config.stride or max(1, round(float(camera.focal[0]) * 2 * REACH / 0.6 / WINDOW[1]))
     geometry = hand_geometry() if config.hand == "right" else mirrored(hand_geometry())
-    likelihood = HandLikelihood(geometry, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
+    surface = CapsuleHand(geometry) if config.surface == "capsules" else triangle_hand(geometry)
+    likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
     setup = _Setup(camera, likelihood, config, stride)
     return SequenceTracker(partial(_start, setup), partial(_advance, setup))
 
@@ -209,7 +218,7 @@ def _placed(setup: _Setup, key: Array, pose: Array, scale: Array) -> Any:
 
 def _filter(setup: _Setup, pose: Array, scale: Array) -> Filter:
     """The filter of a hand of the given scale that starts about `pose`."""
-    likelihood = replace(setup.likelihood, geometry=setup.likelihood.geometry.scaled(scale))
+    likelihood = setup.likelihood.scaled(scale)
     with_velocity = setup.config.filter == "rbpf"
     velocity = START_VELOCITY_STD if with_velocity else START_VELOCITY_STD[:0]
     inner = rao_blackwell_shared(
@@ -325,7 +334,7 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
     something = image.observed_count >= FEWEST_PIXELS
     ensemble, info = jax.lax.cond(something, update, coast, predicted)
     pose, covariance = pose_moments(*_particles(ensemble))
-    likelihood = replace(setup.likelihood, geometry=setup.likelihood.geometry.scaled(state.scale))
+    likelihood = setup.likelihood.scaled(state.scale)
     seen = something & (likelihood.cost(pose, image) < LOST_COST)
     misses = jnp.where(seen, 0, state.misses + 1)
     track = HandTrack(

@@ -29,6 +29,7 @@ from jaxfilters.models.hand.skeleton import (
     open_palm,
     retract,
 )
+from jaxfilters.models.hand.surface import CapsuleHand, HandSurface
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, INITIAL_VELOCITY_STD, START
 from jaxfilters.particle import StandardNormal, TemperToShare, bootstrap
 from jaxfilters.proposals import Proposal, exact
@@ -66,6 +67,9 @@ class Setting:
     """Whether joint limits are part of the likelihood."""
     segmented: bool
     """Whether readings far from the expected hand are taken out first."""
+    surface: Callable[[HandGeometry], HandSurface] = CapsuleHand
+    stride: int = 1
+    """Every how many rows and columns of the window are compared."""
 
 
 def improved() -> Setting:
@@ -146,7 +150,7 @@ def _walk(pose_variance_rate: Array, noise: Array, pose: Array, dt: Array) -> Ar
 
 def _log_likelihood(setting: Setting) -> Callable:
     sigma = jnp.asarray(setting.sigma, dtype=float)
-    likelihood = HandLikelihood(hand_geometry(), sigma, MAX_ERROR, setting.cost_of, setting.form)
+    likelihood = HandLikelihood(setting.surface(hand_geometry()), sigma, MAX_ERROR, setting.cost_of, setting.form)
     return likelihood.log_likelihood if setting.limits else jax.tree_util.Partial(_without_limits, likelihood)
 
 
@@ -167,12 +171,14 @@ class View:
     camera: Pinhole
     geometry: HandGeometry
     segmented: bool = field(metadata={"static": True})
+    stride: int = field(default=1, metadata={"static": True})
 
     def image(self, frame: Float[Array, "rows cols"], expected: Float[Array, " 22"]) -> HandImage:
         """The window about the expected hand; `frame` in metres, NaN without a reading."""
         center = hand_center(expected)
         center = center.at[2].set(jnp.maximum(center[2], 0.1))  # a lost hand may be predicted behind the camera
-        window, observed = crop(self.camera, frame, center, WINDOW, 1)
+        shape = tuple(size // self.stride for size in WINDOW)
+        window, observed = crop(self.camera, frame, center, shape, self.stride)
         return hand_image(window, isolate(window, observed, expected) if self.segmented else observed)
 
 

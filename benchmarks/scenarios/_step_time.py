@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,8 +21,10 @@ from jaxfilters.benchmarks.scenarios._hand_filters import (
 )
 from jaxfilters.filter import Filter, init, predict
 from jaxfilters.models.hand.skeleton import hand_geometry
+from jaxfilters.models.hand.surface import triangle_hand
 from jaxfilters.models.synthetic.depth_sensor import depth_from_millimetres
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, kinect_v2, simulate_sequence
+from jaxfilters.trackers import hand_depth
 
 NUM_FRAMES = 30
 """Of data B, filtered again and again from their start: both filters still follow the hand, and render as much."""
@@ -46,7 +49,7 @@ def measure(num_particles: int, rounds: int, seed: int) -> StepTimes:
     recording_key, filter_key = jax.random.split(jax.random.key(seed))
     frames = depth_from_millimetres(simulate_sequence(recording_key, "B", num_frames=NUM_FRAMES).depth_mm)
     setting = improved()
-    view = View(kinect_v2(), hand_geometry(), setting.segmented)
+    view = View(kinect_v2(), hand_geometry(), setting.segmented, setting.stride)
     pf, rbpf = (build(setting, num_particles) for build in (particle_filter, rao_blackwellized))
     dt = jnp.asarray(FRAME_INTERVAL, dtype=float)
     predicted = init(rbpf, filter_key)
@@ -56,6 +59,18 @@ def measure(num_particles: int, rounds: int, seed: int) -> StepTimes:
         "rbpf_predict": partial(predict, rbpf, filter_key, predicted, dt),
     }
     return StepTimes(**rounds_of(calls, rounds))
+
+
+def measure_variants(num_particles: int, rounds: int, seed: int) -> dict[str, np.ndarray]:
+    """Seconds a frame of the Rao-Blackwellized filter with the mesh at stride 2, and of the tracker with its guide."""
+    recording_key, filter_key = jax.random.split(jax.random.key(seed))
+    frames = depth_from_millimetres(simulate_sequence(recording_key, "B", num_frames=NUM_FRAMES).depth_mm)
+    setting = replace(improved(), surface=triangle_hand, stride=2)
+    view = View(kinect_v2(), hand_geometry(), setting.segmented, setting.stride)
+    mesh = _Follower(rao_blackwellized(setting, num_particles), filter_key, view, frames)
+    guided = _Tracker(num_particles, filter_key, np.asarray(frames))
+    seconds = rounds_of({"rbpf_mesh_stride2": mesh, "rbpf_guided": guided}, rounds)
+    return seconds | {"rbpf_guided": seconds["rbpf_guided"] / guided.chunk}
 
 
 class _Follower:
@@ -71,6 +86,27 @@ class _Follower:
         state = self._state if i else self._start
         self._state, estimate = advance(self._filter, key, self._view, state, frame)
         return estimate
+
+
+class _Tracker:
+    """The tracker as the shell runs it: a few frames with each call, on the host before and after."""
+
+    chunk = 5
+
+    def __init__(self, num_particles: int, key: Array, frames: np.ndarray):
+        config = hand_depth.HandDepthConfig(num_particles=num_particles, scale=1.0)
+        self._tracker = hand_depth.build(kinect_v2(), config)
+        self._start = self._state = self._tracker.start(key, frames[0])
+        times = FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32)
+        self._chunks = itertools.cycle(range(0, len(frames), self.chunk))
+        self._frames, self._times = frames, times
+
+    def __call__(self) -> Any:
+        first = next(self._chunks)
+        part = slice(first, first + self.chunk)
+        state = self._state if first else self._start
+        self._state, track = self._tracker.advance(state, self._frames[part], self._times[part])
+        return track
 
 
 def rounds_of(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:

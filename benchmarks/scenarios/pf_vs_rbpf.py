@@ -32,7 +32,7 @@ from jaxfilters.benchmarks.scenarios._accuracy import (
     run_all,
 )
 from jaxfilters.benchmarks.scenarios._pf_vs_rbpf_plots import plot_times, plot_tracks
-from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure
+from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure, measure_variants
 from jaxfilters.filter import Filter
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, START, kinect_v2
@@ -64,9 +64,10 @@ def run(
     num_frames = num_frames or (QUICK_NUM_FRAMES if quick else None)
     _say(out, _preamble(num_particles, num_seeds, num_frames))
     times = _measure_times(quick, seed, out)
+    variants = _measure_variants(num_particles, quick, seed, out)
     runs = _measure_accuracy(_filters(num_particles, quick), range(seed, seed + num_seeds), num_frames, out)
     _say(out, _accuracy_table(runs))
-    return time_metrics(times) | accuracy_metrics(runs)
+    return time_metrics(times) | variants | accuracy_metrics(runs)
 
 
 def time_metrics(times: dict[int, StepTimes]) -> dict[str, Metric]:
@@ -116,7 +117,7 @@ def _filters(num_particles: int, quick: bool) -> dict[str, dict[str, Filtering]]
 
 
 def _filtering(setting: hand.Setting, filter: Filter) -> Filtering:
-    view = hand.View(kinect_v2(), hand_geometry(), setting.segmented)
+    view = hand.View(kinect_v2(), hand_geometry(), setting.segmented, setting.stride)
     return lambda key, frames: hand.track(filter, key, view, frames)
 
 
@@ -152,6 +153,15 @@ def _measure_times(quick: bool, seed: int, out: Path | None) -> dict[int, StepTi
     if out is not None:
         plot_times(out / "time_per_frame.png", {n: (_median_ms(t.pf), _median_ms(t.rbpf)) for n, t in times.items()})
     return times
+
+
+def _measure_variants(num_particles: int, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
+    """The two dearer frames: rendered from the mesh, and with registration before the draw."""
+    seconds = measure_variants(num_particles, QUICK_ROUNDS if quick else ROUNDS, seed)
+    _say(out, "".join(f"{name:>20} {_median_ms(times):8.2f} ms\n" for name, times in seconds.items()))
+    return {
+        f"frame_ms_{name}_n{num_particles}": Metric(_median_ms(times), "ms", "lower") for name, times in seconds.items()
+    }
 
 
 def _measure_accuracy(

@@ -1,7 +1,7 @@
 """What a depth camera says about a hand: the part of the frame that is compared, and the log-likelihood of a pose."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, no_type_check
 
 import jax
@@ -12,8 +12,9 @@ from jaxfilters.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed, rendered_cost, union_cost
 from jaxfilters.models.hand.limits import limit_log_likelihood
-from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
-from jaxfilters.models.rendering.comparison import DepthTerms, compare_capsules
+from jaxfilters.models.hand.skeleton import HandGeometry, hand_center
+from jaxfilters.models.hand.surface import HandSurface
+from jaxfilters.models.rendering.comparison import DepthTerms
 
 REACH = 0.14
 """Radius in metres of the ball about the middle of an average hand that holds it in any pose."""
@@ -91,7 +92,7 @@ def rendered(terms: DepthTerms, image: HandImage, max_error: float) -> Float[Arr
 class HandLikelihood:
     """Log-likelihood of a pose given a `HandImage`: a depth cost in Gibbs form, and soft joint limits."""
 
-    geometry: HandGeometry
+    surface: HandSurface
     sigma: Float[Array, ""]
     """Scale of the cost, metres, positive."""
     max_error: float = field(metadata={"static": True})
@@ -101,10 +102,18 @@ class HandLikelihood:
     form: Callable[[Array, Array], Float[Array, ""]] = field(metadata={"static": True})
     """`gibbs_abs` or `gibbs_sq` of `jaxfilters.models.hand.cost`."""
 
+    @property
+    def geometry(self) -> HandGeometry:
+        """Of the hand that is rendered."""
+        return self.surface.geometry
+
+    def scaled(self, scale: float | Float[Array, ""]) -> "HandLikelihood":
+        """The likelihood of the same hand with every length multiplied by `scale` (may be traced)."""
+        return replace(self, surface=self.surface.scaled(scale))
+
     def cost(self, pose: Float[Array, " 22"], image: HandImage) -> Float[Array, ""]:
         """Metres."""
-        capsules = forward_kinematics(pose, self.geometry).capsules
-        terms = compare_capsules(image.camera, capsules, image.observed, self.max_error)
+        terms = self.surface.compare(image.camera, pose, image.observed, self.max_error)
         return self.cost_of(terms, image, self.max_error)
 
     def log_likelihood(self, pose: Float[Array, " 22"], image: HandImage) -> Float[Array, ""]:

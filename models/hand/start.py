@@ -1,7 +1,6 @@
 """Find a hand without knowing where it was: many hypotheses, each pulled onto the image, the best one kept."""
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -122,8 +121,7 @@ def find_start(
         return register(coarse_camera, target, geometry, pose, PosePrior(pose, root), config).pose
 
     def judge(pose: Array, scale: Array) -> Array:
-        sized = replace(likelihood, geometry=likelihood.geometry.scaled(scale))
-        return sized.cost(pose, image)
+        return likelihood.scaled(scale).cost(pose, image)
 
     middle = scales[len(scales) // 2]
     poses = jax.vmap(lambda pose: pull(pose, middle, COARSE))(starting_poses(sighting))

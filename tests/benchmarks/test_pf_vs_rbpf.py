@@ -132,6 +132,7 @@ def test_a_tiny_comparison_has_every_metric_of_the_issue(tmp_path, monkeypatch):
     names |= {"p_value_rbpf_better_b"}
     names |= {f"{name}_paper_cost" for name in names} | {"joint_error_mm_frozen_a", "joint_error_mm_frozen_b"}
     names |= {"frame_ms_pf_n16", "frame_ms_rbpf_n16", "time_ratio_rbpf_over_pf_n16"}
+    names |= {"frame_ms_rbpf_mesh_stride2_n16", "frame_ms_rbpf_guided_n16"}
     assert names <= set(metrics)
     assert all(np.isfinite(metric.value) for metric in metrics.values())
     assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 2 * 2 * 5

@@ -93,6 +93,9 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
         "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
     )
     parser.add_argument("--seed", type=_seed, metavar="SEED", help="random seed")
+    parser.add_argument(
+        "--surface", choices=("capsules", "mesh"), help="what particles are rendered as (default: capsules)"
+    )
     parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
     parser.add_argument(
         "--guide",

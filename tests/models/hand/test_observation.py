@@ -9,6 +9,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs, gibbs_sq
 from jaxfilters.models.hand.observation import HandLikelihood, crop, hand_image, isolate, rendered, union
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, forward_kinematics, hand_geometry, open_palm, retract
+from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.rendering.depth import render_capsules
 
 GEOMETRY = hand_geometry()
@@ -54,7 +55,7 @@ def test_only_the_hand_is_left():
 @pytest.mark.parametrize("form", [gibbs_abs, gibbs_sq])
 def test_the_true_pose_is_the_most_likely(cost_of, form):
     image = hand_image(CAMERA, render(CAMERA, POSE))
-    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(0.002), 0.1, cost_of, form)
+    likelihood = HandLikelihood(CapsuleHand(GEOMETRY), jnp.asarray(0.002), 0.1, cost_of, form)
     evaluate = jax.jit(jax.vmap(lambda pose: likelihood.log_likelihood(pose, image), in_axes=-1))
     deltas = jnp.concatenate([jnp.zeros((TANGENT_SIZE, 1)), 0.02 * jnp.eye(TANGENT_SIZE)[:, :6]], axis=1)
     values = np.asarray(evaluate(jax.vmap(retract, in_axes=(None, -1), out_axes=-1)(POSE, deltas)))
@@ -64,8 +65,24 @@ def test_the_true_pose_is_the_most_likely(cost_of, form):
 
 def test_angles_beyond_their_limits_are_unlikely():
     image = hand_image(CAMERA, render(CAMERA, POSE))
-    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    likelihood = HandLikelihood(CapsuleHand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)
     bent_back = POSE.at[12].set(jnp.deg2rad(-9.0))  # PIP: 9 degrees beyond 0, softness 3 degrees
     difference = likelihood.log_likelihood(bent_back, image) - likelihood.log_likelihood(POSE, image)
     cost = likelihood.cost(bent_back, image) - likelihood.cost(POSE, image)
     np.testing.assert_allclose(difference, -0.5 * 3.0**2 - cost, rtol=1e-4)
+
+
+def test_a_triangle_hand_is_likeliest_where_the_capsules_are_and_grows_with_its_scale():
+    image = hand_image(CAMERA, render(CAMERA, POSE))
+    mesh = HandLikelihood(triangle_hand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    evaluate = jax.jit(jax.vmap(lambda pose, scale: mesh.scaled(scale).cost(pose, image), in_axes=(-1, 0)))
+    moved = jax.vmap(retract, in_axes=(None, -1), out_axes=-1)(
+        POSE, jnp.concatenate([jnp.zeros((TANGENT_SIZE, 3)), 0.02 * jnp.eye(TANGENT_SIZE)[:, :3]], axis=1)
+    )
+    costs = np.asarray(evaluate(moved, jnp.array([1.0, 1.1, 0.9, *[1.0] * 3])))
+    # A tessellated hand of the same volume differs from the capsules by a millimetre, and by a pixel along its edge.
+    assert costs[0] < 0.012
+    assert np.all(costs[1:] > costs[0] + 0.01)
+    # Scaled by hand: the mesh of a scaled geometry.
+    larger = HandLikelihood(triangle_hand(GEOMETRY.scaled(1.1)), jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    np.testing.assert_allclose(jax.jit(larger.cost)(POSE, image), costs[1], atol=1e-5)

@@ -18,6 +18,7 @@ from jaxfilters.models.hand.registration import (
 )
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, local, open_palm, retract
 from jaxfilters.models.hand.start import SCALES, Sighting, find_start
+from jaxfilters.models.hand.surface import CapsuleHand
 from jaxfilters.models.rendering.depth import render_capsules
 
 GEOMETRY = hand_geometry()
@@ -104,7 +105,7 @@ def test_a_hand_of_unknown_size_is_found_without_a_start(scale):
     truth = open_palm(jnp.array([0.02, 0.09, 0.7])).at[7:].set(jnp.tile(jnp.deg2rad(jnp.array([5.0, 8.0, 12.0])), 5))
     geometry = GEOMETRY.scaled(scale)
     observed = jax.jit(lambda: render_capsules(camera, forward_kinematics(truth, geometry).capsules))()
-    likelihood = HandLikelihood(GEOMETRY, jnp.asarray(1.0), 0.1, union, gibbs_abs)
+    likelihood = HandLikelihood(CapsuleHand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)
     sighting = Sighting(truth[:3] - jnp.array([0.0, 0.055 * scale, 0.0]), jnp.zeros(3))
     start = find_start(camera, observed, sighting, likelihood, jnp.asarray(SCALES))
     assert abs(float(start.scale) - scale) < 0.051

@@ -1,0 +1,66 @@
+"""What a hand is rendered as: capsules, or convex triangle parts. Either is compared with depth in the same way."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol, no_type_check
+
+import jax
+from jaxtyping import Array, Float
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.mesh import hand_mesh, part_meshes
+from jaxfilters.models.hand.parts import part_transforms
+from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics
+from jaxfilters.models.rendering.comparison import DepthTerms, compare_capsules, compare_convex_parts
+from jaxfilters.models.rendering.geometry import ConvexParts, convex_parts
+
+
+class HandSurface(Protocol):
+    """A pytree that knows its skeleton and how it looks."""
+
+    geometry: HandGeometry
+
+    def scaled(self, scale: float | Float[Array, ""]) -> "HandSurface":
+        """The same hand with every length multiplied by `scale` (may be traced)."""
+
+    def compare(
+        self, camera: Pinhole, pose: Float[Array, " 22"], observed: Float[Array, "rows cols"], max_error: float
+    ) -> DepthTerms:
+        """Depth terms of the posed hand against an image of `camera`, metres; see `compare_capsules`."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class CapsuleHand:
+    """One capsule for each part: exact, and the fastest."""
+
+    geometry: HandGeometry
+
+    def scaled(self, scale):
+        return CapsuleHand(self.geometry.scaled(scale))
+
+    def compare(self, camera, pose, observed, max_error):
+        return compare_capsules(camera, forward_kinematics(pose, self.geometry).capsules, observed, max_error)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class MeshHand:
+    """One convex polyhedron for each part, moved with its bone: any shape, e.g. cut from a scanned hand."""
+
+    geometry: HandGeometry
+    parts: ConvexParts
+    """In the frames of `part_transforms`, in the order of `PART_NAMES`."""
+
+    def scaled(self, scale):
+        parts = replace(self.parts, offsets=self.parts.offsets * scale, corners=self.parts.corners * scale)
+        return MeshHand(self.geometry.scaled(scale), parts)
+
+    def compare(self, camera, pose, observed, max_error):
+        return compare_convex_parts(camera, self.parts, part_transforms(pose, self.geometry), observed, max_error)
+
+
+def triangle_hand(geometry: HandGeometry) -> MeshHand:
+    """The procedural mesh of 608 triangles of a (concrete) hand."""
+    return MeshHand(geometry, convex_parts(part_meshes(hand_mesh(geometry))))
