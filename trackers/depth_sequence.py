@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
-
-
-class InputError(ValueError):
-    """A recording that cannot be used, with what was found and what was expected."""
+from jaxfilters.trackers.recording import InputError, check_times
 
 
 @dataclass(frozen=True)
@@ -64,18 +61,3 @@ def from_array(camera: Pinhole, times_s: np.ndarray, depth: np.ndarray, name: st
         return np.where(np.isfinite(frame) & (frame > 0), frame, np.float32(np.nan))
 
     return DepthSequence(camera, np.asarray(times_s, np.float64), read, name)
-
-
-def check_times(times_s: np.ndarray, name: str) -> None:
-    """Raise `InputError` unless the times are (frames,) with at least one frame, finite and strictly increasing."""
-    if times_s.ndim != 1 or len(times_s) == 0:
-        raise InputError(f"{name}: expected at least one frame; times have shape {times_s.shape}.")
-    if not np.isfinite(times_s).all():
-        raise InputError(f"{name}: times must be finite; frame {int(np.argmin(np.isfinite(times_s)))} is not.")
-    steps = np.diff(times_s)
-    if (steps <= 0).any():
-        i = int(np.argmax(steps <= 0))
-        raise InputError(
-            f"{name}: times must increase strictly; frame {i} is at {times_s[i]:.6f} s, "
-            f"frame {i + 1} at {times_s[i + 1]:.6f} s."
-        )

@@ -66,8 +66,6 @@ class HandDepthConfig:
     """Every how many pixels one is compared; `None` chooses for a hand at 0.6 m to fill the window."""
     seed: int = 0
     hand: str = "right"
-    surface: str = "capsules"
-    """What particles are rendered as: `capsules`, or the triangle `mesh`, three times slower."""
     scale: float | None = None
     """Size of the hand relative to the average adult's; `None` fits it to the first frame."""
     guide: bool = True
@@ -75,6 +73,8 @@ class HandDepthConfig:
     missing: str = "auto"
     """What pixels without a reading are: `background` (the recording had it removed), `unknown`, or `auto`: background
     if they are more than half of the first frame."""
+    surface: str = "capsules"
+    """What particles are rendered as: `capsules`, or the triangle `mesh`, three times slower."""
 
     def __post_init__(self) -> None:
         choices = {

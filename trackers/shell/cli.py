@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from jaxfilters.trackers.shell.devices import use_all_cores
 
@@ -21,13 +22,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _bench(argv[1:])
     options = _parser().parse_args(argv)
     # Everything that computes is imported here: `--help` answers at once, and the number of devices is set by now.
-    from jaxfilters.trackers.depth_sequence import InputError
+    from jaxfilters.trackers.recording import InputError
     from jaxfilters.trackers.shell.checkpoint import CheckpointError
     from jaxfilters.trackers.shell.results import OutputError
-    from jaxfilters.trackers.shell.track_command import track_hand
+    from jaxfilters.trackers.shell.track_command import track
 
     try:
-        track_hand(options)
+        track(_job(options), options)
     except (InputError, OutputError, CheckpointError) as error:
         print(f"jaxfilters: error: {error}", file=sys.stderr)
         return FAILURE
@@ -35,6 +36,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\njaxfilters: interrupted; {interrupt or 'nothing was kept'}.", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _job(options: argparse.Namespace) -> Any:
+    from jaxfilters.trackers.shell.hand_command import hand_job
+
+    return hand_job(options)
 
 
 def _bench(arguments: list[str]) -> int:

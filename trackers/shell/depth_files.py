@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.depth_sequence import DepthSequence, InputError
+from jaxfilters.trackers.depth_sequence import DepthSequence
+from jaxfilters.trackers.recording import InputError
 
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "K", "depth_scale", "timestamps_us", "fps"}
 _SHORTEST_STEP_US = 1000

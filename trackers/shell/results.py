@@ -3,7 +3,7 @@
 import csv
 import errno
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,44 +13,23 @@ import numpy as np
 
 from jaxfilters.trackers.shell import checkpoint
 from jaxfilters.trackers.shell.checkpoint import CheckpointError
-from jaxfilters.trackers.tracker import STATUS_NAMES, HandTrack
-
-_POSITION = tuple(f"wrist_{axis}" for axis in "xyz")
-_THUMB_ANGLES = ("thumb_cmc_x", "thumb_mcp_x", "thumb_mcp_z")
-_FINGER_ANGLES = tuple(
-    f"{finger}_{joint}" for finger in ("index", "middle", "ring", "little") for joint in ("mcp_x", "mcp_z", "pip_x")
-)
-_ANGLES = _THUMB_ANGLES + _FINGER_ANGLES
-POSE_COLUMNS = (
-    *(f"{name}_m" for name in _POSITION),
-    *(f"wrist_quaternion_{part}" for part in "wxyz"),
-    *(f"{name}_rad" for name in _ANGLES),
-)
-"""The 22 pose numbers, in the order of the pose vector."""
-STD_COLUMNS = (
-    *(f"{name}_std_m" for name in _POSITION),
-    *(f"wrist_rotation_{axis}_std_rad" for axis in "xyz"),
-    *(f"{name}_std_rad" for name in _ANGLES),
-)
-"""The 21 standard deviations, in the order of the tangent vector."""
-COLUMNS = ("frame", "time_s", *POSE_COLUMNS, *STD_COLUMNS, "ess", "log_evidence", "status")
+from jaxfilters.trackers.tracker import STATUS_NAMES
 
 
 class OutputError(OSError):
     """Results cannot be written; the message says what is kept."""
 
 
-class TimedTrack(NamedTuple):
-    """`HandTrack` on the host, with the times of its frames; all fields frames first."""
+class TrackTable(NamedTuple):
+    """How the track of one kind of tracker becomes rows of `track.csv`."""
 
-    times_s: np.ndarray
-    """(frames,) float64 seconds, as in the recording."""
-    pose: np.ndarray
-    pose_std: np.ndarray
-    joints: np.ndarray
-    ess: np.ndarray
-    log_evidence: np.ndarray
-    status: np.ndarray
+    columns: tuple[str, ...]
+    """Names of the numbers of a row, between the time and the status."""
+    numbers: Callable[[Any, int], np.ndarray]
+    """`(track, i) -> (columns,)`."""
+    empty: Callable[[int], Any]
+    """`frames -> track`: a named tuple of arrays, frames first, that begins with `times_s` and ends with `status`,
+    zeros of the right shapes and types. Between these two are the fields of what the tracker returns, in order."""
 
 
 class TrackWriter:
@@ -59,11 +38,11 @@ class TrackWriter:
     `begin` and `resume` make one.
     """
 
-    def __init__(self, folder: Path, run: dict[str, Any], done: TimedTrack):
-        self._folder, self._run = folder, run
+    def __init__(self, folder: Path, run: dict[str, Any], table: TrackTable, done: Any):
+        self._folder, self._run, self._table = folder, run, table
         self._parts = [done]
         self.frames_saved = len(done.times_s)
-        self._write_rows([COLUMNS, *_rows(0, done)], "w")
+        self._write_rows([("frame", "time_s", *table.columns, "status"), *self._rows(0, done)], "w")
 
     @property
     def frames(self) -> int:
@@ -71,15 +50,15 @@ class TrackWriter:
         return sum(len(part.times_s) for part in self._parts)
 
     @property
-    def results(self) -> TimedTrack:
+    def results(self) -> Any:
         """All frames so far."""
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *self._parts)
 
-    def append(self, times_s: np.ndarray, track: HandTrack) -> None:
+    def append(self, times_s: np.ndarray, track: Any) -> None:
         """Add frames: one row each in `track.csv`, on disk when this returns."""
-        arrays = TimedTrack(times_s, **track._asdict())
+        arrays = type(self._parts[0])(times_s, *track)
         part = jax.tree.map(lambda array, like: np.asarray(array, like.dtype), arrays, self._parts[0])
-        self._write_rows(_rows(self.frames, part), "a")
+        self._write_rows(self._rows(self.frames, part), "a")
         self._parts.append(part)
 
     def checkpoint(self, state: Any, *, complete: bool = False) -> None:
@@ -105,6 +84,11 @@ class TrackWriter:
             return f"the first {self.frames} frames are in {self._folder / 'track.csv'}"
         return "nothing was kept"
 
+    def _rows(self, first: int, part: Any) -> Iterator[tuple[Any, ...]]:
+        for i, time_s in enumerate(part.times_s):
+            numbers = (f"{x:.9g}" for x in self._table.numbers(part, i))
+            yield (first + i, f"{time_s:.6f}", *numbers, STATUS_NAMES[int(part.status[i])])
+
     def _write_rows(self, rows: Iterable[tuple[Any, ...]], mode: str) -> None:
         with self._explained(path := self._folder / "track.csv"), path.open(mode, newline="") as file:
             csv.writer(file).writerows(rows)
@@ -117,12 +101,13 @@ class TrackWriter:
             raise OutputError(f"cannot write {path}: {_cause(error)}; {self.kept()}.") from error
 
 
-def begin(folder: Path, run: dict[str, Any], *, overwrite: bool = False) -> TrackWriter:
+def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bool = False) -> TrackWriter:
     """A writer for a new run in `folder`, which is made if need be.
 
     Args:
         folder: where the results go.
         run: what must be equal for a run to be continued (input, configuration, versions), JSON-able.
+        table: how rows are written.
         overwrite: discard an unfinished run that lies there.
 
     Raises:
@@ -140,10 +125,10 @@ def begin(folder: Path, run: dict[str, Any], *, overwrite: bool = False) -> Trac
         path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write into {folder}: {_cause(error)}.") from error
-    return TrackWriter(folder, run, _empty(0))
+    return TrackWriter(folder, run, table, table.empty(0))
 
 
-def resume(folder: Path, run: dict[str, Any], state: Any) -> tuple[TrackWriter, Any]:
+def resume(folder: Path, run: dict[str, Any], table: TrackTable, state: Any) -> tuple[TrackWriter, Any]:
     """`(writer, state)` where the last checkpoint in `folder` left off; `state` is a template of the state.
 
     Raises:
@@ -155,8 +140,8 @@ def resume(folder: Path, run: dict[str, Any], state: Any) -> tuple[TrackWriter, 
     if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
         changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
         raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
-    saved, _ = checkpoint.load(path, {"state": state, "done": _empty(meta["frames"])})
-    return TrackWriter(folder, run, saved["done"]), saved["state"]
+    saved, _ = checkpoint.load(path, {"state": state, "done": table.empty(meta["frames"])})
+    return TrackWriter(folder, run, table, saved["done"]), saved["state"]
 
 
 def can_resume(folder: Path) -> bool:
@@ -170,16 +155,3 @@ def _checkpoint_path(folder: Path) -> Path:
 
 def _cause(error: OSError) -> str:
     return "no space left on the device" if error.errno == errno.ENOSPC else error.strerror or str(error)
-
-
-def _rows(first: int, part: TimedTrack) -> Iterator[tuple[Any, ...]]:
-    for i, time_s in enumerate(part.times_s):
-        numbers = np.concatenate([part.pose[i], part.pose_std[i], [part.ess[i], part.log_evidence[i]]])
-        yield (first + i, f"{time_s:.6f}", *(f"{x:.9g}" for x in numbers), STATUS_NAMES[int(part.status[i])])
-
-
-def _empty(frames: int) -> TimedTrack:
-    pose, pose_std, joints, ess, log_evidence = (
-        np.zeros((frames, *shape), np.float32) for shape in ((22,), (21,), (21, 3), (), ())
-    )
-    return TimedTrack(np.zeros(frames), pose, pose_std, joints, ess, log_evidence, np.zeros(frames, np.int32))

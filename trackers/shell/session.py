@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxfilters.trackers.depth_sequence import DepthSequence, InputError
+from jaxfilters.trackers.recording import InputError, Recording
 from jaxfilters.trackers.shell.results import TrackWriter
 from jaxfilters.trackers.tracker import STATUS_NAMES, SequenceTracker
 
@@ -26,7 +26,7 @@ class Progress(NamedTuple):
 
 
 def follow(
-    sequence: DepthSequence,
+    sequence: Recording,
     tracker: SequenceTracker,
     state: Any,
     writer: TrackWriter,
@@ -41,7 +41,7 @@ def follow(
     chunk_ends: list[float] = []
     for first in range(writer.frames, len(sequence), CHUNK):
         frames, failure = _read(sequence, first, min(first + CHUNK, len(sequence)))
-        if len(frames):
+        if frames:
             times_s = sequence.times_s[first : first + len(frames)]
             state, track = tracker.advance(state, *_filled(frames, times_s - sequence.times_s[0]))
             track = _first(len(frames), track)
@@ -66,21 +66,20 @@ def _first(frames: int, track: Any) -> Any:
     return jax.tree.map(lambda array: np.asarray(array)[:frames], track)
 
 
-def _read(sequence: DepthSequence, first: int, end: int) -> tuple[np.ndarray, InputError | None]:
+def _read(sequence: Recording, first: int, end: int) -> tuple[list[Any], InputError | None]:
     """The frames up to the first unreadable one, and its error."""
-    frames: list[np.ndarray] = []
-    failure = None
+    frames: list[Any] = []
     try:
         for i in range(first, end):
             frames.append(sequence[i])
     except InputError as error:
-        failure = error
-    return np.asarray(frames, np.float32).reshape(len(frames), *sequence.camera.shape), failure
+        return frames, error
+    return frames, None
 
 
-def _filled(frames: np.ndarray, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _filled(frames: list[Any], times_s: np.ndarray) -> tuple[Any, np.ndarray]:
     """Frames and times up to `CHUNK`, the last frame held still: one shape, one compilation, nothing to search."""
     missing = CHUNK - len(frames)
     later = times_s[-1] + np.arange(1, missing + 1) / 30
-    held = np.concatenate([frames, frames[-1:].repeat(missing, axis=0)])
+    held = jax.tree.map(lambda *leaves: np.stack(leaves), *frames, *[frames[-1]] * missing)
     return held, np.concatenate([times_s, later]).astype(np.float32)

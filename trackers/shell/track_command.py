@@ -1,4 +1,4 @@
-"""`jaxfilters track hand-depth` and `jaxfilters demo`."""
+"""A tracker on a recording from the command line: results, pictures and a report in one folder."""
 
 import argparse
 import dataclasses
@@ -7,25 +7,58 @@ import platform
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
-from jaxfilters.trackers import hand_depth
-from jaxfilters.trackers.depth_sequence import DepthSequence, InputError
-from jaxfilters.trackers.shell.depth_files import open_depth
-from jaxfilters.trackers.shell.draw import write_overlay
+from jaxfilters.trackers.recording import InputError, Recording
 from jaxfilters.trackers.shell.progress import ProgressLine
-from jaxfilters.trackers.shell.results import OutputError, TimedTrack, TrackWriter, begin, can_resume, resume
+from jaxfilters.trackers.shell.results import OutputError, TrackTable, TrackWriter, begin, can_resume, resume
 from jaxfilters.trackers.shell.session import Progress, follow
-from jaxfilters.trackers.shell.summary import mean_joint_error, write_summary
 from jaxfilters.trackers.tracker import STATUS_NAMES, SequenceTracker
 
+Made = TypeVar("Made")
 
-def track_hand(options: argparse.Namespace) -> None:
-    """Follow a hand as the command line says, and leave the results in `options.out`.
+
+class Job(NamedTuple):
+    """What one command follows, with what, and how it is shown."""
+
+    sequence: Recording
+    tracker: SequenceTracker
+    config: Any
+    """A dataclass of Python values, with `seed`."""
+    table: TrackTable
+    errors: Callable[[Any], dict[str, float | None]]
+    """`results -> errors` against the truth by name, with units in the names; None where no truth is known."""
+    draw_summary: Callable[..., None]
+    """`(path, results)`; raises `OutputError`."""
+    draw_overlay: Callable[..., None]
+    """`(path, results, frames_per_second, on_progress)`; raises `OutputError`."""
+
+
+def given(config: Callable[..., Made], options: argparse.Namespace) -> Made:
+    """A configuration with the options that were given; the others keep the defaults that stand there."""
+    names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
+    return config(**{name: value for name in names if (value := getattr(options, name, None)) is not None})
+
+
+def refusing(make: Callable[[], Made]) -> Made:
+    """What `make` returns; what it finds wrong is the input's fault.
+
+    Raises:
+        InputError: for a `ValueError`.
+    """
+    try:
+        return make()
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def track(job: Job, options: argparse.Namespace) -> None:
+    """Do the job, and leave the results in `options.out`.
 
     Raises:
         InputError: the recording or an option cannot be used.
@@ -34,80 +67,58 @@ def track_hand(options: argparse.Namespace) -> None:
         KeyboardInterrupt: with what is kept as its text.
     """
     began = time.perf_counter()
-    config = _config(options)
-    sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
-    tracker = _tracker(sequence, config)
-    state = tracker.start(jax.random.key(config.seed), sequence[0])
-    writer, state = _writer(options, _identity(sequence, config), state)
+    state = job.tracker.start(jax.random.key(job.config.seed), job.sequence[0])
+    writer, state = _writer(options, job, state)
     try:
-        rate = _follow(sequence, tracker, state, writer)
-        report = _report(sequence, writer.results, rate, time.perf_counter() - began, config)
+        rate = _follow(job, state, writer)
+        errors = job.errors(writer.results)
+        report = _report(job, writer.results, errors, rate, time.perf_counter() - began)
         writer.finish(report)
-        _write_pictures(options, sequence, writer, rate)
+        _write_pictures(options, job, writer, rate)
     except InputError as error:
         raise InputError(_with_what_is_kept(error, writer)) from None
     except KeyboardInterrupt:
         raise KeyboardInterrupt(writer.kept()) from None
-    _tell(report, options)
+    _tell(report, errors, options)
 
 
-def _config(options: argparse.Namespace) -> hand_depth.HandDepthConfig:
-    names = (field.name for field in dataclasses.fields(hand_depth.HandDepthConfig))
-    given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    try:
-        return hand_depth.HandDepthConfig(**given)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-
-
-def _synthetic(seed: int) -> DepthSequence:
-    sequence, joints = hand_depth.synthetic_sequence(seed)
-    return dataclasses.replace(sequence, joints=np.asarray(joints))
-
-
-def _tracker(sequence: DepthSequence, config: hand_depth.HandDepthConfig) -> SequenceTracker:
-    try:
-        return hand_depth.build(sequence.camera, config)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-
-
-def _identity(sequence: DepthSequence, config: hand_depth.HandDepthConfig) -> dict[str, Any]:
+def _identity(job: Job) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
     return {
-        "input": sequence.fingerprint(),
+        "input": job.sequence.fingerprint(),
         "version": version("jaxfilters"),
-        **{f"config.{name}": value for name, value in dataclasses.asdict(config).items()},
+        **{f"config.{name}": value for name, value in dataclasses.asdict(job.config).items()},
     }
 
 
-def _writer(options: argparse.Namespace, run: dict[str, Any], state: Any) -> tuple[TrackWriter, Any]:
+def _writer(options: argparse.Namespace, job: Job, state: Any) -> tuple[TrackWriter, Any]:
+    run = _identity(job)
     if options.resume and can_resume(options.out):
-        writer, state = resume(options.out, run, state)
+        writer, state = resume(options.out, run, job.table, state)
         print(f"continuing after frame {writer.frames} of {options.out}", file=sys.stderr)
         return writer, state
     if options.resume:
         print(f"nothing to resume in {options.out}: starting with the first frame", file=sys.stderr)
-    return begin(options.out, run, overwrite=options.overwrite), state
+    return begin(options.out, run, job.table, overwrite=options.overwrite), state
 
 
-def _follow(sequence: DepthSequence, tracker: SequenceTracker, state: Any, writer: TrackWriter) -> float:
-    with ProgressLine("tracking", len(sequence)) as line:
+def _follow(job: Job, state: Any, writer: TrackWriter) -> float:
+    with ProgressLine("tracking", len(job.sequence)) as line:
 
         def show(progress: Progress) -> None:
             speed = "" if math.isnan(progress.frames_per_second) else f"{progress.frames_per_second:.0f} frames/s  "
             line.show(progress.done, speed + progress.status)
 
-        return follow(sequence, tracker, state, writer, show)
+        return follow(job.sequence, job.tracker, state, writer, show)
 
 
-def _write_pictures(options: argparse.Namespace, sequence: DepthSequence, writer: TrackWriter, rate: float) -> None:
+def _write_pictures(options: argparse.Namespace, job: Job, writer: TrackWriter, rate: float) -> None:
     results = writer.results
     try:
         if options.video:
             with ProgressLine("drawing", len(results.times_s)) as line:
-                write_overlay(options.out / "overlay.mp4", sequence, results, rate, line.show)
-        write_summary(options.out / "summary.png", sequence, results)
+                job.draw_overlay(options.out / "overlay.mp4", results, rate, line.show)
+        job.draw_summary(options.out / "summary.png", results)
     except OutputError as error:
         raise OutputError(_with_what_is_kept(error, writer)) from None
 
@@ -116,25 +127,18 @@ def _with_what_is_kept(error: Exception, writer: TrackWriter) -> str:
     return f"{str(error).removesuffix('.')}; {writer.kept()}."
 
 
-def _report(
-    sequence: DepthSequence,
-    results: TimedTrack,
-    rate: float,
-    seconds: float,
-    config: hand_depth.HandDepthConfig,
-) -> dict[str, Any]:
+def _report(job: Job, results: Any, errors: dict[str, float | None], rate: float, seconds: float) -> dict[str, Any]:
     counts = Counter(STATUS_NAMES[int(status)] for status in results.status)
-    error = mean_joint_error(sequence, results)
     evidence = float(np.nansum(results.log_evidence, dtype=float))
     return {
-        "input": sequence.name,
+        "input": job.sequence.name,
         "frames": len(results.times_s),
         "frames_per_second": None if math.isnan(rate) else round(rate, 2),
         "seconds": round(seconds, 2),
         "status": {name: counts[name] for name in STATUS_NAMES},
         "log_evidence": evidence if math.isfinite(evidence) else None,
-        "mean_joint_error_mm": None if error is None else round(1000 * error, 2),
-        "config": dataclasses.asdict(config),
+        **errors,
+        "config": dataclasses.asdict(job.config),
         "versions": {
             "jaxfilters": version("jaxfilters"),
             "jax": jax.__version__,
@@ -144,13 +148,19 @@ def _report(
     }
 
 
-def _tell(report: dict[str, Any], options: argparse.Namespace) -> None:
-    speed, error = report["frames_per_second"], report["mean_joint_error_mm"]
+def _tell(report: dict[str, Any], errors: dict[str, float | None], options: argparse.Namespace) -> None:
+    speed = report["frames_per_second"]
     print(
         f"{report['frames']} frames in {report['seconds']:.1f} s"
         + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
         + "".join(f", {report['status'][name]} {name}" for name in ("lost", "searching"))
-        + (f", mean joint error {error:.1f} mm" if error is not None else "")
+        + "".join(f", {_in_words(name, value)}" for name, value in errors.items() if value is not None)
         + f"\nresults in {options.out}: track.csv, track.npz, report.json, summary.png"
         + (", overlay.mp4" if options.video else "")
     )
+
+
+def _in_words(name: str, value: float) -> str:
+    """`mean joint error 1.5 mm` of `mean_joint_error_mm`."""
+    *words, unit = name.split("_")
+    return f"{' '.join(words)} {value:.1f} {unit}"

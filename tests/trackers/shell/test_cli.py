@@ -8,7 +8,7 @@ import pytest
 
 from jaxfilters.trackers import hand_depth
 from jaxfilters.trackers.hand_depth import HandDepthConfig
-from jaxfilters.trackers.shell import session, track_command
+from jaxfilters.trackers.shell import hand_command, session
 from jaxfilters.trackers.shell.cli import main
 from jaxfilters.trackers.shell.devices import available_cores, use_all_cores
 from jaxfilters.trackers.shell.progress import ProgressLine
@@ -80,11 +80,11 @@ def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monk
     configs = []
     build = hand_depth.build
     monkeypatch.setattr(hand_depth, "build", lambda camera, config: configs.append(config) or build(camera, config))
-    given = "--filter pf --particles 64 --stride 3 --scale 0.9 --seed 4 --hand left --no-guide --missing unknown"
+    given = "--filter pf --particles 64 --stride 3 --scale 0.9 --seed 4 --hand left --no-guide --missing unknown --surface mesh"
     assert run("demo", "--out", tmp_path / "a", "--no-video", *given.split()) == 0
     assert run("demo", "--out", tmp_path / "b", "--no-video") == 0
     assert configs == [
-        HandDepthConfig("pf", 64, 3, 4, "left", 0.9, guide=False, missing="unknown"),
+        HandDepthConfig("pf", 64, 3, 4, "left", 0.9, guide=False, missing="unknown", surface="mesh"),
         HandDepthConfig(),
     ]
 
@@ -145,7 +145,7 @@ def test_a_truncated_image_says_what_is_kept_and_can_be_mended(png_folder, tmp_p
 
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_a_mistake_of_ours_shows_its_traceback(tmp_path, monkeypatch):
-    monkeypatch.setattr(track_command, "write_summary", lambda *_: 1 / 0)
+    monkeypatch.setattr(hand_command, "write_summary", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run("demo", "--out", tmp_path / "out", "--no-video")
 

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.depth_sequence import InputError
+from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.depth_files import open_depth
 
 

@@ -7,20 +7,22 @@ import jax
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.depth_sequence import InputError
+from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell import results
 from jaxfilters.trackers.shell.checkpoint import CheckpointError
-from jaxfilters.trackers.shell.results import COLUMNS, OutputError, begin, resume
+from jaxfilters.trackers.shell.hand_table import HAND_TABLE
+from jaxfilters.trackers.shell.results import OutputError, begin, resume
 from jaxfilters.trackers.shell.session import CHUNK, follow
 from jaxfilters.trackers.tracker import STATUS_NAMES
 
+COLUMNS = ("frame", "time_s", *HAND_TABLE.columns, "status")
 RUN = {"input": "abc", "config.seed": 3}
 
 
 def track(recording, tracker, folder, *, resumed=False, stop_after=None, on_progress=lambda progress: None):
     """Follow the recording into `folder`; `stop_after` presses Ctrl-C when that many frames are done."""
     state = tracker.start(jax.random.key(3), recording[0])
-    writer, state = resume(folder, RUN, state) if resumed else (begin(folder, RUN), state)
+    writer, state = resume(folder, RUN, HAND_TABLE, state) if resumed else (begin(folder, RUN, HAND_TABLE), state)
 
     def report(progress):
         on_progress(progress)
@@ -81,7 +83,7 @@ def test_resuming_a_finished_run_computes_nothing(recording, fake_tracker, tmp_p
 
 def test_a_finished_run_may_be_replaced(recording, fake_tracker, tmp_path):
     track(recording, fake_tracker, tmp_path)
-    assert begin(tmp_path, RUN | {"config.seed": 4}).frames == 0
+    assert begin(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE).frames == 0
     assert (tmp_path / "track.csv").read_text().count("\n") == 1
 
 
@@ -90,10 +92,10 @@ def test_another_run_cannot_be_resumed_or_overwritten(recording, fake_tracker, t
         track(recording, fake_tracker, tmp_path, stop_after=CHUNK + 1)
     state = fake_tracker.start(jax.random.key(3), recording[0])
     with pytest.raises(CheckpointError, match=r"cannot be resumed: config.seed was 3 and is 4\."):
-        resume(tmp_path, RUN | {"config.seed": 4}, state)
+        resume(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE, state)
     with pytest.raises(CheckpointError, match=r"holds an unfinished run of 16 frames: continue it with --resume"):
-        begin(tmp_path, RUN)
-    assert begin(tmp_path, RUN, overwrite=True).frames == 0
+        begin(tmp_path, RUN, HAND_TABLE)
+    assert begin(tmp_path, RUN, HAND_TABLE, overwrite=True).frames == 0
 
 
 def unreadable_at(recording, bad):
@@ -108,7 +110,7 @@ def unreadable_at(recording, bad):
 @pytest.mark.parametrize(("bad", "saved"), [(5, 0), (CHUNK, CHUNK), (CHUNK + 5, CHUNK)])
 def test_frames_before_an_unreadable_one_are_kept(recording, fake_tracker, tmp_path, bad, saved):
     track(recording, fake_tracker, tmp_path / "whole")
-    writer = begin(tmp_path / "parts", RUN)
+    writer = begin(tmp_path / "parts", RUN, HAND_TABLE)
     state = fake_tracker.start(jax.random.key(3), recording[0])
     with pytest.raises(InputError, match=rf"{bad}.png: truncated"):
         follow(unreadable_at(recording, bad), fake_tracker, state, writer, lambda progress: None)
@@ -137,7 +139,7 @@ def test_a_full_disk_says_what_is_kept(recording, fake_tracker, tmp_path):
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"cannot write into .*file/out"):
-        begin(tmp_path / "file" / "out", RUN)
+        begin(tmp_path / "file" / "out", RUN, HAND_TABLE)
 
 
 def test_progress_counts_up_and_measures_from_the_second_chunk(recording, fake_tracker, tmp_path):

@@ -8,8 +8,10 @@ import numpy as np
 
 from jaxfilters.trackers.depth_sequence import DepthSequence
 from jaxfilters.trackers.shell.chart import Curve, draw_chart
-from jaxfilters.trackers.shell.draw import caption, depth_range, draw_frame
-from jaxfilters.trackers.shell.results import OutputError, TimedTrack
+from jaxfilters.trackers.shell.hand_draw import depth_range, draw_frame
+from jaxfilters.trackers.shell.hand_table import TimedHandTrack
+from jaxfilters.trackers.shell.results import OutputError
+from jaxfilters.trackers.shell.video import caption
 
 _COLUMNS, _ROWS = 3, 2
 _TILE = 320
@@ -19,7 +21,7 @@ _AXIS_COLORS = ((70, 70, 215), (60, 150, 60), (205, 110, 40))
 _INK = (90, 90, 90)
 
 
-def joint_errors(sequence: DepthSequence, results: TimedTrack) -> np.ndarray | None:
+def joint_errors(sequence: DepthSequence, results: TimedHandTrack) -> np.ndarray | None:
     """(frames,) mean distance in metres between estimated and true joints, NaN for a frame without an estimate.
 
     None where no truth is known.
@@ -30,18 +32,18 @@ def joint_errors(sequence: DepthSequence, results: TimedTrack) -> np.ndarray | N
     return np.linalg.norm(offsets, axis=-1).mean(axis=-1)
 
 
-def mean_joint_error(sequence: DepthSequence, results: TimedTrack) -> float | None:
+def mean_joint_error(sequence: DepthSequence, results: TimedHandTrack) -> float | None:
     """Metres, over the frames that have an estimate; None where there is no such frame or no truth is known."""
     errors = joint_errors(sequence, results)
     return None if errors is None or np.isnan(errors).all() else float(np.nanmean(errors))
 
 
-def draw_summary(sequence: DepthSequence, results: TimedTrack) -> np.ndarray:
+def draw_summary(sequence: DepthSequence, results: TimedHandTrack) -> np.ndarray:
     """(rows, cols, 3) uint8: montage above; wrist with 2-sigma bands, ESS and, where known, the joint error below."""
     return np.concatenate([_montage(sequence, results), *_charts(sequence, results)])
 
 
-def write_summary(path: Path, sequence: DepthSequence, results: TimedTrack) -> None:
+def write_summary(path: Path, sequence: DepthSequence, results: TimedHandTrack) -> None:
     """Write `draw_summary` as a PNG image.
 
     Raises:
@@ -51,7 +53,7 @@ def write_summary(path: Path, sequence: DepthSequence, results: TimedTrack) -> N
         raise OutputError(f"cannot write {path} (is the disk full?).")
 
 
-def _montage(sequence: DepthSequence, results: TimedTrack) -> np.ndarray:
+def _montage(sequence: DepthSequence, results: TimedHandTrack) -> np.ndarray:
     count = len(results.times_s)
     indices = np.linspace(0, count - 1, _COLUMNS * _ROWS).round().astype(int)
     limits = depth_range(results.joints)
@@ -65,7 +67,7 @@ def _montage(sequence: DepthSequence, results: TimedTrack) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _side(sequence: DepthSequence, results: TimedTrack) -> float:
+def _side(sequence: DepthSequence, results: TimedHandTrack) -> float:
     """Camera pixels along a square that holds the hand in nearly every frame."""
     points = np.asarray(sequence.camera.project(jnp.asarray(results.joints)))
     extents = (points.max(axis=1) - points.min(axis=1)).max(axis=-1)
@@ -86,7 +88,7 @@ def _crop(image: np.ndarray, sequence: DepthSequence, joints: np.ndarray, side: 
     return cv2.resize(square, (_TILE, _TILE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
-def _charts(sequence: DepthSequence, results: TimedTrack) -> list[np.ndarray]:
+def _charts(sequence: DepthSequence, results: TimedHandTrack) -> list[np.ndarray]:
     times_s = results.times_s - results.times_s[0]
     errors = joint_errors(sequence, results)
     ess = Curve("", results.ess, _INK)
@@ -104,7 +106,7 @@ def _charts(sequence: DepthSequence, results: TimedTrack) -> list[np.ndarray]:
     return charts
 
 
-def _wrist_curves(results: TimedTrack) -> list[Curve]:
+def _wrist_curves(results: TimedHandTrack) -> list[Curve]:
     wrist, spread = 1000 * results.pose[:, :3], 1000 * results.pose_std[:, :3]
     seen = wrist[np.isfinite(wrist).all(axis=-1)]
     middle = np.median(seen, axis=0) if len(seen) else np.zeros(3)

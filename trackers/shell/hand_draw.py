@@ -1,6 +1,6 @@
 """Pictures of a tracked hand: colour-mapped depth with the skeleton over it, as images and as a video."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.depth_sequence import DepthSequence
-from jaxfilters.trackers.shell.results import OutputError, TimedTrack
+from jaxfilters.trackers.shell.hand_table import TimedHandTrack
+from jaxfilters.trackers.shell.video import STATUS_COLORS, caption, write_video
 from jaxfilters.trackers.tracker import STATUS_NAMES
 
 BONES = tuple((0 if joint % 4 == 1 else joint - 1, joint) for joint in range(1, 21))
@@ -17,7 +18,6 @@ BONES = tuple((0 if joint % 4 == 1 else joint - 1, joint) for joint in range(1, 
 FINGER_COLORS = ((84, 92, 255), (60, 176, 255), (110, 220, 90), (255, 190, 70), (255, 120, 215))
 """Blue, green, red: thumb, index, middle, ring, little."""
 _TRUTH_COLOR = (235, 235, 235)
-_STATUS_COLORS = ((0, 200, 255), (110, 220, 90), (84, 92, 255))
 _SMALLEST_HEIGHT = 480
 """Images with fewer rows are enlarged, so that lines and text stay fine against the hand."""
 _SUBPIXEL = 4
@@ -66,7 +66,7 @@ def draw_skeleton(
             cv2.circle(image, _fixed_point(points[joint]), radius, (255, 255, 255), -1, cv2.LINE_AA, _SUBPIXEL)
 
 
-def draw_frame(sequence: DepthSequence, results: TimedTrack, index: int, limits: tuple[float, float]) -> np.ndarray:
+def draw_frame(sequence: DepthSequence, results: TimedHandTrack, index: int, limits: tuple[float, float]) -> np.ndarray:
     """Frame `index` of the recording with the estimate over it, and the true joints in white where they are known.
 
     `limits` are the depths (near, far) in metres that the colours span.
@@ -82,7 +82,7 @@ def draw_frame(sequence: DepthSequence, results: TimedTrack, index: int, limits:
 def write_overlay(
     path: Path,
     sequence: DepthSequence,
-    results: TimedTrack,
+    results: TimedHandTrack,
     frames_per_second: float,
     on_progress: Callable[[int], None],
 ) -> None:
@@ -91,13 +91,10 @@ def write_overlay(
     Raises:
         OutputError: the video cannot be written.
     """
-    images = _captioned(sequence, results, frames_per_second)
-    steps = np.diff(results.times_s)
-    pace = float(np.clip(1 / np.median(steps), 1, 120)) if len(steps) else 30.0
-    _write_video(path, _counted(images, on_progress), pace)
+    write_video(path, _captioned(sequence, results, frames_per_second), results.times_s, on_progress)
 
 
-def _captioned(sequence: DepthSequence, results: TimedTrack, frames_per_second: float) -> Iterator[np.ndarray]:
+def _captioned(sequence: DepthSequence, results: TimedHandTrack, frames_per_second: float) -> Iterator[np.ndarray]:
     limits = depth_range(results.joints)
     speed = f"{frames_per_second:.0f} frames/s" if np.isfinite(frames_per_second) else ""
     for i, time_s in enumerate(results.times_s - results.times_s[0]):
@@ -105,43 +102,8 @@ def _captioned(sequence: DepthSequence, results: TimedTrack, frames_per_second: 
         status, ess = int(results.status[i]), results.ess[i]
         count = f"ESS {ess:4.0f}" if np.isfinite(ess) else "        "
         caption(image, f"frame {i}   {time_s:6.2f} s   {count}   {speed}", 0)
-        caption(image, STATUS_NAMES[status], 1, _STATUS_COLORS[status])
+        caption(image, STATUS_NAMES[status], 1, STATUS_COLORS[status])
         yield image
-
-
-def caption(image: np.ndarray, text: str, line: int, color: tuple = (255, 255, 255)) -> None:
-    """Write `text` into the top left corner of `image`, `line` lines down, outlined to stay legible on anything."""
-    place = (10, 22 + 22 * line)
-    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
-    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 1, cv2.LINE_AA)
-
-
-def _counted(images: Iterable[np.ndarray], on_progress: Callable[[int], None]) -> Iterator[np.ndarray]:
-    for done, image in enumerate(images, 1):
-        yield image
-        on_progress(done)
-
-
-def _write_video(path: Path, images: Iterator[np.ndarray], frames_per_second: float) -> None:
-    first = next(images)
-    video = cv2.VideoWriter(
-        str(path), cv2.VideoWriter.fourcc(*"mp4v"), frames_per_second, (first.shape[1], first.shape[0])
-    )
-    if not video.isOpened():
-        raise OutputError(f"cannot write {path}: the video could not be opened for writing.")
-    try:
-        video.write(first)
-        for image in images:
-            video.write(image)
-    finally:
-        video.release()
-    # A full disk is no error to the writer: it leaves a file that cannot be opened.
-    check = cv2.VideoCapture(str(path))
-    try:
-        if not check.isOpened():
-            raise OutputError(f"cannot write {path}: the finished video does not open (is the disk full?).")
-    finally:
-        check.release()
 
 
 def _fixed_point(point: np.ndarray) -> tuple[int, int]:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.shell.draw import (
+from jaxfilters.trackers.shell.hand_draw import (
     BONES,
     FINGER_COLORS,
     color_depth,
@@ -13,7 +13,8 @@ from jaxfilters.trackers.shell.draw import (
     draw_skeleton,
     write_overlay,
 )
-from jaxfilters.trackers.shell.results import OutputError, TimedTrack
+from jaxfilters.trackers.shell.hand_table import TimedHandTrack
+from jaxfilters.trackers.shell.results import OutputError
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def results(recording):
     """The truth of the recording, as an estimate."""
     frames = len(recording)
     pose = np.concatenate([recording.joints[:, 0], np.ones((frames, 1)), np.zeros((frames, 18))], axis=1)
-    return TimedTrack(
+    return TimedHandTrack(
         recording.times_s,
         pose.astype(np.float32),
         np.full((frames, 21), 0.003, np.float32),
@@ -113,7 +114,7 @@ def test_the_video_has_every_frame_at_the_pace_of_the_recording(tmp_path, record
 
 def test_one_frame_is_enough_for_a_video(tmp_path, recording, results):
     one = replace(recording, times_s=recording.times_s[:1], joints=None)
-    first = TimedTrack(*(field[:1] for field in results))
+    first = TimedHandTrack(*(field[:1] for field in results))
     write_overlay(tmp_path / "o.mp4", one, first, float("nan"), lambda done: None)
     assert (tmp_path / "o.mp4").stat().st_size > 0
 

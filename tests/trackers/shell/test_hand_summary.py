@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from jaxfilters.trackers.shell.chart import Curve, draw_chart, ticks
-from jaxfilters.trackers.shell.results import OutputError, TimedTrack
-from jaxfilters.trackers.shell.summary import draw_summary, joint_errors, mean_joint_error, write_summary
+from jaxfilters.trackers.shell.hand_summary import draw_summary, joint_errors, mean_joint_error, write_summary
+from jaxfilters.trackers.shell.hand_table import TimedHandTrack
+from jaxfilters.trackers.shell.results import OutputError
 
 RED = (0, 0, 255)
 
@@ -15,7 +16,7 @@ def make_results(recording, joints):
     frames = len(recording)
     pose = np.concatenate([joints[:, 0], np.ones((frames, 1)), np.zeros((frames, 18))], axis=1)
     spread, ones = np.full((frames, 21), 0.003), np.ones(frames)
-    return TimedTrack(recording.times_s, pose, spread, joints, ones, ones, ones.astype(int))
+    return TimedHandTrack(recording.times_s, pose, spread, joints, ones, ones, ones.astype(int))
 
 
 def test_joint_error_is_the_mean_distance(recording):
