@@ -1,0 +1,182 @@
+"""The articulated hand as one model: how its state moves, what is seen of it, and with how much noise."""
+
+from dataclasses import dataclass, field
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.linalg import safe_norm
+from jaxfilters.models.articulated.features import (
+    FULL,
+    SHORTEST_LINK,
+    FeatureSet,
+    ImagedHand,
+    Residual,
+    palm_outline,
+    undirected_residual,
+)
+from jaxfilters.models.articulated.kinematics import Pivot, finger_points, pivot_base, turn, unit_rotation
+from jaxfilters.models.articulated.layout import Layout, white_acceleration_noise, white_acceleration_root
+from jaxfilters.models.articulated.projection import Projection, WeakPerspective
+
+POINT_STD, ALPHA_STD, RHO_STD = 1.0, float(np.deg2rad(2.0)), 1.0
+"""Pixels, radians, pixels."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class ArticulatedHand:
+    """Links seen by one camera, for any Gaussian filter; made by `articulated_hand`.
+
+    `transition`, `process_noise`, `observe`, `observation_noise` and `residual` are what the filters take. Frames are
+    the unit of time; a `control` is the time since the last state in frames, `None` for one.
+    """
+
+    projection: Projection
+    acceleration_std: Float[Array, " m"]
+    """Of position, quaternion and angles, per frame squared, not negative."""
+    point_std: Float[Array, ""]
+    """Noise of each coordinate of a point, pixels, positive."""
+    alpha_std: Float[Array, ""]
+    """Noise of a line's angle, radians, positive."""
+    rho_std: Float[Array, ""]
+    """Noise of a line's distance from the origin, pixels, positive."""
+    origin: Float[Array, " 2"]
+    """The pixel that distances of lines are measured from; near the hand, as a line's noise grows with its distance."""
+    layout: Layout = field(metadata=dict(static=True))
+    features: FeatureSet = field(metadata=dict(static=True))
+    pivot: Pivot = field(metadata=dict(static=True))
+    """`pivot_base` or `pivot_wrist`."""
+    compare: Residual = field(metadata=dict(static=True))
+    """`undirected_residual` or `directed_residual`."""
+
+    def transition(self, x: Float[Array, " n"], control: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
+        """The state with everything moved on by its rate [6], [8]."""
+        dt = 1.0 if control is None else control
+        moved = x.at[self.layout.moving].add(dt * x[self.layout.rates])
+        return self.projection.settle(moved, self.layout)
+
+    def process_noise(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n n"]:
+        """Covariance of what accelerations add to a transition."""
+        return white_acceleration_noise(self.layout, self.acceleration_std, 1.0 if control is None else control)
+
+    def process_noise_root(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n m"]:
+        """A root of `process_noise`."""
+        return white_acceleration_root(self.layout, self.acceleration_std, 1.0 if control is None else control)
+
+    def points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 3"]:
+        """Joints of every finger from base to tip in the camera frame: pixels from the wrist's depth, or metres."""
+        points = finger_points(x, self.layout, pivot=self.pivot)
+        return self.projection.camera_points(x, self.layout, points)
+
+    def image_points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 2"]:
+        """Pixels of `points`."""
+        return self.projection.image_points(self.points(x))
+
+    def image(self, x: Float[Array, " n"]) -> ImagedHand:
+        """Everything that a camera could measure of a hand in this state."""
+        width, height, thickness = x[self.layout.palm]
+        zero = jnp.zeros_like(height)
+        corners = [(a * thickness, b * width) for a in (-0.5, 0.5) for b in (-0.5, 0.5)]
+        # In perspective the palm's edges are not parallel: each is taken along the axis, through its middle.
+        middles = [jnp.stack([0.5 * height, inward, across]) for inward, across in corners]
+        center = jnp.stack([0.5 * height, zero, zero])
+        palm = jnp.stack([jnp.zeros_like(center), center, 2 * center, *middles])
+        palm = self.projection.camera_points(x, self.layout, palm)
+        axis = turn(unit_rotation(x[self.layout.quaternion]), jnp.eye(3, dtype=x.dtype)[0])
+        image = self.projection.image_points(palm)
+        return ImagedHand(
+            wrist=image[0],
+            points=self.image_points(x),
+            palm=palm_outline(self.projection.image_direction(palm[1], axis), image[3:] - self.origin),
+            palm_length=safe_norm(image[2] - image[0]),
+            origin=self.origin,
+        )
+
+    def observe(self, x: Float[Array, " n"]) -> Float[Array, " rows"]:
+        """h(x) [7]: the chosen features of a hand in this state, pixels and radians."""
+        return self.features.stack(self.image(x))
+
+    def usable(self, x: Float[Array, " n"], shortest: float = SHORTEST_LINK) -> Bool[Array, " rows"]:
+        """False for rows that are lines too short to have a direction in this state."""
+        return self.features.usable(self.image(x), shortest)
+
+    def residual(self, y: Float[Array, " rows"], y_hat: Float[Array, " rows"]) -> Float[Array, " rows"]:
+        """Observed minus predicted features, for lines the shorter way round."""
+        return self.compare(y, y_hat, self.features, self.layout.num_fingers)
+
+    def observation_std(self) -> Float[Array, " rows"]:
+        """Standard deviations of the noise of the features."""
+        return self.features.std(self.layout.num_fingers, self.point_std, self.alpha_std, self.rho_std)
+
+    def observation_noise(self) -> Float[Array, "rows rows"]:
+        """Covariance W [7] of the noise of the features."""
+        return jnp.diag(self.observation_std() ** 2)
+
+    @property
+    def feature_names(self) -> tuple[str, ...]:
+        """Of the rows of `observe`."""
+        return self.features.names(self.layout.num_fingers)
+
+
+def articulated_hand(
+    layout: Layout,
+    *,
+    projection: Projection | None = None,
+    features: FeatureSet = FULL,
+    pivot: Pivot = pivot_base,
+    compare: Residual = undirected_residual,
+    acceleration_std: tuple[float, float, float] | None = None,
+    point_std: float = POINT_STD,
+    alpha_std: float = ALPHA_STD,
+    rho_std: float = RHO_STD,
+    origin: tuple[float, float] | None = None,
+) -> ArticulatedHand:
+    """The model with checked numbers; the defaults are weak perspective and the noise of the specification.
+
+    Args:
+        layout: Of the state.
+        projection: `WeakPerspective()` unless given.
+        features: What is observed.
+        pivot: What abduction turns a finger about.
+        compare: How observed and predicted features are subtracted.
+        acceleration_std: Of wrist, quaternion and angles, per frame squared; the projection's unless given.
+        point_std: Noise of a point's coordinates, pixels.
+        alpha_std: Noise of a line's angle, radians.
+        rho_std: Noise of a line's distance, pixels.
+        origin: The pixel that distances of lines are measured from; the optical axis unless given.
+
+    Raises:
+        ValueError: if the layout is not one for the projection, or a number is not finite or has the wrong sign.
+    """
+    projection = WeakPerspective() if projection is None else projection
+    acceleration_std = projection.acceleration_std if acceleration_std is None else acceleration_std
+    center = projection.center() if origin is None else np.asarray(origin)
+    if layout.position_size != projection.position_size:
+        raise ValueError(
+            f"layout.position_size must be {projection.position_size} for {type(projection).__name__}; "
+            f"got {layout.position_size}."
+        )
+    for name, value in (("point_std", point_std), ("alpha_std", alpha_std), ("rho_std", rho_std)):
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} must be positive; got {value}.")
+    if len(acceleration_std) != 3 or not all(0 <= value < np.inf for value in acceleration_std):
+        raise ValueError(f"acceleration_std must be three numbers, zero or more; got {acceleration_std}.")
+    if center.shape != (2,) or not np.all(np.isfinite(center)):
+        raise ValueError(f"origin must be two finite numbers (pixels); got {origin}.")
+    return ArticulatedHand(
+        projection=projection,
+        acceleration_std=layout.per_moving(*acceleration_std),
+        point_std=jnp.asarray(point_std, dtype=float),
+        alpha_std=jnp.asarray(alpha_std, dtype=float),
+        rho_std=jnp.asarray(rho_std, dtype=float),
+        origin=jnp.asarray(center, dtype=float),
+        layout=layout,
+        features=features,
+        pivot=pivot,
+        compare=compare,
+    )
