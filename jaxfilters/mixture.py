@@ -224,23 +224,36 @@ def _usable(candidates: _Candidates) -> Float[Array, " m"]:
 
 
 def _form(model: Mixture, key: AnyKey, state: MixtureState, observation: PyTree) -> _Candidates:
-    """Update every hypothesis with every branch of the observation."""
-    update = partial(model.inner.update, model.inner.params)
-
-    def look(key: AnyKey, component: PyTree) -> tuple[Any, ...]:
-        views, tried = model.branch(component, observation)
-        states, infos = jax.vmap(lambda view: update(key, component, view))(views)
-        return states, infos, jax.vmap(model.margin)(states, infos), tried
-
-    keys = jax.random.split(key, model.capacity)
-    states, infos, margins, tried = jax.vmap(look)(keys, state.components)
+    """Update every hypothesis with every branch of the observation that is to be tried."""
+    views, tried = jax.vmap(model.branch, (0, None))(state.components, observation)
     tried = tried & (state.log_weights > -jnp.inf)[:, None]
+    parents, branches = jnp.indices(tried.shape, dtype=jnp.int32)
+
+    def look(key: AnyKey, component: PyTree, view: PyTree) -> tuple[Any, ...]:
+        after, info = model.inner.update(model.inner.params, key, component, view)
+        return after, info, model.margin(after, info)
+
+    def pass_over(key: AnyKey, component: PyTree, view: PyTree) -> tuple[Any, ...]:
+        _, info, margin = jax.eval_shape(look, key, component, view)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (info, margin))
+        return component, *nothing
+
+    def candidate(inputs: tuple) -> tuple[Any, ...]:
+        is_tried, parent, branch = inputs
+        component = jax.tree.map(lambda leaf: leaf[parent], state.components)
+        view = jax.tree.map(lambda leaf: leaf[parent, branch], views)
+        return jax.lax.cond(is_tried, look, pass_over, keys[parent], component, view)
+
+    # One after the other: few are tried in most frames, the others then cost nothing, and the factorisations of
+    # large matrices in a batch stand still in jaxlib 0.10 where two of them meet on a machine with two cores.
+    keys = jax.random.split(key, model.capacity)
+    places = (tried.ravel(), parents.ravel(), branches.ravel())
+    states, infos, margins = jax.lax.map(candidate, places)
     gain = infos.log_evidence
     invalid = ~jnp.isfinite(gain) | jnp.isnan(margins)
-    fates = jnp.where(tried, jnp.where(invalid, INVALID, KEPT), UNUSED).astype(jnp.int32)
-    parents, branches = jnp.indices(fates.shape, dtype=jnp.int32)
-    every = _Candidates(states, infos, state.log_weights[:, None] + gain, margins, fates, parents, branches)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
+    fates = jnp.where(places[0], jnp.where(invalid, INVALID, KEPT), UNUSED).astype(jnp.int32)
+    log_weights = state.log_weights[places[1]] + gain
+    return _Candidates(states, infos, log_weights, margins, fates, places[1], places[2])
 
 
 def _rejected(candidates: _Candidates) -> tuple[_Candidates, Bool[Array, ""]]:

@@ -1,0 +1,252 @@
+"""Gaussian filters of an articulated hand: one hypothesis with limits, and a bank of hypotheses about depth.
+
+Three ways to filter one hypothesis. `recommended` makes the observation linear to the second order, cuts the belief by
+expectation propagation with memory, and learns lengths from new views only. `literal` is the paper's: an extended
+Kalman filter, half-spaces one after the other in every frame. `unconstrained` is a second-order filter without limits.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters import linalg, mixture
+from jaxfilters.constrained import AfreshEachFrame, ConstrainedInfo, ConstrainedState, Remembering, constrained
+from jaxfilters.extended import Measured, condition
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.kalman import KalmanInfo, joseph
+from jaxfilters.linearize import Linearize, second_order, taylor
+from jaxfilters.models.articulated.ambiguity import (
+    depth_mirrors,
+    mirror_trigger,
+    reversal_trigger,
+    reverse_depth,
+    separated_points,
+)
+from jaxfilters.models.articulated.hand import ArticulatedHand
+from jaxfilters.models.articulated.limits import LimitRows
+from jaxfilters.truncation import LinearConstraints, TruncationInfo, cut, linear_constraints
+from jaxfilters.typing import AnyKey
+from jaxfilters.views import ViewInfo, ViewState, each_view_once
+
+NEW_VIEW = 4.0
+"""Standard deviations of a point's noise by which some joint must be seen elsewhere for a view to be new."""
+SKIP = 4.0
+"""The paper's c_skip: standard deviations beyond which an inequality is not applied."""
+REJECT = -3.0
+"""c_rej: standard deviations outside of an inequality at which a hypothesis is given up."""
+LOG_RATIO = 12.0
+BRANCHES = 4
+
+
+class Inequalities(NamedTuple):
+    """Limits as a filter takes them: arrays, with the names static."""
+
+    constraints: LinearConstraints
+    lasting: Bool[Array, " k"]
+    """True for rows on constant components only."""
+
+
+def inequalities(rows: LimitRows) -> Inequalities:
+    """The rows, checked: see `jaxfilters.truncation.linear_constraints`."""
+    return Inequalities(linear_constraints(rows.normals, rows.lower, rows.upper, rows.names), rows.static)
+
+
+class Look(NamedTuple):
+    """One frame's features, and where a hypothesis is made linear."""
+
+    y: Float[Array, " rows"]
+    """Pixels and radians."""
+    mask: Bool[Array, " rows"]
+    std: Float[Array, " rows"]
+    """Standard deviations of the noise."""
+    at: Float[Array, " n"] | None = None
+    """Point of linearisation; `None` is the predicted mean."""
+    reversed: Bool[Array, ""] | None = None
+    """Whether the prediction is to be mirrored in depth first; `None` is no."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class HandBelief:
+    """Parameters of the innermost filter: predict, and condition on a `Look`."""
+
+    hand: ArticulatedHand
+    prior: Gaussian
+    gate: Float[Array, ""]
+    """Standard deviations of its innovation beyond which a row is left out."""
+    linearize: Linearize = field(metadata={"static": True})
+
+
+def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
+    """Second-order filter, limits counted once, lengths learnt from new views; observations are `Look`s."""
+    inner = constrained(_belief(hand, prior, gate, second_order), Remembering(*limits))
+    constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
+    return each_view_once(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
+
+
+def literal(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
+    """The paper's filter: first-order, half-spaces one by one in every frame (Shimada et al., sections 3 to 5)."""
+    return constrained(_belief(hand, prior, gate, taylor), AfreshEachFrame(limits.constraints, one_by_one))
+
+
+def unconstrained(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
+    """Second-order filter that knows of no limits."""
+    del limits
+    return _belief(hand, prior, gate, second_order)
+
+
+def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"]:
+    """What is seen of a hand wherever it is in the image: its joints from the wrist, pixels."""
+    points = hand.points(x)
+    wrist = hand.projection.camera_points(x, hand.layout, jnp.zeros(3, x.dtype))
+    return (hand.projection.image_points(points) - hand.projection.image_points(wrist)).ravel()
+
+
+def one_by_one(belief: Gaussian, constraints: LinearConstraints) -> tuple[Gaussian, TruncationInfo]:
+    """The paper's truncation with its skip rule."""
+    return cut.sequential_halfspaces(belief, constraints, skip=SKIP)
+
+
+def belief_of(state: ViewState | ConstrainedState | Gaussian) -> Gaussian:
+    """The belief in the state of any of the filters above."""
+    state = state.inner if isinstance(state, ViewState) else state
+    return state.belief if isinstance(state, ConstrainedState) else state
+
+
+class Report(NamedTuple):
+    """What any of the filters above tells of an update."""
+
+    kalman: KalmanInfo
+    least_distance: Float[Array, ""]
+    """Standard deviations to the nearest limit before the cut, negative outside; infinite without limits."""
+    is_new_view: Bool[Array, ""]
+    """Whether lengths were learnt."""
+
+
+def report_of(info: ViewInfo | ConstrainedInfo | KalmanInfo) -> Report:
+    """The same diagnostics of every filter, whatever it is wrapped in."""
+    if isinstance(info, ViewInfo):
+        return report_of(info.inner)._replace(is_new_view=info.is_new)
+    if isinstance(info, ConstrainedInfo):
+        return report_of(info.inner)._replace(least_distance=info.least_distance)
+    return Report(info, jnp.full_like(info.log_evidence, jnp.inf), jnp.ones((), bool))
+
+
+def hypotheses(inner: Filter, hand: ArticulatedHand, *, capacity: int, start: mixture.MixtureState | None) -> Filter:
+    """A bank over the depth ambiguities of a hand (Shimada et al., section 6); observations are `Look`s.
+
+    Every hypothesis is made linear at its mean; where the image of a link hardly depends on its angle, at both poses of
+    the link that is most in doubt instead [30]; and where all fingers may be straight, also with the hand mirrored.
+    Those that leave a limit by more than three standard deviations are given up. Arguments as in `mixture.mixture`.
+    """
+    return mixture.mixture(
+        inner,
+        capacity=capacity,
+        start=start,
+        branch=jax.tree_util.Partial(_branches, hand),
+        margin=_margin,
+        same=jax.tree_util.Partial(_same, hand),
+        log_ratio=LOG_RATIO,
+    )
+
+
+def _belief(hand: ArticulatedHand, prior: Gaussian, gate: float, linearize: Linearize) -> Filter:
+    return Filter(HandBelief(hand, prior, jnp.asarray(gate, dtype=float), linearize), _init, _predict, _update)
+
+
+def _init(model: HandBelief, key: AnyKey) -> Gaussian:
+    del key
+    return model.prior
+
+
+def _predict(model: HandBelief, key: AnyKey, belief: Gaussian, control: Array) -> Gaussian:
+    del key
+    F = jax.jacfwd(model.hand.transition)(belief.mean, control)
+    ahead = joseph.predict(belief, F, model.hand.process_noise(control))
+    return Gaussian(model.hand.transition(belief.mean, control), ahead.covariance)
+
+
+def _update(model: HandBelief, key: AnyKey, belief: Gaussian, look: Look) -> tuple[Gaussian, KalmanInfo]:
+    del key
+    hand = model.hand
+    if look.reversed is not None:
+        mirror = jax.jacfwd(partial(reverse_depth, hand=hand))(belief.mean)
+        turned = linalg.matmul(linalg.matmul(mirror, belief.covariance), mirror.T)
+        mirrored = Gaussian(reverse_depth(belief.mean, hand), turned)
+        belief = jax.tree.map(lambda yes, no: jnp.where(look.reversed, yes, no), mirrored, belief)
+    at = belief.mean if look.at is None else look.at
+    H = jax.jacfwd(hand.observe)(at)
+    noise = jnp.diag(look.std**2)
+    measured = Measured(look.y, look.mask & _within_gate(model, belief, look, H, at), noise)
+    posterior, info = condition(
+        belief, measured, hand.observe, noise, at=at, linearize=model.linearize, residual=hand.residual
+    )
+    # An innovation's likelihood cannot be compared between points of linearisation; the height of the mode can.
+    log_evidence = laplace_log_evidence(hand, belief, posterior, info, H, look)
+    return posterior, replace(info, log_evidence=log_evidence)
+
+
+def _within_gate(model, belief, look, H, at):
+    predicted = jnp.sum(linalg.matmul(H, belief.covariance) * H, axis=1) + look.std**2
+    innovation = model.hand.residual(look.y, model.hand.observe(at)) + H @ (at - belief.mean)
+    return innovation**2 <= model.gate**2 * predicted
+
+
+def laplace_log_evidence(
+    hand: ArticulatedHand, prior: Gaussian, posterior: Gaussian, info: KalmanInfo, H: Float[Array, "rows n"], look: Look
+) -> Float[Array, ""]:
+    r"""Log evidence by Laplace's method at the posterior mean; for a linear observation, that of the innovation.
+
+    $-\frac12(\epsilon^T W^{-1} \epsilon + d^T \tilde P^+ d + \log |2 \pi S|)$ with the nonlinear residual
+    $\epsilon$ and $d$ the correction. As $d = \tilde P H^T S^{-1} \nu$, nothing is inverted that may be singular.
+    """
+    root = info.innovation_root
+    counts = jnp.diagonal(root) > 0
+    missed = jnp.where(counts, hand.residual(look.y, hand.observe(posterior.mean)) / look.std, 0.0)
+    pull = linalg.solve_triangular(root, linalg.solve_triangular(root, info.innovation), transpose=True)
+    correction = jnp.sum(jnp.where(counts, pull * (H @ (posterior.mean - prior.mean)), 0.0))
+    scale = jnp.log(jnp.where(counts, jnp.diagonal(root), 1.0)) + 0.5 * math.log(2 * math.pi)
+    log_scale = jnp.sum(jnp.where(counts, scale, 0.0))
+    value = -0.5 * (jnp.sum(missed**2) + correction) - log_scale
+    return jnp.where(jnp.isneginf(info.log_evidence), -jnp.inf, value)
+
+
+def _branches(hand: ArticulatedHand, state: ViewState, look: Look) -> tuple[Look, Bool[Array, " b"]]:
+    belief = belief_of(state)
+    std = jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance), 0.0))
+    doubtful = mirror_trigger(belief.mean, std, hand)
+    # Of the links in doubt the one whose two poses lie closest together, in standard deviations.
+    sigma = hand.layout.angles_of(std)[:, 1:]
+    distance = jnp.abs(depth_mirrors(belief.mean, hand).change) / jnp.where(sigma > 0, sigma, 1.0)
+    finger, link = jnp.divmod(jnp.argmin(jnp.where(doubtful, distance, jnp.inf)), doubtful.shape[1])
+    both = separated_points(belief.mean, std, hand, finger, link)
+    reversed_mean = reverse_depth(belief.mean, hand)
+    at = jnp.stack([belief.mean, both[0], both[1], reversed_mean])
+    mirrored = jnp.array([False, False, False, True])
+    any_doubt = jnp.any(doubtful)
+    tried = jnp.stack([~any_doubt, any_doubt, any_doubt, reversal_trigger(belief.mean, std, hand.layout)])
+    spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BRANCHES, *leaf.shape)), Look(*look[:3]))
+    return spread._replace(at=at, reversed=mirrored), tried
+
+
+def _margin(state: ViewState | ConstrainedState | Gaussian, info) -> Float[Array, ""]:
+    del state
+    return report_of(info).least_distance - REJECT
+
+
+def _same(hand: ArticulatedHand, heavier: ViewState, lighter: ViewState) -> Bool[Array, ""]:
+    """Whether all joint angles agree within half their deviations and half a degree, and palms within 10 degrees."""
+    a, b = belief_of(heavier), belief_of(lighter)
+    layout = hand.layout
+    spread = sum(jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance)[layout.angles], 0.0)) for belief in (a, b))
+    apart = jnp.abs(a.mean[layout.angles] - b.mean[layout.angles]) > 0.5 * spread + math.radians(0.5)
+    p, q = a.mean[layout.quaternion], b.mean[layout.quaternion]
+    aligned = jnp.abs(p @ q) / (linalg.safe_norm(p) * linalg.safe_norm(q)) > math.cos(math.radians(5.0))
+    return ~jnp.any(apart) & aligned
