@@ -7,6 +7,7 @@ belief; stacked over time or an ensemble the leaves have more axes, and the meth
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ Key = PRNGKeyArray | Array
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
 class Gaussian:
     """A Gaussian by mean and covariance."""
 
@@ -54,6 +56,7 @@ class Gaussian:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
 class GaussianRoot:
     """A Gaussian by mean and any root of its covariance."""
 

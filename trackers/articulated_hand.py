@@ -35,7 +35,7 @@ from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
-from jaxfilters.trackers.articulated_start import NUM_STARTS, Starts, starts_from_keypoints
+from jaxfilters.trackers.articulated_start import NUM_STARTS, Starts, starts_from_points
 from jaxfilters.trackers.feature_sequence import FeatureFrame, FeatureSequence, Start
 from jaxfilters.trackers.tracker import SequenceTracker
 
@@ -147,7 +147,14 @@ def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) ->
     if sequence.start is not None and np.shape(sequence.start.covariance) != (n, n):
         raise ValueError(f"{sequence.name}: start must be ({n},) and ({n}, {n}); got {np.shape(sequence.start.mean)}.")
     start = None if sequence.start is None else Start(*(jnp.asarray(part, dtype=float) for part in sequence.start))
-    setup = _Setup(hand, _limits(hand.layout), start, config)
+    return tracker_of(hand, _limits(hand.layout), start, config)
+
+
+def tracker_of(
+    hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig
+) -> SequenceTracker:
+    """A tracker of any hand; without a start, one of five fingers whose features are points finds its own."""
+    setup = _Setup(hand, limits, start, config)
     return SequenceTracker(partial(_start, setup), partial(_advance, setup))
 
 
@@ -176,7 +183,7 @@ def _starting_bank(setup: _Setup, starts: Starts) -> MixtureState:
 def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     """State before the first frame: what is given, or hypotheses from its keypoints; searching where it has too few."""
     if setup.start is not None:
-        starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.ones((), bool))
+        starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.zeros(1), jnp.ones((), bool))
     else:
         starts = _keypoint_starts(setup, jax.tree.map(jnp.asarray, frame))
     slots = setup.config.hypotheses if setup.config.mode == "recommended" else 1
@@ -195,9 +202,8 @@ def _first_belief(bank: MixtureState) -> Gaussian:
 
 
 def _keypoint_starts(setup: _Setup, frame: FeatureFrame) -> Starts:
-    wrist, bases = frame.y[:2], frame.y[2:12].reshape(5, 2)
-    seen = jnp.concatenate([frame.mask[:2].all()[None], frame.mask[2:12].reshape(5, 2).all(axis=1)])
-    return starts_from_keypoints(setup.hand, wrist, bases, seen)
+    limits = None if setup.config.mode == "unconstrained" else setup.limits.constraints
+    return starts_from_points(setup.hand, limits, frame.y, frame.mask, frame.std)
 
 
 def _advance(
@@ -219,13 +225,14 @@ def _found_again(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Ar
     """The state with a new start where the hand has been missed for long and its keypoints are seen."""
     if setup.start is not None:
         return state
-    starts = _keypoint_starts(setup, frame)
     capacity = state.bank.log_weights.shape[0]
-    fresh = TrackState(
-        _with_slots(setup, _starting_bank(setup, starts), capacity), time, jnp.zeros_like(state.misses), state.key
-    )
-    again = (state.misses > PATIENCE) & starts.found
-    return _select(again, fresh, state)
+
+    def search() -> TrackState:
+        starts = _keypoint_starts(setup, frame)
+        bank = _with_slots(setup, _starting_bank(setup, starts), capacity)
+        return _select(starts.found, TrackState(bank, time, jnp.zeros_like(state.misses), state.key), state)
+
+    return jax.lax.cond(state.misses > PATIENCE, search, lambda: state)
 
 
 def _select(condition: Array, yes: Any, no: Any) -> Any:

@@ -1,6 +1,7 @@
-"""Where an articulated hand may be when it is seen for the first time: hypotheses from 21 keypoints."""
+"""Where an articulated hand may be when it is seen for the first time: hypotheses from points in one image."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,88 +10,204 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.lie import quaternion_multiply, so3_exp
-from jaxfilters.models.articulated.anatomy import PALM_HEIGHT, PALM_WIDTH, template_shape
+from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.models.articulated.projection import Perspective
+from jaxfilters.truncation import LinearConstraints
 
 NUM_STARTS = 6
-_TILTS = (0.0, math.radians(35.0), math.radians(-35.0))
-"""About the axis across the palm: fingers towards the camera or away from it."""
-ROTATION_STD, ANGLE_STD, LENGTH_SHARE = math.radians(25.0), math.radians(25.0), 0.2
-POSITION_STD = 10.0
+FEWEST_POINTS = 4
+_TILTS = (-50.0, -20.0, 20.0, 50.0)
+"""Degrees about the axis across the palm: fingers away from the camera or towards it."""
+_ROLLS = (-45.0, 0.0, 45.0, 135.0, 180.0, 225.0)
+"""Degrees about the axis along the palm: 0 shows its inner side, 180 its back."""
+STEPS = 8
+"""Gauss-Newton steps from each orientation."""
+ROTATION_STD, ANGLE_STD = math.radians(15.0), math.radians(20.0)
+"""About the fitted pose; angles also about the relaxed hand while it is fitted, radians."""
+SIZE_STD, LENGTH_STD = 0.1, 0.08
+"""Of the hand as a whole, and of each length on its own: shares of the average hand's."""
+POSITION_STD = 5.0
 """Pixels."""
+LIMIT_STD = math.radians(3.0)
+"""How far a fitted angle may leave its limits."""
 RATE_STD = (6.0, 0.03, math.radians(4.0))
 """Per frame: pixels, quaternion, radians."""
-_BENT = (0.0, 0.35, 0.35, 0.2)
-"""Abduction and flexions of a relaxed finger, radians."""
-FEWEST_BASES = 2
+_DISTANCE = 0.6
+"""Metres from a camera in perspective at which orientations are compared with the image."""
+SAME_POSE = math.radians(15.0)
+"""Between the palms of two fits that count as one."""
+_SET_BACK = 1e6
+_OUTLIER = 3.0
+"""Standard deviations of a point beyond which its pull on the fit grows no more."""
 
 
 class Starts(NamedTuple):
-    """Gaussians, hypotheses first."""
+    """Gaussians, hypotheses first, the best first."""
 
     means: Float[Array, "h n"]
     covariances: Float[Array, "h n n"]
+    costs: Float[Array, " h"]
+    """Half the squared deviations of points, angles and limits."""
     found: Bool[Array, ""]
-    """Whether enough was seen: the wrist and two finger bases."""
+    """Whether enough was seen: `FEWEST_POINTS` points."""
 
 
-def starts_from_keypoints(
-    hand: ArticulatedHand, wrist: Float[Array, " 2"], bases: Float[Array, "5 2"], seen: Bool[Array, " 6"]
+def starts_from_points(
+    hand: ArticulatedHand,
+    limits: LinearConstraints | None,
+    y: Float[Array, " rows"],
+    mask: Bool[Array, " rows"],
+    std: Float[Array, " rows"],
 ) -> Starts:
-    """Palm or back to the camera, level or tilted by 35 degrees, about what the wrist and the finger bases show.
+    """The poses of an average hand that explain one image best, from many orientations.
+
+    Each orientation is laid over the image by a similarity; those that fit best are refined by Gauss-Newton steps on
+    pose, size and angles, with the relaxed hand as a prior and the limits on angles as barriers.
 
     Args:
-        hand: Five fingers in weak perspective.
-        wrist: Pixels.
-        bases: First joints of the fingers from the thumb on, pixels.
-        seen: Which of wrist and bases were measured; what was not may hold anything.
+        hand: Five fingers whose features are points, (x, y) one after the other.
+        limits: Rows on the state; `None` for none.
+        y: Pixels; what was not measured may hold anything finite.
+        mask: Which rows were measured.
+        std: Noise of the rows, pixels.
     """
     layout = hand.layout
-    shares = jnp.asarray(layout.base_shares, dtype=wrist.dtype)
-    template = shares * jnp.array([PALM_HEIGHT, PALM_WIDTH])
-    usable = (seen[1:] & seen[0])[:, None]
-    offsets = jnp.where(usable, bases - wrist, 0.0)
-    template = jnp.where(usable, template, 0.0)
-    # How palm coordinates (along, across) lie in the image: a similarity for each side of the hand that may be seen.
-    # The angle of the axis along the palm comes from the fingers' mean, its length from all of them.
-    along, forward = jnp.sum(offsets, axis=0), jnp.sum(template[:, 0])
-    direction = jnp.arctan2(along[1], along[0])
-    spread = jnp.sqrt(jnp.sum(template**2))
-    scale = jnp.sqrt(jnp.sum(offsets**2)) / jnp.where(spread > 0, spread, 1.0)
-    found = seen[0] & (jnp.sum(seen[1:]) >= FEWEST_BASES) & (scale > 0) & (forward > 0)
-    scale = jnp.where(found, scale, 1.0)
-    lengths = jnp.asarray(template_shape(), dtype=wrist.dtype)
-
-    def start(flip: Array, tilt: Array) -> tuple[Array, Array]:
-        # A tilt shortens the palm's image: the hand is larger than it looks.
-        size = scale / jnp.cos(tilt)
-        q = _facing(direction, flip, tilt)
-        mean = jnp.zeros(layout.size, wrist.dtype).at[layout.position].set(jnp.where(seen[0], wrist, 0.0))
-        mean = mean.at[layout.quaternion].set(q).at[layout.angles].set(jnp.tile(jnp.array(_BENT), layout.num_fingers))
-        mean = mean.at[layout.static].set(size * lengths)
-        return mean, _covariance(layout, q, size * lengths)
-
-    flips, tilts = np.meshgrid([0.0, math.pi], _TILTS, indexing="ij")
-    means, covariances = jax.vmap(start)(
-        jnp.asarray(flips.ravel(), wrist.dtype), jnp.asarray(tilts.ravel(), wrist.dtype)
-    )
-    return Starts(means, covariances, found)
+    seen = mask.reshape(-1, 2).all(axis=1)
+    target = jnp.where(seen[:, None], y.reshape(-1, 2), 0.0)
+    found = jnp.sum(seen) >= FEWEST_POINTS
+    first = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, seen))(_orientations(y.dtype))
+    states, misfits = first
+    order = jnp.argsort(misfits)[: 2 * NUM_STARTS]
+    fit = partial(_fitted, hand, limits, y, jnp.repeat(seen, 2), std)
+    # One after the other: LAPACK calls in a batch stand still in jaxlib 0.10 on two cores.
+    means, costs = jax.lax.map(fit, states[order])
+    costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+    best = jnp.argsort(_apart(layout, means, costs))[:NUM_STARTS]
+    means = jnp.where(jnp.isfinite(means[best]), means[best], states[order][best])
+    found = found & jnp.all(jnp.isfinite(means))
+    means = jnp.where(found, means, jax.vmap(partial(_template, hand))(_orientations(y.dtype)[:NUM_STARTS]))
+    covariances = jax.vmap(partial(_covariance, hand))(means)
+    return Starts(means, covariances, costs[best], found)
 
 
-def _facing(direction: Array, flip: Array, tilt: Array) -> Array:
-    """Camera from palm, with the palm's axis along `direction` in the image, turned about it and across it."""
-    x, _, z = jnp.eye(3)
-    upright = jnp.array([0.5, -0.5, 0.5, -0.5])  # palm to the camera, its axis up: direction -90 degrees
-    q = quaternion_multiply(so3_exp((direction + 0.5 * jnp.pi) * z), upright)
-    q = quaternion_multiply(q, so3_exp(flip * x))
-    return quaternion_multiply(q, so3_exp(tilt * z))
+def _apart(layout: Layout, means: Array, costs: Array) -> Array:
+    """Costs with those of poses set back that a better one is close to."""
+    q = means[:, layout.quaternion]
+    alike = jnp.abs(q @ q.T) > math.cos(0.5 * SAME_POSE)
+    better = (costs[None] < costs[:, None]) | ((costs[None] == costs[:, None]) & jnp.tri(len(costs), k=-1, dtype=bool))
+    return costs + jnp.where(jnp.any(alike & better, axis=1), _SET_BACK, 0.0)
 
 
-def _covariance(layout: Layout, q: Array, shape: Array) -> Array:
-    moving = layout.per_moving(POSITION_STD, 0.0, ANGLE_STD) ** 2
-    rates = layout.per_moving(*RATE_STD) ** 2
-    variances = jnp.concatenate([moving, rates, (LENGTH_SHARE * shape) ** 2]).astype(q.dtype)
-    across = jnp.eye(4, dtype=q.dtype) - jnp.outer(q, q)
-    block = layout.quaternion
-    return jnp.diag(variances).at[block, block].set((0.5 * ROTATION_STD) ** 2 * across)
+def _orientations(dtype: np.dtype) -> Float[Array, "k 4"]:
+    """Camera from palm, the palm's axis up in the image: turned about it, then across it."""
+    rolls, tilts = np.meshgrid(np.radians(_ROLLS), np.radians(_TILTS), indexing="ij")
+    upright = jnp.array([0.5, -0.5, 0.5, -0.5], dtype)
+    x, _, z = jnp.eye(3, dtype=dtype)
+
+    def one(roll: Array, tilt: Array) -> Array:
+        # Tilted about the image's horizontal: fingers towards the camera whatever side of the hand is seen.
+        return quaternion_multiply(so3_exp(tilt * x), quaternion_multiply(upright, so3_exp(roll * x)))
+
+    del z
+    return jax.vmap(one)(jnp.asarray(rolls.ravel(), dtype), jnp.asarray(tilts.ravel(), dtype))
+
+
+def _template(hand: ArticulatedHand, q: Array) -> Float[Array, " n"]:
+    """The average hand, relaxed, on the optical axis: lengths in millimetres for pixels, or in metres."""
+    layout = hand.layout
+    in_space = isinstance(hand.projection, Perspective)
+    shape = jnp.asarray(template_shape() * (1e-3 if in_space else 1.0), q.dtype)
+    x = jnp.zeros(layout.size, q.dtype).at[layout.quaternion].set(q).at[layout.static].set(shape)
+    x = x.at[layout.angles].set(jnp.asarray(relaxed_angles(layout), q.dtype).ravel())
+    return x.at[2].set(_DISTANCE) if in_space else x
+
+
+def _laid_over(hand: ArticulatedHand, x: Array, target: Array, seen: Array) -> tuple[Array, Array]:
+    """The state turned in the image, moved and scaled to fit the points best, and the mean square of what remains."""
+    layout, weight = hand.layout, seen[:, None] / jnp.maximum(jnp.sum(seen), 1)
+    image = hand.observe(x).reshape(-1, 2)
+    here, there = jnp.sum(weight * image, axis=0), jnp.sum(weight * target, axis=0)
+    a, b = image - here, target - there
+    cos = jnp.sum(weight * a * b)
+    sin = jnp.sum(weight[:, 0] * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    square = jnp.maximum(jnp.sum(weight * a * a), 1e-6)
+    angle, scale = jnp.arctan2(sin, cos), jnp.maximum(jnp.sqrt(cos**2 + sin**2) / square, 1e-3)
+    turned = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
+    misfit = jnp.sum(weight * (b - scale * a @ turned.T) ** 2)
+    z = jnp.eye(3, dtype=x.dtype)[2]
+    q = quaternion_multiply(so3_exp(angle * z), x[layout.quaternion])
+    origin = hand.projection.image_points(hand.projection.camera_points(x, layout, jnp.zeros(3, x.dtype)))
+    wrist = there + scale * turned @ (origin - here)
+    if isinstance(hand.projection, Perspective):
+        camera = hand.projection.camera
+        ray = jnp.append((wrist - camera.center) / camera.focal, 1.0)
+        towards = jnp.cross(z, ray)
+        q = quaternion_multiply(so3_exp(towards), q)
+        return x.at[layout.quaternion].set(q).at[layout.position].set(x[2] / scale * ray), misfit
+    moved = x.at[layout.quaternion].set(q).at[layout.position].set(wrist)
+    return moved.at[layout.static].multiply(scale), misfit
+
+
+def _fitted(
+    hand: ArticulatedHand, limits: LinearConstraints | None, y: Array, seen: Array, std: Array, start: Array
+) -> tuple[Array, Array]:
+    """Gauss-Newton from one state, and the cost at its end."""
+    layout = hand.layout
+    position, rotation, size = layout.position.stop, layout.position.stop + 3, layout.position.stop + 4
+    in_space = isinstance(hand.projection, Perspective)
+    unit = start[2] if in_space else 1.0
+    relaxed = jnp.asarray(relaxed_angles(layout), start.dtype).ravel()
+
+    def state(p: Array) -> Array:
+        x = start.at[layout.position].add(unit * p[:position])
+        x = x.at[layout.quaternion].set(quaternion_multiply(so3_exp(p[position:rotation]), start[layout.quaternion]))
+        return x.at[layout.static].multiply(jnp.exp(p[rotation])).at[layout.angles].add(p[size:])
+
+    def deviations(p: Array) -> Array:
+        x = state(p)
+        missed = jnp.where(seen, (hand.observe(x) - y) / std, 0.0)
+        pair = jnp.sum(jax.lax.stop_gradient(missed).reshape(-1, 2) ** 2, axis=1)
+        missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
+        parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]
+        parts += [p[rotation : rotation + 1] / SIZE_STD] if in_space else []
+        if limits is not None:
+            value = limits.normals @ x
+            outside = jnp.maximum(value - limits.upper, 0.0) + jnp.maximum(limits.lower - value, 0.0)
+            moves = jnp.any(limits.normals[:, layout.angles] != 0, axis=1)
+            parts.append(jnp.where(moves, outside / LIMIT_STD, 0.0))
+        return jnp.concatenate(parts)
+
+    def step(carry: tuple, _: None) -> tuple[tuple, None]:
+        p, cost, damping = carry
+        r, J = deviations(p), jax.jacfwd(deviations)(p)
+        A = J.T @ J
+        change = jnp.linalg.solve(A + damping * jnp.diag(jnp.diagonal(A) + 1e-3), -J.T @ r)
+        tried = p + change
+        after = 0.5 * jnp.sum(deviations(tried) ** 2)
+        better = after < cost
+        damping = jnp.where(better, 0.2 * damping, 5.0 * damping)
+        return (jnp.where(better, tried, p), jnp.where(better, after, cost), damping), None
+
+    zero = jnp.zeros(size + 4 * layout.num_fingers, start.dtype)
+    first = (zero, 0.5 * jnp.sum(deviations(zero) ** 2), jnp.asarray(0.1, start.dtype))
+    (p, cost, _), _ = jax.lax.scan(step, first, None, length=STEPS)
+    return state(p), cost
+
+
+def _covariance(hand: ArticulatedHand, x: Array) -> Array:
+    """Pose as fitted; a hand as a whole may be larger or smaller, in perspective at a distance in proportion."""
+    layout: Layout = hand.layout
+    in_space = isinstance(hand.projection, Perspective)
+    pixel = x[2] / hand.projection.camera.focal[0] if in_space else 1.0
+    position, quaternion, angle = RATE_STD
+    rates = layout.per_moving(1.0, quaternion, angle).at[layout.position].multiply(position * pixel) ** 2
+    moving = layout.per_moving(1.0, 0.0, ANGLE_STD).at[layout.position].multiply(POSITION_STD * pixel) ** 2
+    variances = jnp.concatenate([moving, rates, (LENGTH_STD * x[layout.static]) ** 2]).astype(x.dtype)
+    q = x[layout.quaternion]
+    across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
+    covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)
+    grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static])
+    grows = grows.at[layout.position].set(x[layout.position]) if in_space else grows
+    return covariance + SIZE_STD**2 * jnp.outer(grows, grows)

@@ -1,9 +1,34 @@
-"""Kalman filter atoms in two arithmetics with the same verbs, `predict` and `update`.
+"""Kalman filter atoms in three arithmetics with the same verbs: `predict`, `update`, `rts`, `noise_root`.
 
 `joseph` keeps covariances and is the default; `square_root` keeps roots of them and stays right in float32 where a
-covariance is too ill-conditioned to be written down. Choose by passing the module.
+covariance is too ill-conditioned to be written down; `fast` keeps covariances and subtracts. Choose by passing the
+module.
 """
 
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+from jaxfilters.kalman import fast as fast
 from jaxfilters.kalman import joseph as joseph
 from jaxfilters.kalman import square_root as square_root
 from jaxfilters.kalman.info import KalmanInfo as KalmanInfo
+
+
+@runtime_checkable
+class Arithmetic(Protocol):
+    """A module like `joseph`: how beliefs and noises are written down, and the verbs on them."""
+
+    @property
+    def Belief(self) -> type: ...  # noqa: N802, D102
+
+    @property
+    def predict(self) -> Callable[..., Any]: ...
+
+    @property
+    def update(self) -> Callable[..., Any]: ...
+
+    @property
+    def rts(self) -> Callable[..., Any]: ...
+
+    @property
+    def noise_root(self) -> Callable[..., Any]: ...

@@ -1,18 +1,13 @@
 """Kalman filter atoms on covariances, with Joseph's form of the update: never indefinite by subtraction."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import linalg
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import info
+from jaxfilters.kalman import covariance, factor, info
+from jaxfilters.kalman.covariance import noise_root as noise_root
+from jaxfilters.kalman.covariance import predict as predict
 
-
-def predict(
-    belief: Gaussian, F: Float[Array, "k n"], Q: Float[Array, "k k"], b: Float[Array, " k"] | float = 0.0
-) -> Gaussian:
-    """Belief in `x' = F x + b + q`, q ~ N(0, Q)."""
-    return Gaussian(F @ belief.mean + b, _turned(F, belief.covariance) + Q)
+Belief = Gaussian
 
 
 def update(
@@ -22,25 +17,35 @@ def update(
     R: Float[Array, "m m"],
     y_hat: Float[Array, " m"] | None = None,
     mask: Bool[Array, " m"] | None = None,
+    lost: Float[Array, "m _"] | None = None,
 ) -> tuple[Gaussian, info.KalmanInfo]:
     """Belief after seeing `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics.
 
-    `y_hat` is `H mean` unless given: for a nonlinear observation it is the predicted one, and H its Jacobian.
-    Components where `mask` is False are as if they were not there, whatever `y`, `y_hat` and the rows of `H` and
-    `R` hold, NaN included. The covariance is `(I - K H) P (I - K H)^T + K R K^T` (R. Bucy, P. Joseph, "Filtering for
-    stochastic processes", 1968).
+    `y_hat` is `H mean` unless given: for a nonlinear observation it is the predicted one, and H its Jacobian. `lost` is
+    a root of more noise. Components where `mask` is False are as if they were not there, whatever `y`, `y_hat` and the
+    rows of `H`, `R` and `lost` hold, NaN included; so are those that the diagnostics call invalid or deficient. The
+    covariance is `(I - K H) P (I - K H)^T + K R K^T` (R. Bucy, P. Joseph, "Filtering for stochastic processes", 1968).
     """
-    y, H, R = info.observed(mask, y), info.observed(mask, H), info.observed(mask, info.observed(mask, R).T)
-    y_hat = None if y_hat is None else info.observed(mask, y_hat)
-    P = belief.covariance
-    HP = linalg.matmul(H, P)
-    L = linalg.cholesky(linalg.matmul(HP, H.T) + R)
-    gain = linalg.solve_triangular(L, linalg.solve_triangular(L, HP), transpose=True).T
-    left = jnp.eye(belief.mean.size, dtype=P.dtype) - linalg.matmul(gain, H)
-    deviation = info.innovation(belief.mean, y, H, y_hat)
-    posterior = Gaussian(belief.mean + gain @ deviation, _turned(left, P) + _turned(gain, R))
-    return posterior, info.report(deviation, L)
+    return covariance.update(_form, belief, y, H, R, y_hat, mask, lost)
 
 
-def _turned(F, P):
-    return linalg.matmul(linalg.matmul(F, P), F.T)
+def rts(
+    belief: Gaussian,
+    following: Gaussian,
+    F: Float[Array, "k n"],
+    Q: Float[Array, "k k"],
+    b: Float[Array, " k"] | float = 0.0,
+    lost: Float[Array, "k _"] | None = None,
+) -> Gaussian:
+    """Belief given the future too, from `following`, that of the next step given the same.
+
+    The next step is `x' = F x + b + q`, q ~ N(0, Q). Once x' is known, x has the covariance of an update that measured
+    x'; what is not known of x' comes on top: no covariance is subtracted (H. Rauch, F. Tung, C. Striebel, "Maximum
+    likelihood estimates of linear dynamic systems", AIAA J. 3(8), 1965).
+    """
+    return covariance.rts(_form, belief, following, F, Q, b, lost)
+
+
+def _form(P, H, R, gain, W):
+    del W
+    return factor.turned(covariance.kept(gain, H), P) + factor.turned(gain, R)

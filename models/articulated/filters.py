@@ -6,6 +6,7 @@ Kalman filter, half-spaces one after the other in every frame. `unconstrained` i
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple, no_type_check
@@ -82,24 +83,26 @@ class HandBelief:
     gate: Float[Array, ""]
     """Standard deviations of its innovation beyond which a row is left out."""
     linearize: Linearize = field(metadata={"static": True})
+    corrected: Callable = field(metadata={"static": True})
+    """How a correction of the quaternion is taken: `turned` or `added`."""
 
 
 def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """Second-order filter, limits counted once, lengths learnt from new views; observations are `Look`s."""
-    inner = constrained(_belief(hand, prior, gate, second_order), Remembering(*limits))
+    inner = constrained(_belief(hand, prior, gate, second_order, turned), Remembering(*limits))
     constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
     return each_view_once(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
 
 
 def literal(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """The paper's filter: first-order, half-spaces one by one in every frame (Shimada et al., sections 3 to 5)."""
-    return constrained(_belief(hand, prior, gate, taylor), AfreshEachFrame(limits.constraints, one_by_one))
+    return constrained(_belief(hand, prior, gate, taylor, added), AfreshEachFrame(limits.constraints, one_by_one))
 
 
 def unconstrained(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """Second-order filter that knows of no limits."""
     del limits
-    return _belief(hand, prior, gate, second_order)
+    return _belief(hand, prior, gate, second_order, turned)
 
 
 def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"]:
@@ -157,8 +160,9 @@ def hypotheses(inner: Filter, hand: ArticulatedHand, *, capacity: int, start: mi
     )
 
 
-def _belief(hand: ArticulatedHand, prior: Gaussian, gate: float, linearize: Linearize) -> Filter:
-    return Filter(HandBelief(hand, prior, jnp.asarray(gate, dtype=float), linearize), _init, _predict, _update)
+def _belief(hand: ArticulatedHand, prior: Gaussian, gate: float, linearize: Linearize, corrected: Callable) -> Filter:
+    model = HandBelief(hand, prior, jnp.asarray(gate, dtype=float), linearize, corrected)
+    return Filter(model, _init, _predict, _update)
 
 
 def _init(model: HandBelief, key: AnyKey) -> Gaussian:
@@ -188,9 +192,37 @@ def _update(model: HandBelief, key: AnyKey, belief: Gaussian, look: Look) -> tup
     posterior, info = condition(
         belief, measured, hand.observe, noise, at=at, linearize=model.linearize, residual=hand.residual
     )
+    posterior = model.corrected(hand, belief.mean, posterior)
     # An innovation's likelihood cannot be compared between points of linearisation; the height of the mode can.
     log_evidence = laplace_log_evidence(hand, belief, posterior, info, H, look)
     return posterior, replace(info, log_evidence=log_evidence)
+
+
+def added(hand: ArticulatedHand, before: Float[Array, " n"], after: Gaussian) -> Gaussian:
+    """The belief as it is: the quaternion is corrected like any other number, as in the paper."""
+    del hand, before
+    return after
+
+
+def turned(hand: ArticulatedHand, before: Float[Array, " n"], after: Gaussian) -> Gaussian:
+    """The belief with the quaternion's correction taken as a turn, which leaves the scale alone, and a stretch.
+
+    Added, a turn by an angle a would stretch the quaternion by 1 / cos(a / 2): 20 degrees are 3 % of the hand's size.
+    The covariance turns along, so that a scale that is known stays known.
+    """
+    block = hand.layout.quaternion
+    q = before[block]
+    length = linalg.safe_norm(q)
+    axis = q / length
+    moved = after.mean[block]
+    stretch = jnp.sum(moved * axis)
+    new_axis = moved / linalg.safe_norm(moved)
+    mean = after.mean.at[block].set(stretch * new_axis)
+    # The rotation in the plane of the two axes that takes one to the other.
+    middle = axis + new_axis
+    turn = jnp.eye(4, dtype=q.dtype) - jnp.outer(middle, middle) / (1 + axis @ new_axis) + 2 * jnp.outer(new_axis, axis)
+    whole = jnp.eye(after.mean.size, dtype=q.dtype).at[block, block].set(turn)
+    return Gaussian(mean, linalg.matmul(linalg.matmul(whole, after.covariance), whole.T))
 
 
 def _within_gate(model, belief, look, H, at):

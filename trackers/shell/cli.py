@@ -39,6 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _job(options: argparse.Namespace) -> Any:
+    if getattr(options, "what", None) == "articulated":
+        from jaxfilters.trackers.shell.articulated_command import articulated_job
+
+        return articulated_job(options)
     from jaxfilters.trackers.shell.hand_command import hand_job
 
     return hand_job(options)
@@ -64,17 +68,15 @@ def _parser() -> argparse.ArgumentParser:
     track = commands.add_parser("track", help="follow something in a recording")
     what = track.add_subparsers(dest="what", required=True, metavar="WHAT")
     hand = what.add_parser("hand-depth", help="the pose of one hand in depth images")
-    hand.add_argument(
-        "input",
-        nargs="?",
-        type=Path,
-        metavar="INPUT",
-        help="folder of 16-bit PNGs with camera.json, or .npz with depth_mm and K; without it, a synthetic recording",
-    )
-    hand.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    hand.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
-    hand.set_defaults(overwrite=False)
+    _add_recording(hand, "folder of 16-bit PNGs with camera.json, or .npz with depth_mm and K")
     _add_filter_options(hand)
+    articulated = what.add_parser("articulated", help="lengths and angles of one hand from 2-D features or keypoints")
+    _add_recording(
+        articulated,
+        ".npz with features or keypoints, folder of OpenPose's *_keypoints.json, or .json or .csv of MediaPipe's "
+        "landmarks",
+    )
+    _add_articulated_options(articulated)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
@@ -91,6 +93,54 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _image_size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 640x480; got {text}")
+    return int(width), int(height)
+
+
+def _add_recording(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument(
+        "input", nargs="?", type=Path, metavar="INPUT", help=f"{what}; without it, a synthetic recording"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
+    parser.set_defaults(overwrite=False)
+
+
+def _add_common_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
+    parser.add_argument("--seed", type=_seed, metavar="SEED", help="random seed")
+    parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+
+
+def _add_articulated_options(parser: argparse.ArgumentParser) -> None:
+    """Options that are None unless given, as below."""
+    parser.add_argument(
+        "--mode",
+        choices=("recommended", "literal", "unconstrained"),
+        help="how estimates are kept within the limits of a hand (default: recommended; literal: as in the paper)",
+    )
+    parser.add_argument("--hypotheses", type=int, metavar="N", help="how many at most (default: 6)")
+    parser.add_argument(
+        "--gate", type=float, metavar="SIGMAS", help="leave out features that are farther off (default: 5; 0: never)"
+    )
+    parser.add_argument(
+        "--image-size", type=_image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        metavar="PIXELS",
+        help="standard deviation of a keypoint's coordinate (default: 3 percent of the hand's diagonal)",
+    )
+    parser.add_argument(
+        "--fps", type=float, metavar="FPS", help="frames per second of a recording without times (default: 30)"
+    )
+    _add_common_options(parser)
+
+
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     """Options that are None unless given, so that the defaults stand in one place, the configuration."""
     parser.add_argument("--filter", choices=("rbpf", "pf"), help="Rao-Blackwellized (default) or plain particle filter")
@@ -99,11 +149,9 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
     )
-    parser.add_argument("--seed", type=_seed, metavar="SEED", help="random seed")
     parser.add_argument(
         "--surface", choices=("capsules", "mesh"), help="what particles are rendered as (default: capsules)"
     )
-    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
     parser.add_argument(
         "--guide",
         action=argparse.BooleanOptionalAction,
@@ -114,7 +162,7 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "background", "unknown"),
         help="what pixels without a reading are (default: auto, background if more than half of the first frame)",
     )
-    parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+    _add_common_options(parser)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.models.articulated.features import FULL
+from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
+from jaxfilters.trackers.articulated_hand import ArticulatedTrack
 from jaxfilters.trackers.depth_sequence import from_array
+from jaxfilters.trackers.feature_sequence import FeatureSequence, Start
+from jaxfilters.trackers.shell.articulated_table import TimedArticulatedTrack
 from jaxfilters.trackers.tracker import HandTrack, SequenceTracker
 
 ROWS, COLS, FRAMES = 24, 32, 40
@@ -128,3 +134,100 @@ def _joints(frames):
     fingers = directions[:, None] * np.asarray([0.08, 0.12, 0.14, 0.16])[None, :, None]
     joints = np.asarray([0.0, 0.08, 0.6]) + np.concatenate([np.zeros((1, 3)), fingers.reshape(20, 3)])
     return np.repeat(joints[None], frames, axis=0).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def features():
+    """A hand with two fingers in FRAMES frames, with start and truth; nothing was measured in frame 5."""
+    made = simulate_paper(jax.random.key(2), num_frames=FRAMES)
+    y = np.where(np.asarray(made.masks), np.asarray(made.features, float), np.nan)
+    y[5] = np.nan
+    return FeatureSequence(
+        num_fingers=2,
+        features=FULL,
+        times_s=2.0 + np.arange(FRAMES) / 25,
+        y=y,
+        std=np.tile(np.asarray(made.noise_std, float), (FRAMES, 1)),
+        name="features",
+        start=Start(np.asarray(made.initial_mean, float), np.asarray(made.initial_covariance, float)),
+        truth=np.asarray(made.states, float),
+    )
+
+
+@pytest.fixture(scope="session")
+def perfect_track(features):
+    """The truth of the features, as an estimate."""
+    hand = paper_hand()
+    states = jnp.asarray(features.truth)
+    points = np.asarray(jax.jit(jax.vmap(hand.points))(states))
+    ones = np.ones(FRAMES, np.float32)
+    return TimedArticulatedTrack(
+        times_s=features.times_s,
+        mean=features.truth.astype(np.float32),
+        std=np.full(features.truth.shape, 0.1, np.float32),
+        points=points,
+        image_points=points[..., :2],
+        scale=(features.truth[:, hand.layout.quaternion] ** 2).sum(axis=1).astype(np.float32),
+        weight=ones,
+        num_hypotheses=np.arange(FRAMES, dtype=np.int32) % 3,
+        is_new_view=np.zeros(FRAMES, bool),
+        nis_per_row=ones,
+        least_distance=ones,
+        log_evidence=-ones,
+        status=np.arange(FRAMES, dtype=np.int32) % 3,
+    )
+
+
+@pytest.fixture
+def fake_articulated(monkeypatch, features):
+    """Puts a random walk in the place of the articulated tracker, so that the shell is tested without its cost."""
+    from jaxfilters.trackers import articulated_hand
+
+    monkeypatch.setattr(articulated_hand, "build", build_fake_articulated)
+    monkeypatch.setattr(articulated_hand, "synthetic_sequence", lambda seed: features)
+
+
+def build_fake_articulated(sequence, config):
+    """A tracker whose every row depends on the random key, the frame, the time and all rows before it.
+
+    A frame without any measurement has a row of NaN and the status `searching`.
+    """
+    del config
+    layout = Layout(sequence.num_fingers)
+    first = jnp.zeros(layout.size).at[layout.quaternion].set(jnp.asarray([1.0, 0.0, 0.0, 0.0]))
+    first = first if sequence.start is None else jnp.asarray(sequence.start.mean, jnp.float32)
+    fan = 10.0 * jnp.arange(1.0, 5.0)[None, :, None] * jnp.asarray([1.0, -2.0, 0.5])
+    fan = jnp.tile(fan, (layout.num_fingers, 1, 1)) + 15.0 * jnp.arange(layout.num_fingers)[:, None, None]
+
+    def start(key, frame):
+        return FakeState(key, jnp.zeros((), jnp.int32), first + jnp.mean(frame.y))
+
+    def step(state, inputs):
+        frame, time_s = inputs
+        key, noise_key = jax.random.split(state.key)
+        walk = 0.1 * jax.random.normal(noise_key, (layout.size,), jnp.float32)
+        mean = 0.9 * state.wrist + 0.1 * first + walk + 0.01 * jnp.mean(frame.y) + 0.01 * jnp.sin(time_s)
+        points = fan + jnp.concatenate([mean[layout.position], jnp.zeros(1)])
+        one = jnp.ones((), jnp.float32)
+        row = ArticulatedTrack(
+            mean=mean,
+            std=jnp.full(layout.size, 0.5, jnp.float32),
+            points=points,
+            image_points=points[..., :2],
+            scale=jnp.sum(mean[layout.quaternion] ** 2),
+            weight=0.75 * one,
+            num_hypotheses=jnp.asarray(2, jnp.int32),
+            is_new_view=state.frames % 2 == 0,
+            nis_per_row=one,
+            least_distance=-one,
+            log_evidence=walk[0],
+            status=jnp.asarray(1, jnp.int32),
+        )
+        whole = {"num_hypotheses": 0, "is_new_view": False, "status": 0}
+        nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(**dict.fromkeys(whole, 0.0)))
+        nothing = nothing._replace(**{name: jnp.asarray(x, getattr(row, name).dtype) for name, x in whole.items()})
+        row = jax.tree.map(partial(jnp.where, frame.mask.any()), row, nothing)
+        return FakeState(key, state.frames + 1, mean), row
+
+    advance = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
+    return SequenceTracker(start, advance)
