@@ -175,9 +175,8 @@ def _starting_bank(setup: _Setup, starts: Starts) -> MixtureState:
         filter = _filter(setup, Gaussian(mean, covariance))
         return filter.init(filter.params, jax.random.key(0))
 
-    count = starts.means.shape[0]
     components = jax.vmap(state)(starts.means, starts.covariances)
-    return MixtureState(components, jnp.full(count, -math.log(count), dtype=float))
+    return MixtureState(components, jax.nn.log_softmax(-starts.costs))
 
 
 def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:

@@ -84,12 +84,13 @@ def starts_from_points(
     # One after the other: LAPACK calls in a batch stand still in jaxlib 0.10 on two cores.
     means, costs = jax.lax.map(fit, states[order])
     costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-    best = jnp.argsort(_apart(layout, means, costs))[:NUM_STARTS]
+    apart = _apart(layout, means, costs)
+    best = jnp.argsort(apart)[:NUM_STARTS]
     means = jnp.where(jnp.isfinite(means[best]), means[best], states[order][best])
     found = found & jnp.all(jnp.isfinite(means))
     means = jnp.where(found, means, jax.vmap(partial(_template, hand))(_orientations(y.dtype)[:NUM_STARTS]))
     covariances = jax.vmap(partial(_covariance, hand))(means)
-    return Starts(means, covariances, costs[best], found)
+    return Starts(means, covariances, apart[best], found)
 
 
 def _apart(layout: Layout, means: Array, costs: Array) -> Array:

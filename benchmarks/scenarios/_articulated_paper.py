@@ -107,15 +107,18 @@ def looks_of(sequence: ArticulatedSequence) -> tuple[Look, Float[Array, " t"]]:
 
 
 def _filtered(make, sequences: ArticulatedSequence) -> Runs:
-    model = paper_model()
+    means, covariances = _filter_each(make, paper_model(), sequences)
+    return Runs(*(np.asarray(x, float) for x in (sequences.states, means, covariances)))
 
+
+@partial(jax.jit, static_argnames="make")
+def _filter_each(make, model: Model, sequences: ArticulatedSequence) -> tuple[Array, Array]:
     def one(sequence: ArticulatedSequence) -> tuple[Array, Array]:
         filter = filter_of(make, model, sequence)
         return run_filter(filter, jax.random.key(0), *looks_of(sequence), collect=_keep_shape)[1]
 
     # One after the other: a batch of factorisations may stand still in jaxlib 0.10 on two cores.
-    means, covariances = jax.jit(lambda every: jax.lax.map(one, every))(sequences)
-    return Runs(*(np.asarray(x, float) for x in (sequences.states, means, covariances)))
+    return jax.lax.map(one, sequences)
 
 
 def _keep_shape(state, info) -> tuple[Array, Array]:

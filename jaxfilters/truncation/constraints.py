@@ -47,7 +47,7 @@ def linear_constraints(
             upper bound; the message names the row.
     """
     normals = np.asarray(normals, dtype=float)
-    if normals.ndim != 2:
+    if normals.ndim != 2 or len(normals) == 0:
         raise ValueError(f"normals: expected (k, n), a row for each constraint; got shape {normals.shape}.")
     rows = len(normals)
     names = tuple(f"row {k}" for k in range(rows)) if names is None else tuple(names)

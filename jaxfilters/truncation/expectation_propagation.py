@@ -14,12 +14,12 @@ does not pile up.
 """
 
 from dataclasses import replace
-from functools import partial
 from operator import itemgetter
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfilters import linalg
@@ -44,7 +44,12 @@ class _Rows(NamedTuple):
     """Standard deviation below which a value is no longer known from rounding."""
 
 
-@compiled
+class _Patience(NamedTuple):
+    damping: Array | float
+    max_sweeps: Array | int
+    tolerance: Array | float
+
+
 def truncate(
     belief: Belief,
     constraints: LinearConstraints,
@@ -72,7 +77,13 @@ def truncate(
         The belief, its sites, and diagnostics. `log_mass` is the log of the mean, under the given belief, of the rows
         over the given sites: without given sites, of the share of the belief within all rows.
     """
-    given = no_sites(constraints) if sites is None else sites
+    sites = no_sites(constraints) if sites is None else sites
+    tolerance = _TOLERANCE[belief.mean.dtype] if tolerance is None else tolerance
+    return _truncate(belief, constraints, sites, _Patience(damping, max_sweeps, tolerance))
+
+
+@compiled
+def _truncate(belief, constraints, given, patience):
     directions = jax.vmap(along, (None, 0))(belief, constraints.normals)
     distances = jax.vmap(distances_along)(directions, constraints.lower, constraints.upper)
     active = ~directions.certain
@@ -82,42 +93,24 @@ def truncate(
     start = standardized(given, directions.mean, unit)
     centred = replace(belief, mean=jnp.zeros_like(belief.mean))
 
-    tolerance = _TOLERANCE[belief.mean.dtype] if tolerance is None else tolerance
-    iterate = partial(_iterate, damping=damping, max_sweeps=max_sweeps, tolerance=tolerance)
-    natural, (sweeps, change) = _fixed_point(image(centred, normals), rows, _natural(start), iterate)
-
+    natural, sweeps, change = _fixed_point(image(centred, normals), rows, _natural(start), patience)
     truncated, log_integral = _multiplied(centred, normals, natural - _natural(start))
     marginals = jax.vmap(along, (None, 0))(truncated, normals)
     log_scale = _log_scale(marginals.mean, marginals.deviation, natural, rows, start.log_scale)
     infeasible = jnp.where(active, _outside(marginals, rows), jnp.any(distances < 0, axis=-1))
     log_mass = log_integral + jnp.sum(log_scale - start.log_scale)
     log_mass = jnp.where(jnp.any(infeasible & ~active), -jnp.inf, log_mass)
-    info = TruncationInfo(distances, log_mass, infeasible, sweeps.astype(jnp.int32), change <= tolerance)
+    info = TruncationInfo(distances, log_mass, infeasible, sweeps, change <= patience.tolerance)
     result = destandardized(Sites(*natural.T, log_scale), directions.mean, unit)
     return replace(truncated, mean=belief.mean + truncated.mean), result, info
 
 
-def _fixed_point(belief, rows, start, iterate):
-    """Natural parameters (k, 2) of the sites, where the belief in the values (k,) contains `start`; diagnostics."""
+@jax.custom_jvp
+def _fixed_point(belief, rows, natural, patience):
+    """Natural parameters (k, 2) of the sites that demand themselves, sweeps taken, and the change in the last one.
 
-    def lacking(natural):
-        precision, shift = (natural - start).T
-        identity = jnp.eye(len(start), dtype=start.dtype)
-        P = jnp.linalg.solve(identity + prior * precision, prior)
-        return _demanded(P @ shift, linalg.safe_sqrt(jnp.diagonal(P)), natural, rows) - natural
-
-    def solve_linear(linear, y):
-        unit_vectors = jnp.eye(y.size, dtype=y.dtype).reshape(y.size, *y.shape)
-        columns = jax.vmap(linear)(unit_vectors).reshape(y.size, y.size).T
-        return jnp.linalg.solve(columns, y.ravel()).reshape(y.shape)
-
-    prior = linalg.matmul(belief.root, belief.root.T) if isinstance(belief, GaussianRoot) else belief.covariance
-    solve = lambda _, start: iterate(belief, rows, start)
-    return jax.lax.custom_root(lacking, start, solve, solve_linear, has_aux=True)
-
-
-def _iterate(belief, rows, natural, *, damping, max_sweeps, tolerance):
-    """Natural parameters after enough sweeps; how many it took, and the largest change in the last one."""
+    From the belief in the values (k,), which contains `natural` to begin with.
+    """
     identity = jnp.eye(len(natural), dtype=natural.dtype)
 
     def visit(k, carry):
@@ -126,8 +119,8 @@ def _iterate(belief, rows, natural, *, damping, max_sweeps, tolerance):
         row = jax.tree.map(itemgetter(k), rows)
         step = _demanded(direction.mean, direction.deviation, natural[k], row) - natural[k]
         largest = jnp.maximum(largest, _change(direction, step))
-        belief, _ = _times(belief, direction, damping * step)
-        return belief, natural.at[k].add(damping * step), largest
+        belief, _ = _times(belief, direction, patience.damping * step)
+        return belief, natural.at[k].add(patience.damping * step), largest
 
     def sweep(carry):
         belief, natural, count, _ = carry
@@ -135,10 +128,58 @@ def _iterate(belief, rows, natural, *, damping, max_sweeps, tolerance):
         belief, natural, largest = jax.lax.fori_loop(0, len(natural), visit, (belief, natural, unchanged))
         return belief, natural, count + 1, largest
 
-    unfinished = lambda carry: (carry[3] > tolerance) & (carry[2] < max_sweeps)
+    unfinished = lambda carry: (carry[3] > patience.tolerance) & (carry[2] < patience.max_sweeps)
     start = belief, natural, jnp.int32(0), jnp.full((), jnp.inf, natural.dtype)
-    _, natural, count, largest = jax.lax.while_loop(unfinished, sweep, start)
-    return natural, jnp.stack([count.astype(largest.dtype), largest])
+    return jax.lax.while_loop(unfinished, sweep, start)[1:]
+
+
+@_fixed_point.defjvp
+def _fixed_point_jvp(primals, tangents):
+    # Where lacking(natural, given) = 0: d natural = -(d lacking / d natural)^-1 (d lacking / d given) d given. In this
+    # way a loop of unknown length has derivatives, in both modes, and they cost no memory for its steps.
+    belief, rows, start, _ = primals
+    natural, sweeps, change = _fixed_point(*primals)
+    _, lacking = jax.jvp(lambda *given: _lacking(natural, *given), (belief, rows, start), tangents[:3])
+    step = jnp.linalg.solve(_derivative_of_lacking(natural, belief, rows, start), -lacking.ravel())
+    no_tangent = np.zeros((), jax.dtypes.float0)
+    return (natural, sweeps, change), (step.reshape(natural.shape), no_tangent, jnp.zeros_like(change))
+
+
+def _lacking(natural, belief, rows, start):
+    """What the sites demand beyond themselves."""
+    mean, P = _conditioned(natural - start, belief)
+    return _demanded(mean, linalg.safe_sqrt(jnp.diagonal(P)), natural, rows) - natural
+
+
+def _derivative_of_lacking(natural, belief, rows, start):
+    """That by the natural parameters, as a matrix (2 k, 2 k).
+
+    What a row demands depends on its own marginal and site; its marginal on the sites of all rows: by the precision of
+    site j the mean of row k changes at the rate `-P_kj mean_j` and the variance at `-P_kj^2`, by the shift the mean at
+    `P_kj`.
+    """
+    mean, P = _conditioned(natural - start, belief)
+    own = jnp.stack([mean, jnp.diagonal(P), *natural.T])
+    demanded = lambda own: _demanded(own[0], linalg.safe_sqrt(own[1]), own[2:].T, rows)
+    along_axis = lambda axis: jax.jvp(demanded, (own,), (jnp.broadcast_to(axis[:, None], own.shape),))[1]
+    by_mean, by_variance, by_precision, by_shift = jax.vmap(along_axis)(jnp.eye(4, dtype=own.dtype))
+    by_means = jnp.stack([-P * mean, P], axis=-1)
+    by_variances = jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
+    through_marginals = (
+        by_mean[:, :, None, None] * by_means[:, None] + by_variance[:, :, None, None] * by_variances[:, None]
+    )
+    identity = jnp.eye(len(mean), dtype=P.dtype)
+    itself = jnp.stack([by_precision, by_shift], axis=-1) - jnp.eye(2, dtype=P.dtype)
+    total = through_marginals + itself[:, :, None] * identity[:, None, :, None]
+    return total.reshape(natural.size, natural.size)
+
+
+def _conditioned(natural, belief):
+    """Mean and covariance of a belief of mean zero, times factors with these natural parameters, one a component."""
+    prior = linalg.matmul(belief.root, belief.root.T) if isinstance(belief, GaussianRoot) else belief.covariance
+    precision, shift = natural.T
+    P = jnp.linalg.solve(jnp.eye(len(prior), dtype=prior.dtype) + prior * precision, prior)
+    return P @ shift, P
 
 
 def _change(direction: Direction, step):

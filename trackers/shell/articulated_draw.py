@@ -159,8 +159,8 @@ def _measured(sequence: FeatureSequence, frames: int) -> Measured:
 
 def _canvas(image_shape: tuple[int, int] | None, measured: Measured, joints: np.ndarray) -> Canvas:
     if image_shape is not None:
-        scale = max(1, -(-_SMALLEST_HEIGHT // image_shape[0]))
-        return Canvas((scale * image_shape[0], scale * image_shape[1]), (0.0, 0.0), float(scale))
+        times = max(1, -(-_SMALLEST_HEIGHT // image_shape[0]))
+        return Canvas((times * image_shape[0], times * image_shape[1]), (0.0, 0.0), float(times))
     points = np.concatenate([measured.points.reshape(-1, 2), joints.reshape(-1, 2)])
     points = points[np.isfinite(points).all(axis=-1)]
     low, high = np.percentile(points, (0.5, 99.5), axis=0) if len(points) else (np.zeros(2), np.ones(2))

@@ -10,7 +10,7 @@ from jaxfilters.models.articulated.layout import LINKS, PALM_NAMES, Layout
 from jaxfilters.trackers.feature_sequence import FeatureSequence
 from jaxfilters.trackers.shell.articulated_draw import Scene, draw_frame
 from jaxfilters.trackers.shell.articulated_table import TimedArticulatedTrack
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.shell.chart import Color, Curve, draw_chart
 from jaxfilters.trackers.shell.results import OutputError
 from jaxfilters.trackers.shell.video import caption
 
@@ -104,34 +104,23 @@ def _boxes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def _charts(sequence: FeatureSequence, layout: Layout, results: TimedArticulatedTrack) -> list[np.ndarray]:
     times_s = results.times_s - results.times_s[0]
-    frames = len(times_s)
-    states = np.full((frames, layout.size), np.nan) if sequence.truth is None else sequence.truth[:frames]
-    truth, mean, spread = states.astype(float), results.mean.astype(float), 2 * results.std.astype(float)
-    q, part = layout.quaternion, layout.names.index("q_x")
-    # A quaternion and its negative are one rotation.
-    sign = np.where(np.sum(mean[:, q] * truth[:, q], axis=1) < 0, -1.0, 1.0)
-    scale = np.where(np.isnan(truth[:, q]).any(axis=1), np.nan, np.sum(truth[:, q] ** 2, axis=1))
-    angle = layout.names.index("theta_13")
-    degrees = [np.rad2deg(array[:, angle]) for array in (truth, mean, spread)]
+    states = _Series(sequence, layout, results)
 
-    def chart(title: str, curves: list[Curve], cells: int, x_label: str = "", from_zero: bool = False) -> np.ndarray:
-        size = (_ROWS, _WIDTH // cells)
-        return draw_chart(size, title, times_s, curves, x_label, from_zero=from_zero)
+    def chart(title: str, curves: list[Curve], cells: int, x_label: str = "", *, from_zero: bool = False) -> np.ndarray:
+        return draw_chart((_ROWS, _WIDTH // cells), title, times_s, curves, x_label, from_zero=from_zero)
 
     halves = [
-        chart("scale", _pair(scale, results.scale, None, 2), 2),
-        chart("q_x, with 2 sigma", _pair(sign * truth[:, part], mean[:, part], spread[:, part], 1), 2),
-        chart("theta_13, degrees, with 2 sigma", _pair(*degrees, 0), 2),
+        chart("scale", states.scale(_COLORS[2]), 2),
+        chart("q_x, with 2 sigma", states.curves("q_x", _COLORS[1]), 2),
+        chart("theta_13, degrees, with 2 sigma", states.curves("theta_13", _COLORS[0], factor=180 / np.pi), 2),
         chart("hypotheses", [Curve("", results.num_hypotheses.astype(float), _INK)], 2, from_zero=True),
     ]
-    thirds = []
-    for names in _lengths(layout):
-        curves = []
-        for color, name in enumerate(names):
-            i = layout.names.index(name)
-            curves += _pair(truth[:, i], mean[:, i], spread[:, i], color, name)
-        is_last = len(thirds) >= layout.num_fingers + 1 - 3
-        thirds.append(chart("px", curves, 3, "time (s)" if is_last else ""))
+    thirds: list[np.ndarray] = []
+    groups = _lengths(layout)
+    for i, names in enumerate(groups):
+        pairs = [states.curves(name, color, labelled=True) for name, color in zip(names, _COLORS, strict=True)]
+        curves = [curve for pair in pairs for curve in pair]
+        thirds.append(chart("px", curves, 3, "time (s)" if i >= len(groups) - 3 else ""))
     return [*_rows(halves, 2), *_rows(thirds, 3)]
 
 
@@ -141,13 +130,32 @@ def _lengths(layout: Layout) -> list[list[str]]:
     return [*([f"r_{finger}{link}" for link in range(1, LINKS + 1)] for finger in fingers), list(PALM_NAMES)]
 
 
-def _pair(
-    truth: np.ndarray, mean: np.ndarray, spread: np.ndarray | None, color: int, label: str | None = None
-) -> list[Curve]:
-    """The truth, where it is known, under the estimate."""
-    name = "truth" if label is None else ""
-    known = [Curve(name, truth, _TRUTH)] if np.isfinite(truth).any() else []
-    return [*known, Curve(label or "", mean, _COLORS[color], spread)]
+class _Series:
+    """Numbers of the state over time: estimates, and under them the truth where it is known."""
+
+    def __init__(self, sequence: FeatureSequence, layout: Layout, results: TimedArticulatedTrack):
+        shape = results.mean.shape
+        truth = np.full(shape, np.nan) if sequence.truth is None else sequence.truth[: shape[0]].astype(float)
+        self._layout, self._results, q = layout, results, layout.quaternion
+        # A quaternion and its negative are one rotation.
+        opposite = np.sum(results.mean[:, q] * truth[:, q], axis=1) < 0
+        truth[opposite, q] *= -1
+        self._truth = truth
+
+    def curves(self, name: str, color: Color, *, factor: float = 1.0, labelled: bool = False) -> list[Curve]:
+        """One number times a factor, with a band of two standard deviations."""
+        i = self._layout.names.index(name)
+        mean, std = self._results.mean[:, i].astype(float), self._results.std[:, i].astype(float)
+        estimate = Curve(name if labelled else "", factor * mean, color, 2 * factor * std)
+        return [*self._known(factor * self._truth[:, i], "" if labelled else "truth"), estimate]
+
+    def scale(self, color: Color) -> list[Curve]:
+        """The squared length of the quaternion; its deviation would take correlations, which a track has not."""
+        truth = np.sum(self._truth[:, self._layout.quaternion] ** 2, axis=1)
+        return [*self._known(truth, "truth"), Curve("", self._results.scale.astype(float), color)]
+
+    def _known(self, truth: np.ndarray, label: str) -> list[Curve]:
+        return [Curve(label, truth, _TRUTH)] if np.isfinite(truth).any() else []
 
 
 def _rows(charts: list[np.ndarray], cells: int) -> list[np.ndarray]:

@@ -13,7 +13,6 @@ from jaxfilters.models.articulated.features import FULL
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
-from jaxfilters.trackers.articulated_hand import ArticulatedTrack
 from jaxfilters.trackers.depth_sequence import from_array
 from jaxfilters.trackers.feature_sequence import FeatureSequence, Start
 from jaxfilters.trackers.shell.articulated_table import TimedArticulatedTrack
@@ -192,6 +191,8 @@ def build_fake_articulated(sequence, config):
 
     A frame without any measurement has a row of NaN and the status `searching`.
     """
+    from jaxfilters.trackers.articulated_hand import ArticulatedTrack
+
     del config
     layout = Layout(sequence.num_fingers)
     first = jnp.zeros(layout.size).at[layout.quaternion].set(jnp.asarray([1.0, 0.0, 0.0, 0.0]))

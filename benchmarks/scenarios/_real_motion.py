@@ -1,0 +1,239 @@
+"""Real hands from one view: detections of networks on two sets of depth images, and motion capture through a camera.
+
+Only (u, v) of a network is used. Its metric depth, and the truth, serve for judging alone.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.scenarios._real_markers import MarkedHand, Marker, marked_hand
+from jaxfilters.benchmarks.scenarios._real_mocap import mocap_metrics
+from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
+from jaxfilters.models.articulated.filters import Inequalities, inequalities
+from jaxfilters.models.articulated.hand import articulated_hand
+from jaxfilters.models.articulated.layout import five_fingers
+from jaxfilters.models.articulated.limits import limit_rows
+from jaxfilters.models.articulated.projection import Perspective
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.articulated_hand import TRACKING, ArticulatedConfig, tracker_of
+from jaxfilters.trackers.articulated_start import starts_from_points
+from jaxfilters.trackers.feature_sequence import FeatureFrame
+
+FRAME_INTERVAL = 1 / 30
+NOISE_PER_JITTER = 4.0
+"""Errors of a network persist over frames: they are some times what its second differences show."""
+ACCELERATION_STD = (0.003, 0.01, math.radians(2.0))
+"""Metres, quaternion, radians per frame squared; with the shares below the likeliest of a few on the detections."""
+RATE_KEPT, ANGLE_KEPT = 0.5, 0.9
+HYPOTHESES = 4
+QUICK_FRAMES = 240
+VARIANTS = ("backprojection", "limits_only", "filter_only", "recommended")
+
+
+def _on_palm(name: str, along: float, across: float) -> Marker:
+    return Marker(name, palm=(along, 0.0, across))
+
+
+def _on_finger(name: str, finger: int, along: float) -> Marker:
+    return Marker(name, finger=finger, along=along)
+
+
+NYU_MARKERS = (
+    *(
+        _on_finger(f"{name}_{part}", finger, along)
+        for finger, name in ((4, "pinky"), (3, "ring"), (2, "middle"), (1, "index"))
+        for part, along in (("tip", 3.0), ("pip", 1.0))
+    ),
+    *(_on_finger(f"thumb_{part}", 0, along) for part, along in (("tip", 3.0), ("ip", 2.0), ("mcp", 1.0))),
+    _on_palm("wrist_2", 0.0, -0.2),
+    _on_palm("wrist_1", 0.0, 0.2),
+    _on_palm("palm", 0.75, 0.0),
+)
+"""The 14 joints of NYU: its R are the middle joints (to the tip 43 to 57 mm, nearly constant)."""
+ICVL_MARKERS = (
+    _on_palm("palm", 0.6, 0.0),
+    *(_on_finger(f"{finger}_{link}", finger, link + 0.5) for finger in range(5) for link in range(3)),
+)
+"""The 16 joints of ICVL: centres of links, not joints; so the ratios of their distances, 0.88 of the average hand's."""
+
+
+class HandSet(NamedTuple):
+    """What a recording of detections is."""
+
+    file: str
+    networks: tuple[str, ...]
+    """The first gives the metrics without a suffix."""
+    markers: tuple[Marker, ...]
+    side: float
+    """+1 for a right hand, -1 for a left one."""
+    root: int
+    image_shape: tuple[int, int]
+
+
+SETS = {
+    "nyu": HandSet(
+        "nyu_person1.npz", ("ICCV15_NYU_Feedback", "CVPR18_NYU_V2V_PoseNet"), NYU_MARKERS, 1.0, 13, (480, 640)
+    ),
+    "icvl": HandSet("icvl_seq1.npz", ("CVPR18_ICVL_V2V_PoseNet",), ICVL_MARKERS, -1.0, 0, (240, 320)),
+}
+
+
+class Detections(NamedTuple):
+    """A recording in the camera frame x right, y down, z away."""
+
+    camera: Pinhole
+    pixels: np.ndarray
+    """(frames, markers, 2) of a network."""
+    truth: np.ndarray
+    """(frames, markers, 3) millimetres."""
+    noise: float
+    """Pixels, from the detections alone."""
+
+
+class Lifted(NamedTuple):
+    """3-D markers of one variant."""
+
+    points: np.ndarray
+    """(frames, markers, 3) millimetres."""
+    seconds: float
+    tracked: float
+    """Share of the frames."""
+
+
+def real_motion_metrics(data_dir: Path, quick: bool) -> dict[str, Metric]:
+    """Errors on whichever of the recordings lie in `data_dir`; `quick` takes their first frames and one network."""
+    metrics: dict[str, Metric] = {}
+    for name, chosen in SETS.items():
+        if (data_dir / "handpose_tracks" / chosen.file).exists():
+            for network in chosen.networks[: 1 if quick else None]:
+                suffix = "" if network == chosen.networks[0] else f"_{network.split('_', 2)[2].lower()}"
+                detections = load(data_dir, chosen, network, QUICK_FRAMES if quick else None)
+                metrics |= lifting_metrics(name, suffix, chosen, detections)
+    if (data_dir / "dfki_hand_mocap" / "recording.npz").exists():
+        metrics |= mocap_metrics(data_dir / "dfki_hand_mocap" / "recording.npz", quick)
+    return metrics
+
+
+def load(data_dir: Path, chosen: HandSet, network: str, frames: int | None) -> Detections:
+    """The first frames of one network's detections; all without a number."""
+    data = np.load(data_dir / "handpose_tracks" / chosen.file)
+    K, truth = np.abs(data["K"]), np.asarray(data["gt_uvd"][:frames], float)
+    camera = Pinhole.from_matrix(K, chosen.image_shape)
+    pixels = np.asarray(data[network][:frames, :, :2], float)
+    return Detections(camera, pixels, back_projected(camera, truth), NOISE_PER_JITTER * jitter(pixels))
+
+
+def back_projected(camera: Pinhole, uvd: np.ndarray) -> np.ndarray:
+    """Points (..., 3) in the unit of the depth, from pixels and depth."""
+    ray = (uvd[..., :2] - np.asarray(camera.center)) / np.asarray(camera.focal)
+    return np.concatenate([ray, np.ones_like(ray[..., :1])], axis=-1) * uvd[..., 2:]
+
+
+def jitter(pixels: np.ndarray) -> float:
+    """Standard deviation of what differs from frame to frame, pixels: from the median of absolute second differences.
+
+    White noise of variance s^2 has second differences of variance 6 s^2.
+    """
+    return float(1.4826 * np.median(np.abs(np.diff(pixels, n=2, axis=0))) / math.sqrt(6))
+
+
+def hand_of(chosen: HandSet, detections: Detections) -> tuple[MarkedHand, Inequalities]:
+    """The average hand before the camera, and its limits."""
+    layout = five_fingers(3, chosen.side)
+    hand = articulated_hand(
+        layout,
+        projection=Perspective(detections.camera),
+        acceleration_std=ACCELERATION_STD,
+        point_std=detections.noise,
+    )
+    ease = relaxed_angles(layout).ravel()
+    marked = marked_hand(hand, chosen.markers, ease=ease, rate_kept=RATE_KEPT, angle_kept=ANGLE_KEPT)
+    return marked, inequalities(limit_rows(layout, five_finger_limits(layout)))
+
+
+def onto_root_plane(chosen: HandSet, detections: Detections) -> Lifted:
+    """Every detection at the true depth of the root: what one view says without any knowledge of hands."""
+    depth = np.broadcast_to(detections.truth[:, chosen.root, None, 2:], (*detections.pixels.shape[:2], 1))
+    return Lifted(back_projected(detections.camera, np.concatenate([detections.pixels, depth], axis=-1)), 0.0, 1.0)
+
+
+def frame_by_frame(chosen: HandSet, detections: Detections) -> Lifted:
+    """The most likely pose of an average hand within the limits, each frame alone."""
+    hand, limits = hand_of(chosen, detections)
+    frames = _frames(detections)
+
+    @jax.jit
+    def lift(frames: FeatureFrame) -> jax.Array:
+        def one(frame: FeatureFrame) -> jax.Array:
+            return hand.marker_points(starts_from_points(hand, limits.constraints, *frame).means[0])
+
+        return jax.lax.map(one, frames)
+
+    start = time.perf_counter()
+    points = 1e3 * np.asarray(lift(frames))
+    return Lifted(points, time.perf_counter() - start, 1.0)
+
+
+def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
+    """The tracker in one of its modes, started by itself."""
+
+    def lift(chosen: HandSet, detections: Detections) -> Lifted:
+        hand, limits = hand_of(chosen, detections)
+        frames = _frames(detections)
+        tracker = tracker_of(hand, limits, None, ArticulatedConfig(mode=mode, hypotheses=HYPOTHESES))
+        state = tracker.start(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
+        times = FRAME_INTERVAL * np.arange(len(detections.pixels))
+        jax.block_until_ready(tracker.advance(state, frames, times))
+        start = time.perf_counter()
+        _, track = jax.block_until_ready(tracker.advance(state, frames, times))
+        seconds = time.perf_counter() - start
+        points = jax.lax.map(hand.marker_points, jnp.asarray(track.mean))
+        return Lifted(1e3 * np.asarray(points), seconds, float(np.mean(np.asarray(track.status) == TRACKING)))
+
+    return lift
+
+
+def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detections) -> dict[str, Metric]:
+    """Errors of the four variants on one network, and by how much the last is better than the first."""
+    ways = dict(
+        zip(VARIANTS, (onto_root_plane, frame_by_frame, filtered("unconstrained"), filtered("recommended")), strict=True)
+    )
+    metrics, plain = {}, {}
+    for variant, way in ways.items():
+        lifted = way(chosen, detections)
+        plain[variant], scaled = root_relative_errors(lifted.points, detections.truth, chosen.root)
+        metrics[f"{name}_root_relative_mm_{variant}{suffix}"] = Metric(plain[variant], "mm", "lower")
+        metrics[f"{name}_scaled_root_relative_mm_{variant}{suffix}"] = Metric(scaled, "mm", "lower")
+    reduction = 100 * (1 - plain["recommended"] / plain["backprojection"])
+    metrics[f"{name}_reduction_percent{suffix}"] = Metric(reduction, "%", "higher")
+    metrics[f"{name}_tracked_share{suffix}"] = Metric(lifted.tracked, "", "higher")
+    metrics[f"{name}_frames_per_second{suffix}"] = Metric(len(lifted.points) / lifted.seconds, "frames/s", "higher")
+    return metrics
+
+
+def root_relative_errors(points: np.ndarray, truth: np.ndarray, root: int) -> tuple[float, float]:
+    """Mean distance of markers from the true ones, both from the root: as they are, and with each frame scaled to fit.
+
+    Args:
+        points: (frames, markers, 3).
+        truth: The same.
+        root: Which marker both are taken from; it does not count.
+    """
+    others = np.arange(points.shape[1]) != root
+    a, b = ((p - p[:, root : root + 1])[:, others] for p in (points, truth))
+    scale = np.sum(a * b, axis=(1, 2)) / np.sum(a * a, axis=(1, 2))
+    plain, scaled = (np.linalg.norm(s[:, None, None] * a - b, axis=-1).mean() for s in (np.ones_like(scale), scale))
+    return float(plain), float(scaled)
+
+
+def _frames(detections: Detections) -> FeatureFrame:
+    y = detections.pixels.reshape(len(detections.pixels), -1).astype(np.float32)
+    return FeatureFrame(y, np.isfinite(y), np.full(y.shape, detections.noise, np.float32))
