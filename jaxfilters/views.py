@@ -26,7 +26,7 @@ class Views(NamedTuple):
     """The views that have been learnt from, in a ring."""
 
     signatures: Float[Array, "k d"]
-    count: Int32[Array, ""]
+    num_views: Int32[Array, ""]
     """How many there have been; the last k of them are held."""
 
 
@@ -45,8 +45,8 @@ class ViewInfo(NamedTuple):
     """Info of the inner filter."""
     is_new: Bool[Array, ""]
     """Whether constant quantities were updated."""
-    count: Int32[Array, ""]
-    """Views so far."""
+    num_views: Int32[Array, ""]
+    """So far."""
 
 
 @jax.tree_util.register_dataclass
@@ -124,7 +124,7 @@ def _update(model: EachViewOnce, key: AnyKey, state: ViewState, observation: PyT
     views = remember(state.views, signature)
     learnt, kept = ViewState(updated, views), ViewState(considered, state.views)
     after = jax.tree.map(lambda yes, no: jnp.where(new, yes, no), learnt, kept)
-    return after, ViewInfo(info.log_evidence, info, new, after.views.count)
+    return after, ViewInfo(info.log_evidence, info, new, after.views.num_views)
 
 
 def _belief(state: Gaussian | ConstrainedState) -> Gaussian:
@@ -133,12 +133,12 @@ def _belief(state: Gaussian | ConstrainedState) -> Gaussian:
 
 def is_new(views: Views, signature: Float[Array, " d"], tolerance: float | Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a signature differs from all that are held by more than `tolerance` somewhere."""
-    held = jnp.arange(views.signatures.shape[0]) < views.count
+    held = jnp.arange(views.signatures.shape[0]) < views.num_views
     differs = jnp.max(jnp.abs(views.signatures - signature), axis=1) > tolerance
     return jnp.all(differs | ~held)
 
 
 def remember(views: Views, signature: Float[Array, " d"]) -> Views:
     """The views with one more, in place of the oldest if need be."""
-    place = views.count % views.signatures.shape[0]
-    return Views(views.signatures.at[place].set(signature), views.count + 1)
+    place = views.num_views % views.signatures.shape[0]
+    return Views(views.signatures.at[place].set(signature), views.num_views + 1)

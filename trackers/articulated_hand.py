@@ -5,6 +5,7 @@ Image Sequence Based on Loose Constraints". The filters are those of `jaxfilters
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -159,14 +160,17 @@ def tracker_of(
 
 
 def _limits(layout: Layout) -> Inequalities:
-    limits = {2: table_1, 5: partial(five_finger_limits, layout)}.get(layout.num_fingers)
-    if limits is None:
+    if layout.num_fingers not in (2, 5):
         raise ValueError(f"limits are known for two and for five fingers; got {layout.num_fingers}.")
-    return inequalities(limit_rows(layout, limits()))
+    return inequalities(limit_rows(layout, table_1() if layout.num_fingers == 2 else five_finger_limits(layout)))
 
 
 def _filter(setup: _Setup, prior: Gaussian) -> Filter:
-    make = {"recommended": recommended, "literal": literal, "unconstrained": unconstrained}[setup.config.mode]
+    make: Callable[..., Filter] = {
+        "recommended": recommended,
+        "literal": literal,
+        "unconstrained": unconstrained,
+    }[setup.config.mode]
     return make(setup.hand, prior, setup.limits, gate=setup.config.gate or math.inf)
 
 

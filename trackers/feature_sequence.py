@@ -3,7 +3,7 @@
 import hashlib
 import re
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,20 +34,20 @@ _PATTERNS = {
 class FeatureFrame(NamedTuple):
     """One frame, float32."""
 
-    y: np.ndarray
+    y: Any
     """(rows,) pixels and radians; 0 where nothing was measured."""
-    mask: np.ndarray
+    mask: Any
     """(rows,) bool, False where nothing was measured."""
-    std: np.ndarray
+    std: Any
     """(rows,) standard deviations of the noise, pixels and radians, positive."""
 
 
 class Start(NamedTuple):
     """What is believed before the first frame."""
 
-    mean: np.ndarray
+    mean: Any
     """(n,), in the order of the layout."""
-    covariance: np.ndarray
+    covariance: Any
     """(n, n)."""
 
 

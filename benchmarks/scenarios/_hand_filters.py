@@ -177,7 +177,7 @@ class View:
         """The window about the expected hand; `frame` in metres, NaN without a reading."""
         center = hand_center(expected)
         center = center.at[2].set(jnp.maximum(center[2], 0.1))  # a lost hand may be predicted behind the camera
-        shape = tuple(size // self.stride for size in WINDOW)
+        shape = (WINDOW[0] // self.stride, WINDOW[1] // self.stride)
         window, observed = crop(self.camera, frame, center, shape, self.stride)
         return hand_image(window, isolate(window, observed, expected) if self.segmented else observed)
 

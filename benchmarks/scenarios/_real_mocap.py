@@ -33,6 +33,8 @@ FOCAL, DISTANCE = 3000.0, 3.0
 """Pixels, metres: about one pixel a millimetre."""
 NOISE = 1.0
 """Pixels."""
+MODEL_NOISE = 2.0
+"""Pixels: what the filter takes for the noise; markers on skin are not on a chain of hinges."""
 EVERY = 4
 """Frames of the recording (100 a second) from one to the next that is used."""
 VIEW = (0.0, 0.6, 0.8)
@@ -42,15 +44,17 @@ START_ERROR, START_STD = math.radians(8.0), math.radians(15.0)
 """Of the hand's rotation in the first frame, as in the paper's experiment."""
 _BEGINS = (1, 1, 1, 2, 2)
 """Marker of the triangle where each finger's chain begins."""
-_EASE = np.radians([(-70.0, 40.0, 0.0, 0.0), *([(-10.0, 15.0, 10.0, 20.0)] * 4)])
+_ROLLS = np.radians((45.0, 15.0, 20.0, 30.0, 35.0))
+"""By which the planes that the fingers bend in are turned about the hand's long axis: the arch of the palm."""
+_EASE = np.radians([(0.0, 75.0, 0.0, 0.0), *([(-10.0, 15.0, 10.0, 20.0)] * 4)])
 _EASE_STD = np.radians((15.0, 15.0, 25.0, 25.0))
 """What is believed of the first frame's angles."""
 _LENGTHS = 1e-3 * np.array([(60.0, 40.0, 35.0), *([(85.0, 40.0, 50.0)] * 4)])
 _LENGTHS_STD = 1e-3 * np.array((20.0, 15.0, 15.0))
 """Metres."""
-_RANGES = ((-100.0, 40.0), (-30.0, 80.0), (-30.0, 100.0), (-15.0, 110.0))
+_RANGES = ((-100.0, 40.0), (-30.0, 100.0), (-30.0, 100.0), (-15.0, 110.0))
 """Degrees."""
-_ACCELERATION = (0.003, 0.008, (0.1, 0.1, 2.0, 2.0))
+_ACCELERATION = (0.003, 0.008, (0.5, 0.2, 2.0, 2.0))
 """Metres, quaternion, degrees per frame squared: the first two joints of a chain hardly move."""
 
 
@@ -126,9 +130,9 @@ def chain_model(capture: Capture) -> tuple[MarkedHand, Inequalities]:
     """Five chains from the triangle, and their limits."""
     shares = capture.triangle / 0.1
     bases = tuple((float(shares[i, 0]), float(shares[i, 2])) for i in _BEGINS)
-    layout = Layout(5, 3, bases)
+    layout = Layout(5, 3, bases, tuple((float(roll), 0.0, 0.0) for roll in _ROLLS))
     camera = Pinhole.from_intrinsics(FOCAL, np.zeros(2), (1000, 1000))
-    hand = articulated_hand(layout, projection=Perspective(camera), point_std=NOISE)
+    hand = articulated_hand(layout, projection=Perspective(camera), point_std=MODEL_NOISE)
     position, quaternion, angles = _ACCELERATION
     acceleration = layout.per_moving(position, quaternion, 0.0).at[layout.position.stop + 4 :].set(
         jnp.asarray(np.tile(np.radians(angles), 5), dtype=float)
@@ -180,7 +184,7 @@ def track_lengths(capture: Capture, seed: int) -> tuple[np.ndarray, np.ndarray, 
     pixels = FOCAL * capture.points[..., :2] / capture.points[..., 2:]
     y = (pixels + NOISE * rng.normal(size=pixels.shape)).reshape(len(pixels), -1)
     seen = np.isfinite(y)
-    frames = FeatureFrame(np.where(seen, y, 0.0).astype(np.float32), seen, np.full(y.shape, NOISE, np.float32))
+    frames = FeatureFrame(np.where(seen, y, 0.0).astype(np.float32), seen, np.full(y.shape, MODEL_NOISE, np.float32))
     start = Start(*(jnp.asarray(part, dtype=float) for part in start))
     tracker = tracker_of(hand, limits, start, ArticulatedConfig(hypotheses=4))
     state = tracker.start(jax.random.key(seed), jax.tree.map(lambda leaf: leaf[0], frames))

@@ -18,6 +18,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _articulated_paper as paper
 from jaxfilters.benchmarks.timing import interleaved
+from jaxfilters.filter import run as run_filter
 from jaxfilters.models.synthetic.articulated import SHAPES, simulate_paper
 from jaxfilters.trackers.shell.chart import Curve, draw_chart
 
@@ -54,9 +55,10 @@ def paper_metrics(seeds: range) -> dict[str, Metric]:
             final[mode, shape] = found.pop("final_r13_px")
             _say(f"  {mode:14} shape {shape}: " + "  ".join(f"{name} {value:.3g}" for name, value in found.items()))
             for name, value in found.items():
-                better = "higher" if name.startswith("coverage") else "lower"
                 unit = "px" if name.endswith("_px") else "deg" if name.endswith("_deg") else ""
-                metrics[f"{name}_{mode}_shape{shape}"] = Metric(value, unit, better)
+                metrics[f"{name}_{mode}_shape{shape}"] = Metric(
+                    value, unit, "higher" if name.startswith("coverage") else "lower"
+                )
         difference = abs(final[mode, 2] - final[mode, 1])
         metrics[f"r13_difference_px_{mode}"] = Metric(difference, "px", "higher")
     metrics["nees_lengths_band_low"] = Metric(low, "", "higher")
@@ -111,8 +113,11 @@ def _plot_held(path: Path, runs: dict[str, paper.Runs]) -> None:
     for mode, of_mode in runs.items():
         spread = np.sqrt(np.diagonal(of_mode.length_covariances, axis1=-2, axis2=-1)).mean(axis=(0, 2))
         error = np.sqrt((of_mode.length_errors**2).mean(axis=(0, 2)))
-        gray = tuple(int(0.5 * (255 + part)) for part in COLORS[mode])
-        deviations += [Curve(f"{mode}: deviation", spread, COLORS[mode]), Curve(f"{mode}: true error", error, gray)]
+        blue, green, red = (int(0.5 * (255 + part)) for part in COLORS[mode])
+        deviations += [
+            Curve(f"{mode}: deviation", spread, COLORS[mode]),
+            Curve(f"{mode}: true error", error, (blue, green, red)),
+        ]
         nees = np.mean(paper.nees(of_mode.length_errors, of_mode.length_covariances), axis=0) / 6
         values.append(Curve(mode, np.log10(nees), COLORS[mode]))
     charts = [
@@ -130,7 +135,7 @@ def time_metrics(rounds: int) -> dict[str, Metric]:
     calls = {}
     for mode, make in paper.FILTERS.items():
         filter = paper.filter_of(make, paper.paper_model(), sequence)
-        calls[mode] = lambda filter=filter: paper.run_filter(filter, jax.random.key(0), looks, controls)
+        calls[mode] = lambda filter=filter: run_filter(filter, jax.random.key(0), looks, controls)
     seconds = interleaved(calls, rounds)
     per_frame = {mode: 1e6 * value / len(sequence.features) for mode, value in seconds.items()}
     metrics = {f"step_us_{mode}": Metric(value, "us", "lower") for mode, value in per_frame.items()}

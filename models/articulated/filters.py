@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +112,7 @@ def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"
     return (hand.projection.image_points(points) - hand.projection.image_points(wrist)).ravel()
 
 
-def one_by_one(belief: Gaussian, constraints: LinearConstraints) -> tuple[Gaussian, TruncationInfo]:
+def one_by_one(belief: Any, constraints: LinearConstraints) -> tuple[Any, TruncationInfo]:
     """The paper's truncation with its skip rule."""
     return cut.sequential_halfspaces(belief, constraints, skip=SKIP)
 
@@ -182,9 +182,10 @@ def _update(model: HandBelief, key: AnyKey, belief: Gaussian, look: Look) -> tup
     hand = model.hand
     if look.reversed is not None:
         mirror = jax.jacfwd(partial(reverse_depth, hand=hand))(belief.mean)
-        turned = linalg.matmul(linalg.matmul(mirror, belief.covariance), mirror.T)
-        mirrored = Gaussian(reverse_depth(belief.mean, hand), turned)
-        belief = jax.tree.map(lambda yes, no: jnp.where(look.reversed, yes, no), mirrored, belief)
+        covariance = linalg.matmul(linalg.matmul(mirror, belief.covariance), mirror.T)
+        mirrored = Gaussian(reverse_depth(belief.mean, hand), covariance)
+        chosen = partial(jnp.where, look.reversed)
+        belief = jax.tree.map(chosen, mirrored, belief)
     at = belief.mean if look.at is None else look.at
     H = jax.jacfwd(hand.observe)(at)
     noise = jnp.diag(look.std**2)

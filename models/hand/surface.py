@@ -17,7 +17,9 @@ from jaxfilters.models.rendering.geometry import ConvexParts, convex_parts
 class HandSurface(Protocol):
     """A pytree that knows its skeleton and how it looks."""
 
-    geometry: HandGeometry
+    @property
+    def geometry(self) -> HandGeometry:
+        """Of the skeleton."""
 
     def scaled(self, scale: float | Float[Array, ""]) -> "HandSurface":
         """The same hand with every length multiplied by `scale` (may be traced)."""
@@ -36,10 +38,10 @@ class CapsuleHand:
 
     geometry: HandGeometry
 
-    def scaled(self, scale):
+    def scaled(self, scale: float | Array) -> "CapsuleHand":
         return CapsuleHand(self.geometry.scaled(scale))
 
-    def compare(self, camera, pose, observed, max_error):
+    def compare(self, camera: Pinhole, pose: Array, observed: Array, max_error: float) -> DepthTerms:
         return compare_capsules(camera, forward_kinematics(pose, self.geometry).capsules, observed, max_error)
 
 
@@ -53,11 +55,11 @@ class MeshHand:
     parts: ConvexParts
     """In the frames of `part_transforms`, in the order of `PART_NAMES`."""
 
-    def scaled(self, scale):
+    def scaled(self, scale: float | Array) -> "MeshHand":
         parts = replace(self.parts, offsets=self.parts.offsets * scale, corners=self.parts.corners * scale)
         return MeshHand(self.geometry.scaled(scale), parts)
 
-    def compare(self, camera, pose, observed, max_error):
+    def compare(self, camera: Pinhole, pose: Array, observed: Array, max_error: float) -> DepthTerms:
         return compare_convex_parts(camera, self.parts, part_transforms(pose, self.geometry), observed, max_error)
 
 

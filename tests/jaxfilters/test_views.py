@@ -83,7 +83,7 @@ def test_where_every_view_is_new_it_is_the_inner_filter(x64):
     _, (alone, _) = jaxfilters.run(inner, jax.random.key(0), y, collect=keep_all)
     _, (views, infos) = jaxfilters.run(filter, jax.random.key(0), y, collect=keep_all)
     assert np.all(infos.is_new)
-    np.testing.assert_array_equal(infos.count, 1 + np.arange(12))
+    np.testing.assert_array_equal(infos.num_views, 1 + np.arange(12))
     np.testing.assert_allclose(views.inner.mean, alone.mean, rtol=1e-12)
     np.testing.assert_allclose(views.inner.covariance, alone.covariance, rtol=1e-12)
 
