@@ -77,8 +77,7 @@ def starts_from_points(
     seen = mask.reshape(-1, 2).all(axis=1)
     target = jnp.where(seen[:, None], y.reshape(-1, 2), 0.0)
     found = jnp.sum(seen) >= FEWEST_POINTS
-    first = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, seen))(_orientations(y.dtype))
-    states, misfits = first
+    states, misfits = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, seen))(_orientations(y.dtype))
     order = jnp.argsort(misfits)[: 2 * NUM_STARTS]
     fit = partial(_fitted, hand, limits, y, jnp.repeat(seen, 2), std)
     # One after the other: LAPACK calls in a batch stand still in jaxlib 0.10 on two cores.
@@ -105,13 +104,12 @@ def _orientations(dtype: np.dtype) -> Float[Array, "k 4"]:
     """Camera from palm, the palm's axis up in the image: turned about it, then across it."""
     rolls, tilts = np.meshgrid(np.radians(_ROLLS), np.radians(_TILTS), indexing="ij")
     upright = jnp.array([0.5, -0.5, 0.5, -0.5], dtype)
-    x, _, z = jnp.eye(3, dtype=dtype)
+    x = jnp.eye(3, dtype=dtype)[0]
 
     def one(roll: Array, tilt: Array) -> Array:
         # Tilted about the image's horizontal: fingers towards the camera whatever side of the hand is seen.
         return quaternion_multiply(so3_exp(tilt * x), quaternion_multiply(upright, so3_exp(roll * x)))
 
-    del z
     return jax.vmap(one)(jnp.asarray(rolls.ravel(), dtype), jnp.asarray(tilts.ravel(), dtype))
 
 
@@ -200,8 +198,8 @@ def _fitted(
 def _covariance(hand: ArticulatedHand, x: Array) -> Array:
     """Pose as fitted; a hand as a whole may be larger or smaller, in perspective at a distance in proportion."""
     layout: Layout = hand.layout
-    in_space = isinstance(hand.projection, Perspective)
-    pixel = x[2] / hand.projection.camera.focal[0] if in_space else 1.0
+    projection = hand.projection
+    pixel = x[2] / projection.camera.focal[0] if isinstance(projection, Perspective) else 1.0
     position, quaternion, angle = RATE_STD
     rates = layout.per_moving(1.0, quaternion, angle).at[layout.position].multiply(position * pixel) ** 2
     moving = layout.per_moving(1.0, 0.0, ANGLE_STD).at[layout.position].multiply(POSITION_STD * pixel) ** 2
@@ -210,5 +208,6 @@ def _covariance(hand: ArticulatedHand, x: Array) -> Array:
     across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
     covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)
     grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static])
-    grows = grows.at[layout.position].set(x[layout.position]) if in_space else grows
+    if isinstance(projection, Perspective):
+        grows = grows.at[layout.position].set(x[layout.position])
     return covariance + SIZE_STD**2 * jnp.outer(grows, grows)

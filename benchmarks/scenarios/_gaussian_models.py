@@ -107,5 +107,6 @@ def build(problem: Problem, model: Coupled | Ranging, arithmetic: Arithmetic) ->
     ]
     if arithmetic is square_root:
         prior = GaussianRoot(mean, jnp.sqrt(covariance))
-        return extended(prior, model.move, jnp.sqrt(noises[0]), model.observe, jnp.sqrt(noises[1]), arithmetic=arithmetic)
+        roots = [jnp.sqrt(noise) for noise in noises]
+        return extended(prior, model.move, roots[0], model.observe, roots[1], arithmetic=arithmetic)
     return extended(Gaussian(mean, covariance), model.move, noises[0], model.observe, noises[1], arithmetic=arithmetic)

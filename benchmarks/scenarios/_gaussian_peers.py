@@ -43,7 +43,7 @@ def cuthbert(problem: Problem) -> LogEvidence:
         filtering = moments.build_filter(
             problem.start.mean,
             root_P,
-            lambda state, reading: (lambda x: (model.move(x), root_Q), state.mean),
+            lambda state, _reading: (lambda x: (model.move(x), root_Q), state.mean),
             lambda state, reading: (lambda x: (model.observe(x), root_R), state.mean, reading),
         )
         states = library.filter(filtering, readings, filtering.init_prepare())
@@ -56,7 +56,10 @@ def filterpy(problem: Problem) -> Callable[[], float]:
     """Extended Kalman filter of filterpy in numpy and float64, with the Jacobians of `Coupled` written out."""
     kalman = import_module("filterpy.kalman")
     Q, R = (np.asarray(noise, np.float64) for noise in _noises(problem))
-    A, C = (np.asarray(matrix, np.float64) for matrix in (problem.model.A, problem.model.C))
+    model = problem.model
+    if not isinstance(model, Coupled):
+        raise TypeError(f"model must be Coupled; got {type(model).__name__}.")
+    A, C = (np.asarray(matrix, np.float64) for matrix in (model.A, model.C))
     readings = np.asarray(problem.readings, np.float64)
 
     def observe(x: np.ndarray) -> np.ndarray:
@@ -69,7 +72,7 @@ def filterpy(problem: Problem) -> Callable[[], float]:
         filtering = kalman.ExtendedKalmanFilter(dim_x=A.shape[0], dim_z=C.shape[0])
         filtering.x, filtering.P = np.zeros(A.shape[0]), np.asarray(problem.start.covariance, np.float64)
         filtering.Q, filtering.R = Q, R
-        filtering.predict_x = lambda u=0: None
+        filtering.predict_x = lambda *_: None
         total = 0.0
         for y in readings:
             filtering.F = A + 0.05 * np.diag(np.cos(filtering.x))

@@ -37,7 +37,7 @@ class MarkedHand(ArticulatedHand):
     image says nothing about stays as uncertain as any hand's pose and no more.
     """
 
-    ease: Float[Array, " 4*fingers"]
+    ease: Float[Array, " angles"]
     """Angles of a hand at ease, radians."""
     rate_kept: Float[Array, ""]
     """Share of a rate that is left after a frame."""
@@ -74,14 +74,20 @@ def marked_hand(
     hand: ArticulatedHand,
     markers: Sequence[Marker],
     *,
-    ease: Float[Array | np.ndarray, " 4*fingers"],
+    ease: Float[Array | np.ndarray, " angles"],
     rate_kept: float = 1.0,
     angle_kept: float = 1.0,
 ) -> MarkedHand:
     """The hand with markers for its features; arguments as the fields."""
     parts = {part.name: getattr(hand, part.name) for part in dataclasses.fields(hand)}
     kept = (jnp.asarray(share, dtype=float) for share in (rate_kept, angle_kept))
-    return MarkedHand(**parts, ease=jnp.asarray(ease, dtype=float), rate_kept=next(kept), angle_kept=next(kept), markers=tuple(markers))
+    return MarkedHand(
+        **parts,
+        ease=jnp.asarray(ease, dtype=float),
+        rate_kept=next(kept),
+        angle_kept=next(kept),
+        markers=tuple(markers),
+    )
 
 
 def _place(marker, size, joints):

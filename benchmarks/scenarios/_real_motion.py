@@ -28,8 +28,9 @@ from jaxfilters.trackers.articulated_start import starts_from_points
 from jaxfilters.trackers.feature_sequence import FeatureFrame
 
 FRAME_INTERVAL = 1 / 30
-NOISE_PER_JITTER = 4.0
-"""Errors of a network persist over frames: they are some times what its second differences show."""
+NOISE_PER_JITTER = 6.0
+"""Errors of a network persist over several frames, which second differences do not show and a filter of white noise
+takes for fresh evidence: its noise has to be so much larger than the jitter."""
 ACCELERATION_STD = (0.003, 0.01, math.radians(2.0))
 """Metres, quaternion, radians per frame squared; with the shares below the likeliest of a few on the detections."""
 RATE_KEPT, ANGLE_KEPT = 0.5, 0.9
@@ -204,7 +205,9 @@ def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
 def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detections) -> dict[str, Metric]:
     """Errors of the four variants on one network, and by how much the last is better than the first."""
     ways = dict(
-        zip(VARIANTS, (onto_root_plane, frame_by_frame, filtered("unconstrained"), filtered("recommended")), strict=True)
+        zip(
+            VARIANTS, (onto_root_plane, frame_by_frame, filtered("unconstrained"), filtered("recommended")), strict=True
+        )
     )
     metrics, plain = {}, {}
     for variant, way in ways.items():

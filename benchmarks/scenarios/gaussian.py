@@ -58,7 +58,8 @@ def _one_sequence(problem: Problem, present: list[str], rounds: int) -> dict[str
     calls |= {f"gradient_{name}": gradients[name] for name in gradients if name in ("joseph", "square_root", "dynamax")}
     first = {name: _seconds(call) for name, call in calls.items()}
     slow = {"filterpy": peers.filterpy(problem)} if "filterpy" in present else {}
-    check_agreement({name: call() for name, call in {**values, **slow}.items()})
+    once: Calls = {**values, **slow}
+    check_agreement({name: call() for name, call in once.items()})
     times = rounds_of(calls, rounds)
     if slow:
         together = rounds_of({**slow, "joseph": values["joseph"]}, min(rounds, SLOW_ROUNDS))
@@ -123,9 +124,9 @@ def check_agreement(log_evidences: Mapping[str, Array | float], tolerance: float
             sequences one in a hundred may differ: where linearisation is chaotic, rounding decides.
     """
     name, expected = next(iter(log_evidences.items()))
-    expected = np.asarray(expected, np.float64)
+    reference = np.asarray(expected, np.float64)
     for other, found in log_evidences.items():
-        error = np.quantile(abs(np.asarray(found, np.float64) - expected) / np.maximum(abs(expected), 100.0), 0.99)
+        error = np.quantile(abs(np.asarray(found, np.float64) - reference) / np.maximum(abs(reference), 100.0), 0.99)
         if not error <= tolerance:
             raise RuntimeError(f"the log evidences of {name} and {other} differ by {error:.2g} of their size.")
 

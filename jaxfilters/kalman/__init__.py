@@ -19,7 +19,7 @@ class Arithmetic(Protocol):
     """A module like `joseph`: how beliefs and noises are written down, and the verbs on them."""
 
     @property
-    def Belief(self) -> type: ...  # noqa: N802, D102
+    def Belief(self) -> type: ...
 
     @property
     def predict(self) -> Callable[..., Any]: ...

@@ -94,7 +94,7 @@ def _condition(form, P, H, R, innovation):
     return update, inverse, whitened, PH
 
 
-def _cleared(H, R, seen):
+def _cleared(H: Array, R: Array, seen: Array) -> tuple[Array, Array]:
     def clear(H, R):
         return info.observed(seen, H), among(seen, R)
 
@@ -179,9 +179,7 @@ def rts(
     """Belief given the future too: `rts` of the arithmetic that has this form."""
     surprise = following.mean - factor.apply(F, belief.mean) - b
     found = condition(form, belief.covariance, F, total(Q, lost), surprise, jnp.ones(surprise.shape, bool))
-    return Gaussian(
-        belief.mean + found.shift, found.covariance + factor.turned(found.gain, following.covariance)
-    )
+    return Gaussian(belief.mean + found.shift, found.covariance + factor.turned(found.gain, following.covariance))
 
 
 def among(mask: Bool[Array, " m"] | None, R: Float[Array, "m m"]) -> Float[Array, "m m"]:

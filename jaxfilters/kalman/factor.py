@@ -69,7 +69,7 @@ def _pivots(S, drop):
         return drop(L, independent), independent
 
     sound = jnp.all(diagonal(L) ** 2 > tolerance * variance)
-    return jax.lax.cond(sound, lambda S, L: (L, jnp.ones(n, bool)), loosen, S, L)
+    return jax.lax.cond(sound, lambda _S, L: (L, jnp.ones(n, bool)), loosen, S, L)
 
 
 def root_tangent(L: Float[Array, "n n"], dS: Float[Array, "n n"]) -> Float[Array, "n n"]:

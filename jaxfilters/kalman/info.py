@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple, no_type_check, overload
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.kalman import factor
-
 
 
 @jax.tree_util.register_dataclass
@@ -68,14 +67,18 @@ def rows(
     shown = factor.apply(H, ones) + factor.apply(noise, jnp.ones(noise.shape[1], noise.dtype)) + y_hat
     seen = read & jnp.isfinite(shown)
     wanted = jnp.ones(y.shape, bool) if mask is None else mask
-    return Rows(
-        jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen)
-    )
+    return Rows(jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen))
 
 
-def observed(
-    mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None
-) -> Float[Array, "m *k"] | None:
+@overload
+def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"]) -> Float[Array, "m *k"]: ...
+
+
+@overload
+def observed(mask: Bool[Array, " m"] | None, rows: None) -> None: ...
+
+
+def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Float[Array, "m *k"] | None:
     """The rows, zero where masked; all of them without a mask, none of none."""
     if mask is None or rows is None:
         return rows

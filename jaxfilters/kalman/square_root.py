@@ -101,7 +101,7 @@ def _conditioned(seen, noise, state):
     seen = jnp.pad(seen, ((0, 0), (0, state.shape[1] - seen.shape[1])))
     V, G = jnp.hstack([seen, noise]), jnp.pad(state, ((0, 0), (0, m)))
 
-    def sound(V, G, root, cross, posterior):
+    def sound(_V, _G, root, cross, posterior):
         return root, cross, posterior
 
     def deficient(V, G, *_):

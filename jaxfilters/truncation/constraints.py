@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, no_type_check
 
 import jax
@@ -53,13 +54,14 @@ def linear_constraints(
     names = tuple(f"row {k}" for k in range(rows)) if names is None else tuple(names)
     if len(names) != rows:
         raise ValueError(f"names: expected {rows}, one for each row of normals; got {len(names)}.")
-    lower, upper = (_bounds(name, bound, rows) for name, bound in (("lower", lower), ("upper", upper)))
+    least, most = _bounds("lower", lower, rows), _bounds("upper", upper, rows)
     _refuse("normals", names, ~np.isfinite(normals).all(axis=1), "expected finite numbers", normals)
     _refuse("normals", names, ~normals.any(axis=1), "expected a direction; got zeros", None)
-    _refuse("lower", names, np.isnan(lower) | (lower == np.inf), "expected a number or -inf", lower)
-    _refuse("upper", names, np.isnan(upper) | (upper == -np.inf), "expected a number or inf", upper)
-    _refuse("lower, upper", names, lower > upper, "expected lower <= upper", np.stack([lower, upper], axis=1))
-    return LinearConstraints(*(jnp.asarray(x, dtype=float) for x in (normals, lower, upper)), names)
+    _refuse("lower", names, np.isnan(least) | (least == np.inf), "expected a number or -inf", least)
+    _refuse("upper", names, np.isnan(most) | (most == -np.inf), "expected a number or inf", most)
+    _refuse("lower, upper", names, least > most, "expected lower <= upper", np.stack([least, most], axis=1))
+    as_floats = partial(jnp.asarray, dtype=float)
+    return LinearConstraints(as_floats(normals), as_floats(least), as_floats(most), names)
 
 
 def feasible(constraints: LinearConstraints) -> bool:

@@ -7,7 +7,7 @@ triangular shape.
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def _rounding(belief):
     return belief.mean.size * float(jnp.finfo(belief.mean.dtype).eps)
 
 
-def compiled(function: Callable[Concatenate[Belief, Rest], Result]) -> Callable[Concatenate[Belief, Rest], Result]:
+def compiled(function: Callable[Rest, Result]) -> Callable[Rest, Result]:
     """The function of a belief, compiled once for each kind of belief and each set of shapes.
 
     For JAX (0.10) any two dataclasses with as many fields are equal as trees, and once in some hundred times it runs
@@ -95,7 +95,7 @@ def compiled(function: Callable[Concatenate[Belief, Rest], Result]) -> Callable[
     of_kind = jax.jit(lambda _kind, *args, **kwargs: function(*args, **kwargs), static_argnums=0)
 
     @wraps(function)
-    def call(belief, *args, **kwargs):
-        return of_kind(type(belief), belief, *args, **kwargs)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return of_kind(type(args[0]), *args, **kwargs)
 
     return call

@@ -40,6 +40,8 @@ class _Rows(NamedTuple):
     upper: Array
     active: Array
     """False where the value is certain."""
+    given: Array
+    """Precision of the site that the belief contains."""
     floor: Array
     """Standard deviation below which a value is no longer known from rounding."""
 
@@ -89,17 +91,17 @@ def _truncate(belief, constraints, given, patience):
     active = ~directions.certain
     unit = jnp.where(active, directions.deviation, 1.0)
     normals = jnp.where(active[:, None], constraints.normals / unit[:, None], 0.0)
-    rows = _Rows(*_within_reach(-distances[:, 0], distances[:, 1]), active, jnp.full_like(unit, resolution(belief)))
     start = standardized(given, directions.mean, unit)
+    floor = jnp.full_like(unit, resolution(belief))
+    rows = _Rows(*_within_reach(-distances[:, 0], distances[:, 1]), active, start.precision, floor)
     centred = replace(belief, mean=jnp.zeros_like(belief.mean))
 
     natural, sweeps, change = _fixed_point(image(centred, normals), rows, _natural(start), patience)
-    truncated, log_integral = _multiplied(centred, normals, natural - _natural(start))
+    truncated, log_spread = _multiplied(centred, normals, natural - _natural(start))
     marginals = jax.vmap(along, (None, 0))(truncated, normals)
-    log_scale = _log_scale(marginals.mean, marginals.deviation, natural, rows, start.log_scale)
+    log_scale, log_change = _log_scale(marginals, natural, start, rows)
     infeasible = jnp.where(active, _outside(marginals, rows), jnp.any(distances < 0, axis=-1))
-    log_mass = log_integral + jnp.sum(log_scale - start.log_scale)
-    log_mass = jnp.where(jnp.any(infeasible & ~active), -jnp.inf, log_mass)
+    log_mass = jnp.where(jnp.any(infeasible), -jnp.inf, log_spread + jnp.sum(log_change))
     info = TruncationInfo(distances, log_mass, infeasible, sweeps, change <= patience.tolerance)
     result = destandardized(Sites(*natural.T, log_scale), directions.mean, unit)
     return replace(truncated, mean=belief.mean + truncated.mean), result, info
@@ -135,46 +137,48 @@ def _fixed_point(belief, rows, natural, patience):
 
 @_fixed_point.defjvp
 def _fixed_point_jvp(primals, tangents):
-    # Where lacking(natural, given) = 0: d natural = -(d lacking / d natural)^-1 (d lacking / d given) d given. In this
-    # way a loop of unknown length has derivatives, in both modes, and they cost no memory for its steps.
-    belief, rows, start, _ = primals
+    # Where what the sites demand less what they are is zero for all givens: d natural = -(d lacking / d natural)^-1
+    # (d lacking / d givens) d givens. In this way a loop of unknown length has derivatives in both modes.
+    (belief, rows, start, _), (d_belief, d_rows, d_start, _) = primals, tangents
     natural, sweeps, change = _fixed_point(*primals)
-    _, lacking = jax.jvp(lambda *given: _lacking(natural, *given), (belief, rows, start), tangents[:3])
-    step = jnp.linalg.solve(_derivative_of_lacking(natural, belief, rows, start), -lacking.ravel())
+    conditioned = lambda belief, start: _conditioned(belief, natural - start)
+    (mean, P), (d_mean, d_P) = jax.jvp(conditioned, (belief, start), (d_belief, d_start))
+    slopes = _slopes_of_demand(mean, P, natural, rows)
+    d_given = jnp.stack([d_mean, jnp.diagonal(d_P), d_rows.lower, d_rows.upper])
+    d_lacking = jnp.einsum("skp,sk->kp", slopes[:4], d_given, precision="highest")
+    step = jnp.linalg.solve(_derivative_of_lacking(mean, P, slopes), -d_lacking.ravel())
     no_tangent = np.zeros((), jax.dtypes.float0)
     return (natural, sweeps, change), (step.reshape(natural.shape), no_tangent, jnp.zeros_like(change))
 
 
-def _lacking(natural, belief, rows, start):
-    """What the sites demand beyond themselves."""
-    mean, P = _conditioned(natural - start, belief)
-    return _demanded(mean, linalg.safe_sqrt(jnp.diagonal(P)), natural, rows) - natural
+def _slopes_of_demand(mean, P, natural, rows):
+    """Derivatives (6, k, 2) of what each row demands by its mean, variance, bounds and natural parameters."""
+    own = jnp.stack([mean, jnp.diagonal(P), rows.lower, rows.upper, *natural.T])
+
+    def demanded(own):
+        mean, variance, lower, upper, *natural = own
+        bounded = rows._replace(lower=lower, upper=upper)
+        return _demanded(mean, linalg.safe_sqrt(variance), jnp.stack(natural, axis=-1), bounded)
+
+    axes = jnp.eye(len(own), dtype=own.dtype)
+    return jax.vmap(lambda axis: jax.jvp(demanded, (own,), (jnp.broadcast_to(axis[:, None], own.shape),))[1])(axes)
 
 
-def _derivative_of_lacking(natural, belief, rows, start):
-    """That by the natural parameters, as a matrix (2 k, 2 k).
+def _derivative_of_lacking(mean, P, slopes):
+    """Derivative (2 k, 2 k) of what the sites demand beyond themselves, by themselves.
 
-    What a row demands depends on its own marginal and site; its marginal on the sites of all rows: by the precision of
-    site j the mean of row k changes at the rate `-P_kj mean_j` and the variance at `-P_kj^2`, by the shift the mean at
-    `P_kj`.
+    A row demands by its own marginal, and that hangs on the sites of all rows: with the precision of site j the mean of
+    row k changes at the rate `-P_kj mean_j` and its variance at `-P_kj^2`; with the shift the mean at `P_kj`.
     """
-    mean, P = _conditioned(natural - start, belief)
-    own = jnp.stack([mean, jnp.diagonal(P), *natural.T])
-    demanded = lambda own: _demanded(own[0], linalg.safe_sqrt(own[1]), own[2:].T, rows)
-    along_axis = lambda axis: jax.jvp(demanded, (own,), (jnp.broadcast_to(axis[:, None], own.shape),))[1]
-    by_mean, by_variance, by_precision, by_shift = jax.vmap(along_axis)(jnp.eye(4, dtype=own.dtype))
-    by_means = jnp.stack([-P * mean, P], axis=-1)
-    by_variances = jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
-    through_marginals = (
-        by_mean[:, :, None, None] * by_means[:, None] + by_variance[:, :, None, None] * by_variances[:, None]
-    )
-    identity = jnp.eye(len(mean), dtype=P.dtype)
+    by_mean, by_variance, _, _, by_precision, by_shift = slopes
+    means, variances = jnp.stack([-P * mean, P], axis=-1), jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
+    marginals = by_mean[:, :, None, None] * means[:, None] + by_variance[:, :, None, None] * variances[:, None]
     itself = jnp.stack([by_precision, by_shift], axis=-1) - jnp.eye(2, dtype=P.dtype)
-    total = through_marginals + itself[:, :, None] * identity[:, None, :, None]
-    return total.reshape(natural.size, natural.size)
+    identity = jnp.eye(len(mean), dtype=P.dtype)
+    return (marginals + itself[:, :, None] * identity[:, None, :, None]).reshape(2 * len(mean), -1)
 
 
-def _conditioned(natural, belief):
+def _conditioned(belief, natural):
     """Mean and covariance of a belief of mean zero, times factors with these natural parameters, one a component."""
     prior = linalg.matmul(belief.root, belief.root.T) if isinstance(belief, GaussianRoot) else belief.covariance
     precision, shift = natural.T
@@ -191,7 +195,7 @@ def _change(direction: Direction, step):
 
 
 def _multiplied(belief, normals, natural):
-    """The belief times one factor a row, normalised, and the log of what it was normalised by."""
+    """The belief times one factor a row, normalised, and the log of how much narrower its volume has become."""
 
     def step(belief, row):
         normal, factor = row
@@ -199,30 +203,30 @@ def _multiplied(belief, normals, natural):
 
     # What adds information goes first: then no belief in between is less certain than the last one, or improper.
     order = jnp.argsort(-natural[:, 0])
-    belief, log_integrals = jax.lax.scan(step, belief, (normals[order], natural[order]))
-    return belief, jnp.sum(log_integrals)
+    belief, log_spread = jax.lax.scan(step, belief, (normals[order], natural[order]))
+    return belief, jnp.sum(log_spread)
 
 
 def _times(belief, direction: Direction, natural):
-    """The belief times `exp(shift z - precision z^2 / 2)`, normalised, and the log of what it was normalised by."""
+    """The belief times `exp(shift z - precision z^2 / 2)`, normalised, and the log of the ratio of the deviations."""
     precision, shift = natural
     mean, deviation = direction.mean, direction.deviation
     tightened = jnp.maximum(1 + precision * deviation**2, jnp.finfo(natural.dtype).eps)
     moved = deviation * (shift - precision * mean) / tightened
-    exponent = mean * (2 * shift - precision * mean) + (deviation * shift) ** 2
-    log_integral = 0.5 * (exponent / tightened - jnp.log(tightened))
-    return reshape(belief, direction, moved, 1 / tightened), log_integral
+    return reshape(belief, direction, moved, 1 / tightened), -0.5 * jnp.log(tightened)
 
 
 class _Tilted(NamedTuple):
     """A row applied to the belief without its site, in standard deviations of the belief with it."""
 
+    proper: Array
+    """Whether it was a belief without its site to begin with."""
     usable: Array
-    """Whether the belief without the site is proper, and known from rounding."""
+    """Whether it also is known from rounding."""
     deviation: Array
-    """Standard deviation of the belief with the site; 1 where not usable."""
+    """Standard deviation of the belief with the site."""
     shift: Array
-    """That of the site."""
+    """That of the site, about the mean of the belief with it."""
     left: Array
     """Precision without the site."""
     cut: moments.Moments
@@ -231,31 +235,47 @@ class _Tilted(NamedTuple):
 
 def _tilted(mean, deviation, natural, rows: _Rows) -> _Tilted:
     precision, shift = natural[..., 0], natural[..., 1]
-    resolved = rows.active & (deviation > rows.floor)
-    deviation = jnp.where(resolved, deviation, 1.0)
-    shift = deviation * (shift - precision * mean)
+    eps = jnp.finfo(precision.dtype).eps
+    proper = rows.active & (rows.given < 1 - 8 * eps)
+    usable = proper & (deviation > rows.floor)
+    deviation = jnp.where(proper, jnp.maximum(deviation, rows.floor), 1.0)
+    precision = jnp.where(proper, precision, 0.0)
+    shift = jnp.where(proper, deviation * (shift - precision * mean), 0.0)
     left = 1 - precision * deviation**2
-    usable = resolved & (left > 8 * jnp.finfo(left.dtype).eps)
-    left = jnp.where(usable, left, 1.0)
+    # Next to a narrow row nothing is left but rounding; what the row was given to begin with is still known.
+    known = jnp.where(proper, 1 - rows.given, 1.0)
+    left = jnp.where(left > jnp.maximum(8 * eps, (rows.floor / deviation) ** 2), left, known / (known + precision))
     from_mean = lambda bound: jnp.sqrt(left) * ((bound - mean) / deviation + shift / left)
-    return _Tilted(usable, deviation, shift, left, moments.interval(from_mean(rows.lower), from_mean(rows.upper)))
+    cut = moments.interval(from_mean(rows.lower), from_mean(rows.upper))
+    return _Tilted(proper, usable, deviation, shift, left, cut)
 
 
 def _demanded(mean, deviation, natural, rows: _Rows):
     """Natural parameters of the site that gives the belief along the direction the moments of the row itself."""
-    usable, deviation, shift, left, cut = _tilted(mean, deviation, natural, rows)
-    variance = jnp.maximum(cut.variance, jnp.finfo(left.dtype).eps)
+    _, usable, deviation, shift, left, cut = _tilted(mean, deviation, natural, rows)
+    # Nothing is made as narrow as rounding.
+    smallest = jnp.maximum(32 * jnp.finfo(left.dtype).eps, 4 * left * (rows.floor / deviation) ** 2)
+    variance = jnp.maximum(cut.variance, jnp.minimum(smallest, 1.0))
     precision = left * (1 - variance) / (variance * deviation**2)
     shift = (jnp.sqrt(left) * cut.mean - shift * (1 - variance)) / (variance * deviation)
     demanded = jnp.stack([precision, shift + precision * mean], axis=-1)
     return jnp.where(usable[..., None], demanded, jax.lax.stop_gradient(natural))
 
 
-def _log_scale(mean, deviation, natural, rows: _Rows, otherwise):
-    """Log of what the site has to be multiplied by to have the integral of the row itself."""
-    usable, _, shift, left, cut = _tilted(mean, deviation, natural, rows)
-    at_mean = mean * (natural[..., 1] - 0.5 * natural[..., 0] * mean)
-    return jnp.where(usable, cut.log_mass + 0.5 * (shift * shift / left - jnp.log(left)) - at_mean, otherwise)
+def _log_scale(marginals: Direction, natural, start: Sites, rows: _Rows):
+    """Log scales of the sites, with which they have the integrals of the rows, and what they add to the log mass.
+
+    The integral of the belief given, times the new sites over the old, is exp(half of the sum of the changed shifts
+    times the new means), but for how narrow it has become. Its exponent and that of the scales are large and cancel;
+    here they have been cancelled beforehand.
+    """
+    mean = marginals.mean
+    tilted = _tilted(mean, marginals.deviation, natural, rows)
+    force = natural[:, 1] - natural[:, 0] * mean
+    own = tilted.cut.log_mass + 0.5 * (tilted.shift**2 / tilted.left - jnp.log(tilted.left))
+    log_scale = own - mean * (force + 0.5 * natural[:, 0] * mean)
+    change = own - 0.5 * mean * (force + start.shift) - start.log_scale
+    return jnp.where(tilted.proper, log_scale, start.log_scale), jnp.where(tilted.proper, change, 0.0)
 
 
 def _outside(direction: Direction, rows: _Rows):

@@ -349,9 +349,7 @@ def test_a_filter_built_again_compiles_nothing():
 def follow(scale):
     prior = Gaussian(jnp.zeros(3), scale * jnp.eye(3))
     manifold = product(vector(2), vector(1))
-    filter = extended(
-        prior, stay, 0.1 * jnp.eye(3), counted, jnp.eye(2), linearize=unscented(0.9), manifold=manifold
-    )
+    filter = extended(prior, stay, 0.1 * jnp.eye(3), counted, jnp.eye(2), linearize=unscented(0.9), manifold=manifold)
     return run(filter, KEY, jnp.ones((3, 2)))
 
 

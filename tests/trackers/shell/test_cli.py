@@ -80,7 +80,8 @@ def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monk
     configs = []
     build = hand_depth.build
     monkeypatch.setattr(hand_depth, "build", lambda camera, config: configs.append(config) or build(camera, config))
-    given = "--filter pf --particles 64 --stride 3 --scale 0.9 --seed 4 --hand left --no-guide --missing unknown --surface mesh"
+    given = "--filter pf --particles 64 --stride 3 --scale 0.9 --seed 4 --hand left --no-guide"
+    given += " --missing unknown --surface mesh"
     assert run("demo", "--out", tmp_path / "a", "--no-video", *given.split()) == 0
     assert run("demo", "--out", tmp_path / "b", "--no-video") == 0
     assert configs == [

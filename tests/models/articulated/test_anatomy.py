@@ -1,0 +1,55 @@
+"""The average hand of five fingers: what it is at ease keeps its own limits, and left mirrors right."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles, template_lengths, template_shape
+from jaxfilters.models.articulated.layout import Layout, five_fingers
+from jaxfilters.models.articulated.limits import limit_rows
+
+
+def relaxed_state(layout):
+    x = np.zeros(layout.size)
+    x[layout.quaternion], x[layout.static] = (0.5, -0.5, 0.5, -0.5), template_shape()
+    x[layout.angles] = relaxed_angles(layout).ravel()
+    return x
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_hand_at_ease_keeps_its_limits_with_room_to_spare(side):
+    layout = five_fingers(side=side)
+    rows = limit_rows(layout, five_finger_limits(layout))
+    value = np.asarray(rows.normals) @ relaxed_state(layout)
+    angles = ~np.asarray(rows.static)
+    room = np.minimum(value - np.asarray(rows.lower), np.asarray(rows.upper) - value)
+    assert angles.sum() == 5 * 4 + 4
+    assert (room[angles] > np.radians(5.0)).all()
+    assert (room[~angles] > 0).all()
+
+
+def test_fingers_of_left_and_right_spread_to_opposite_sides():
+    right, left = (relaxed_angles(five_fingers(side=side)) for side in (1.0, -1.0))
+    np.testing.assert_allclose(left[:, 0], -right[:, 0])
+    np.testing.assert_allclose(left[:, 1:], right[:, 1:])
+    assert (np.diff(right[1:, 0]) > 0).all()
+
+
+def test_little_finger_spreads_away_from_the_thumb():
+    """Positive abduction turns away from +z, the thumb's side of a right hand."""
+    layout = five_fingers()
+    rows = limit_rows(layout, five_finger_limits(layout))
+    upper = dict(zip(rows.names, np.asarray(rows.upper), strict=True))
+    lower = dict(zip(rows.names, np.asarray(rows.lower), strict=True))
+    assert upper["theta_50"] == pytest.approx(np.radians(38.0))
+    assert lower["theta_50"] == pytest.approx(np.radians(-2.0))
+
+
+def test_lengths_can_be_asked_for_while_something_is_traced():
+    inside = jax.jit(lambda: template_lengths() + 0.0)()
+    np.testing.assert_allclose(inside, template_lengths(), rtol=1e-6)
+
+
+def test_limits_refuse_other_hands():
+    with pytest.raises(ValueError, match="five fingers; got 2"):
+        five_finger_limits(Layout(2))
