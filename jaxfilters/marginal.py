@@ -286,5 +286,5 @@ def _unseen(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTre
 
 def _seen(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
     h, C, R = observe(x)
-    belief, info = kalman.joseph.update(belief, y - h, C, R)
-    return belief, info.log_evidence
+    found = kalman.joseph.condition(belief.covariance, C, R, y - h - C @ belief.mean)
+    return Gaussian(belief.mean + found.shift, found.covariance), found.log_density

@@ -1,5 +1,6 @@
 """Kalman filter atoms on covariances, with Joseph's form of the update: never indefinite by subtraction."""
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian import Gaussian
@@ -27,6 +28,16 @@ def update(
     covariance is `(I - K H) P (I - K H)^T + K R K^T` (R. Bucy, P. Joseph, "Filtering for stochastic processes", 1968).
     """
     return covariance.update(_form, belief, y, H, R, y_hat, mask, lost)
+
+
+def condition(
+    P: Float[Array, "n n"], H: Float[Array, "m n"], R: Float[Array, "m m"], innovation: Float[Array, " m"]
+) -> covariance.Update:
+    """The update with every component seen, of which the covariance depends on no reading: shared by an ensemble.
+
+    NaN in the innovation becomes NaN in the shift and in the log density.
+    """
+    return covariance.condition(_form, P, H, R, innovation, jnp.ones(innovation.shape, bool))
 
 
 def rts(

@@ -41,9 +41,11 @@ class _Rows(NamedTuple):
     active: Array
     """False where the value is certain."""
     given: Array
-    """Precision of the site that the belief contains."""
+    """(k, 2), natural parameters of the sites that the belief contains."""
+    rounding: Array
+    """Variance that may be rounding."""
     floor: Array
-    """Standard deviation below which a value is no longer known from rounding."""
+    """Standard deviation below which a row is left alone; rows that contradict each other would go on for ever."""
 
 
 class _Patience(NamedTuple):
@@ -92,8 +94,9 @@ def _truncate(belief, constraints, given, patience):
     unit = jnp.where(active, directions.deviation, 1.0)
     normals = jnp.where(active[:, None], constraints.normals / unit[:, None], 0.0)
     start = standardized(given, directions.mean, unit)
-    floor = jnp.full_like(unit, resolution(belief))
-    rows = _Rows(*_within_reach(-distances[:, 0], distances[:, 1]), active, start.precision, floor)
+    rounding = jnp.full_like(unit, resolution(belief) ** 2)
+    floor = jnp.sqrt(jnp.maximum(rounding, jnp.finfo(unit.dtype).eps))
+    rows = _Rows(*_within_reach(-distances[:, 0], distances[:, 1]), active, _natural(start), rounding, floor)
     centred = replace(belief, mean=jnp.zeros_like(belief.mean))
 
     natural, sweeps, change = _fixed_point(image(centred, normals), rows, _natural(start), patience)
@@ -144,21 +147,24 @@ def _fixed_point_jvp(primals, tangents):
     conditioned = lambda belief, start: _conditioned(belief, natural - start)
     (mean, P), (d_mean, d_P) = jax.jvp(conditioned, (belief, start), (d_belief, d_start))
     slopes = _slopes_of_demand(mean, P, natural, rows)
-    d_given = jnp.stack([d_mean, jnp.diagonal(d_P), d_rows.lower, d_rows.upper])
-    d_lacking = jnp.einsum("skp,sk->kp", slopes[:4], d_given, precision="highest")
+    usable = _tilted(mean, linalg.safe_sqrt(jnp.diagonal(P)), natural, rows).usable
+    d_given = jnp.stack([d_mean, jnp.diagonal(d_P), d_rows.lower, d_rows.upper, *d_rows.given.T])
+    d_lacking = jnp.einsum("skp,sk->kp", slopes[:6], d_given, precision="highest")
+    # A row that is left alone keeps the site that it was given.
+    d_lacking = jnp.where(usable[:, None], d_lacking, d_start)
     step = jnp.linalg.solve(_derivative_of_lacking(mean, P, slopes), -d_lacking.ravel())
     no_tangent = np.zeros((), jax.dtypes.float0)
     return (natural, sweeps, change), (step.reshape(natural.shape), no_tangent, jnp.zeros_like(change))
 
 
 def _slopes_of_demand(mean, P, natural, rows):
-    """Derivatives (6, k, 2) of what each row demands by its mean, variance, bounds and natural parameters."""
-    own = jnp.stack([mean, jnp.diagonal(P), rows.lower, rows.upper, *natural.T])
+    """Derivatives (8, k, 2) of what a row demands by its mean, variance, bounds, given site and present site."""
+    own = jnp.stack([mean, jnp.diagonal(P), rows.lower, rows.upper, *rows.given.T, *natural.T])
 
     def demanded(own):
-        mean, variance, lower, upper, *natural = own
-        bounded = rows._replace(lower=lower, upper=upper)
-        return _demanded(mean, linalg.safe_sqrt(variance), jnp.stack(natural, axis=-1), bounded)
+        mean, variance, lower, upper = own[:4]
+        row = rows._replace(lower=lower, upper=upper, given=own[4:6].T)
+        return _demanded(mean, linalg.safe_sqrt(variance), own[6:].T, row)
 
     axes = jnp.eye(len(own), dtype=own.dtype)
     return jax.vmap(lambda axis: jax.jvp(demanded, (own,), (jnp.broadcast_to(axis[:, None], own.shape),))[1])(axes)
@@ -170,7 +176,7 @@ def _derivative_of_lacking(mean, P, slopes):
     A row demands by its own marginal, and that hangs on the sites of all rows: with the precision of site j the mean of
     row k changes at the rate `-P_kj mean_j` and its variance at `-P_kj^2`; with the shift the mean at `P_kj`.
     """
-    by_mean, by_variance, _, _, by_precision, by_shift = slopes
+    by_mean, by_variance, *_, by_precision, by_shift = slopes
     means, variances = jnp.stack([-P * mean, P], axis=-1), jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
     marginals = by_mean[:, :, None, None] * means[:, None] + by_variance[:, :, None, None] * variances[:, None]
     itself = jnp.stack([by_precision, by_shift], axis=-1) - jnp.eye(2, dtype=P.dtype)
@@ -211,7 +217,8 @@ def _times(belief, direction: Direction, natural):
     """The belief times `exp(shift z - precision z^2 / 2)`, normalised, and the log of the ratio of the deviations."""
     precision, shift = natural
     mean, deviation = direction.mean, direction.deviation
-    tightened = jnp.maximum(1 + precision * deviation**2, jnp.finfo(natural.dtype).eps)
+    # Less than this is rounding, and would blow the belief up.
+    tightened = jnp.maximum(1 + precision * deviation**2, jnp.finfo(natural.dtype).eps ** 0.5)
     moved = deviation * (shift - precision * mean) / tightened
     return reshape(belief, direction, moved, 1 / tightened), -0.5 * jnp.log(tightened)
 
@@ -220,9 +227,9 @@ class _Tilted(NamedTuple):
     """A row applied to the belief without its site, in standard deviations of the belief with it."""
 
     proper: Array
-    """Whether it was a belief without its site to begin with."""
+    """Whether the belief without the site is one."""
     usable: Array
-    """Whether it also is known from rounding."""
+    """Whether it is also known from rounding."""
     deviation: Array
     """Standard deviation of the belief with the site."""
     shift: Array
@@ -236,18 +243,20 @@ class _Tilted(NamedTuple):
 def _tilted(mean, deviation, natural, rows: _Rows) -> _Tilted:
     precision, shift = natural[..., 0], natural[..., 1]
     eps = jnp.finfo(precision.dtype).eps
-    proper = rows.active & (rows.given < 1 - 8 * eps)
-    usable = proper & (deviation > rows.floor)
-    deviation = jnp.where(proper, jnp.maximum(deviation, rows.floor), 1.0)
-    precision = jnp.where(proper, precision, 0.0)
-    shift = jnp.where(proper, deviation * (shift - precision * mean), 0.0)
+    known = rows.active & (deviation > rows.floor)
+    deviation = jnp.where(rows.active, jnp.maximum(deviation, rows.floor), 1.0)
+    shift = deviation * (shift - precision * mean)
     left = 1 - precision * deviation**2
-    # Next to a narrow row nothing is left but rounding; what the row was given to begin with is still known.
-    known = jnp.where(proper, 1 - rows.given, 1.0)
-    left = jnp.where(left > jnp.maximum(8 * eps, (rows.floor / deviation) ** 2), left, known / (known + precision))
+    # Next to a narrow row nothing is left but rounding, and what there was to begin with has to do.
+    clear = left > jnp.maximum(8 * eps, rows.rounding / deviation**2)
+    began = 1 - rows.given[..., 0]
+    proper = rows.active & (clear | (began > 8 * eps))
+    began = jnp.where(began > 8 * eps, began, 1.0)
+    left = jnp.where(clear, left, began * deviation**2)
+    shift = jnp.where(clear, shift, deviation * (began * mean + rows.given[..., 1]))
     from_mean = lambda bound: jnp.sqrt(left) * ((bound - mean) / deviation + shift / left)
     cut = moments.interval(from_mean(rows.lower), from_mean(rows.upper))
-    return _Tilted(proper, usable, deviation, shift, left, cut)
+    return _Tilted(proper, proper & known, deviation, shift, left, cut)
 
 
 def _demanded(mean, deviation, natural, rows: _Rows):

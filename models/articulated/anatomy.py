@@ -23,7 +23,8 @@ _THUMB = ((-35.0, 35.0), (-20.0, 60.0), (-5.0, 60.0), (-15.0, 80.0))
 _FINGER = ((-20.0, 20.0), (-15.0, 90.0), (0.0, 110.0), (-5.0, 80.0))
 """Degrees: abduction from that of the fan below, then three flexions from the base out."""
 _FAN = (0.0, -8.0, 0.0, 8.0, 18.0)
-"""Degrees: abduction of the fingers of a right hand at ease, which spread from the wrist as its metacarpals do."""
+"""Degrees: abduction of the fingers of a right hand at ease, which spread from the wrist as its metacarpals do; rounded
+from fits to the true joints of two recorded hands."""
 _EASE = ((10.0, 15.0, 15.0), *([(20.0, 25.0, 15.0)] * 4))
 """Degrees: flexions of a hand at ease."""
 
