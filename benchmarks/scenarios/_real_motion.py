@@ -1,7 +1,7 @@
 """Real hands from one view: detections of networks on two sets of depth images, and motion capture through a camera.
 
-Only (u, v) of a network is used. The noise of NYU's detections, the motion model and the fan of the fingers at ease were
-chosen with an eye on the truth of its first frames, as the constants say; frames that they were chosen on do not count.
+Only (u, v) of a network is used. The noise of NYU's detections, the motion model and the fan of the fingers at ease
+were chosen with an eye on the truth of its first frames, as the constants say; these frames do not count.
 """
 
 import math
