@@ -43,7 +43,7 @@ def test_the_page_opens_with_the_demo_and_the_tests():
     assert commands[0].startswith("python3 -m venv")
     assert commands[0].strip().endswith("jaxfilters demo")
     assert commands[1].startswith("python3 -m venv")
-    assert commands[1].strip().endswith("-m pytest")
+    assert commands[1].strip().endswith("-m pytest -n 2")
     assert all(command.count("\n") == 1 for command in commands[:2])
 
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, no_type_check, overload
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -70,15 +70,7 @@ def rows(
     return Rows(jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen))
 
 
-@overload
-def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"]) -> Float[Array, "m *k"]: ...
-
-
-@overload
-def observed(mask: Bool[Array, " m"] | None, rows: None) -> None: ...
-
-
-def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Float[Array, "m *k"] | None:
+def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Any:
     """The rows, zero where masked; all of them without a mask, none of none."""
     if mask is None or rows is None:
         return rows
