@@ -47,7 +47,7 @@ def in_five(form, mean, root):
 
 
 def strip(points=400):
-    """Exact moments and mass of N(0, [[1, .8], [.8, 1]]) in x <= 0.2, y >= 0.6: x by quadrature, y given x in closed form."""
+    """Exact moments and mass of N(0, [[1, .8], [.8, 1]]) in x <= 0.2, y >= 0.6: x by quadrature, y given x closed."""
     nodes, weights = np.polynomial.legendre.leggauss(points)
     x = -9 + (nodes + 1) * (9.2 / 2)
     given = truncnorm((0.6 - 0.8 * x) / 0.6, np.inf, 0.8 * x, 0.6)
