@@ -198,7 +198,9 @@ def _derivative_of_lacking(mean, P, slopes):
     by_mean, by_variance, *_, by_precision, by_shift = slopes
     means, variances = jnp.stack([-P * mean, P], axis=-1), jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
     marginals = by_mean[:, :, None, None] * means[:, None] + by_variance[:, :, None, None] * variances[:, None]
-    itself = jnp.stack([by_precision, by_shift], axis=-1) - jnp.eye(2, dtype=P.dtype)
+    # By roundings more than the identity: rows that contradict each other demand nothing but each other's negative.
+    more = 1 + 8 * jnp.finfo(P.dtype).eps
+    itself = jnp.stack([by_precision, by_shift], axis=-1) - more * jnp.eye(2, dtype=P.dtype)
     identity = jnp.eye(len(mean), dtype=P.dtype)
     return (marginals + itself[:, :, None] * identity[:, None, :, None]).reshape(2 * len(mean), -1)
 

@@ -35,11 +35,11 @@ class TruncationInfo:
     distances: Float[Array, "..."]
     """(k, 2), `constraint_distances` of the belief before truncation."""
     log_mass: Float[Array, "..."]
-    """Log of the share of the belief that satisfies all constraints, as this method sees it; `-inf` where a row
-    contradicts what is certain."""
+    """Log of the share of the belief that satisfies all constraints, as the method estimates it; `-inf` where one of
+    them is infeasible."""
     infeasible: Bool[Array, "..."]
-    """(k,), rows that contradict what is certain, or (expectation propagation) that could not be met together with
-    the others."""
+    """(k,), rows that contradict what is certain, or that expectation propagation could not meet together with the
+    others."""
     sweeps: Int[Array, "..."]
     """How often the rows were gone through."""
     converged: Bool[Array, "..."]

@@ -8,7 +8,9 @@ from scipy.stats import norm, truncnorm
 
 from jaxfilters.gaussian import Gaussian, GaussianRoot
 from jaxfilters.truncation import constraint_distances, cut, linear_constraints
+from jaxfilters.truncation.directions import compiled
 
+halfspace, interval = compiled(cut.halfspace), compiled(cut.interval)
 FORMS = {"covariance": lambda mean, root: Gaussian(mean, root @ root.T), "root": GaussianRoot}
 
 
@@ -47,7 +49,7 @@ def test_the_rank_one_form_is_the_transform_of_the_paper(x64, rng, form):
         m, root, phi = rng.normal(size=5), rng.normal(size=(5, 5)), rng.normal(size=5)
         b = phi @ m + rng.uniform(-3, 3) * np.linalg.norm(root.T @ phi)
         expected_mean, expected_covariance, c = transformed_cut(m, root @ root.T, phi, b)
-        belief, info = cut.halfspace(form(m, root), jnp.asarray(phi), b)
+        belief, info = halfspace(form(m, root), jnp.asarray(phi), b)
         np.testing.assert_allclose(belief.mean, expected_mean, atol=1e-12)
         np.testing.assert_allclose(covariance_of(belief), expected_covariance, atol=1e-12)
         np.testing.assert_allclose(info.distances, [np.inf, c], atol=1e-12)
@@ -61,8 +63,8 @@ def test_a_cut_agrees_with_a_million_samples(x64, rng, form):
     count = 1_000_000
     samples = m + rng.normal(size=(count, 4)) @ root.T
     along = samples @ phi
-    half, half_info = cut.halfspace(form(m, root), jnp.asarray(phi), upper)
-    both, both_info = cut.interval(form(m, root), jnp.asarray(phi), lower, upper)
+    half, half_info = halfspace(form(m, root), jnp.asarray(phi), upper)
+    both, both_info = interval(form(m, root), jnp.asarray(phi), lower, upper)
     for belief, info, kept in (
         (half, half_info, samples[along <= upper]),
         (both, both_info, samples[(along >= lower) & (along <= upper)]),
@@ -79,7 +81,7 @@ def test_what_is_uncorrelated_stays_and_nothing_widens(x64, rng, form):
     root[:3, :3], root[3:, 3:] = rng.normal(size=(3, 3)), rng.normal(size=(2, 2))
     phi = np.append(rng.normal(size=3), [0, 0])
     before = form(rng.normal(size=5), root)
-    after, _ = cut.interval(before, jnp.asarray(phi), phi @ before.mean + 0.2, phi @ before.mean + 1.0)
+    after, _ = interval(before, jnp.asarray(phi), phi @ before.mean + 0.2, phi @ before.mean + 1.0)
     P, Q = covariance_of(before), covariance_of(after)
     np.testing.assert_array_equal(after.mean[3:], before.mean[3:])
     np.testing.assert_array_equal(Q[3:], P[3:])
@@ -127,7 +129,7 @@ def test_a_known_direction_is_left_alone_or_reported(x64, rng, form):
     belief = form(mean, root)
     difference = jnp.array([-1.0, 1.0, 0.0])
     for bounds, violated in (((1.5, 2.5), False), ((2.0, 2.0), False), ((2.5, 9.0), True), ((-jnp.inf, 1.9), True)):
-        after, info = cut.interval(belief, difference, *bounds)
+        after, info = interval(belief, difference, *bounds)
         np.testing.assert_array_equal(after.mean, mean)
         np.testing.assert_array_equal(covariance_of(after), covariance_of(belief))
         assert bool(info.infeasible) == violated
@@ -140,20 +142,20 @@ def test_a_known_direction_is_left_alone_or_reported(x64, rng, form):
         assert covariance_of(after)[2, 2] < covariance_of(belief)[2, 2]
 
     def far(leaves):
-        after, info = cut.interval(leaves, difference, 1.5, 2.5)
+        after, info = interval(leaves, difference, 1.5, 2.5)
         return jnp.sum(after.mean) + info.log_mass
 
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.grad(far)(belief)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.jit(jax.grad(far))(belief)))
 
 
 def test_bounds_far_inside_are_skipped(x64, form):
     belief = form(np.zeros(1), np.eye(1))
     constraints = linear_constraints([[1.0]], -2.5, 0.5)
     skipped, _ = cut.sequential_halfspaces(belief, constraints, skip=2.0)
-    upper_only, _ = cut.halfspace(belief, jnp.ones(1), 0.5)
+    upper_only, _ = halfspace(belief, jnp.ones(1), 0.5)
     np.testing.assert_array_equal(skipped.mean, upper_only.mean)
     np.testing.assert_array_equal(covariance_of(skipped), covariance_of(upper_only))
-    untouched, info = cut.halfspace(belief, jnp.ones(1), 0.5, skip=0.4)
+    untouched, info = halfspace(belief, jnp.ones(1), 0.5, skip=0.4)
     assert (untouched.mean[0], info.log_mass) == (0, 0)
 
 
@@ -193,14 +195,14 @@ def test_gradients_agree_with_differences(x64, rng, form):
     weight = jnp.asarray(rng.normal(size=(3, 3)))
 
     def outcome(x):
-        belief, info = cut.interval(form(x[:3], x[3:12].reshape(3, 3)), phi, x[12], x[13])
+        belief, info = interval(form(x[:3], x[3:12].reshape(3, 3)), phi, x[12], x[13])
         covariance = belief.covariance if isinstance(belief, Gaussian) else belief.root @ belief.root.T
         return jnp.sum(weight * covariance) + jnp.sum(belief.mean) + info.log_mass
 
     x = jnp.asarray([*mean, *root.ravel(), phi @ mean - 0.3, phi @ mean + 1.1])
-    gradient = jax.grad(outcome)(x)
+    gradient = jax.jit(jax.grad(outcome))(x)
     steps = 1e-6 * jnp.eye(x.size)
-    differences = jax.vmap(lambda step: (outcome(x + step) - outcome(x - step)) / 2e-6)(steps)
+    differences = jax.jit(jax.vmap(lambda step: (outcome(x + step) - outcome(x - step)) / 2e-6))(steps)
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-7)
 
 
