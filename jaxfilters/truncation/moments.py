@@ -48,7 +48,7 @@ class _Tail(NamedTuple):
     log_mass: Array
 
 
-def one_sided(c: Float[Array, "*shape"] | float) -> Moments:
+def one_sided(c: Float[Array, "..."] | float) -> Moments:
     """Moments of z ~ N(0, 1) given z <= c.
 
     The mean is `-phi(c) / Phi(c)` and the variance `1 + c mean - mean^2` (N. Shimada et al., "Shape and pose
@@ -59,7 +59,7 @@ def one_sided(c: Float[Array, "*shape"] | float) -> Moments:
     return Moments(-tail.mean, tail.variance, tail.log_mass)
 
 
-def interval(lower: Float[Array, "*shape"] | float, upper: Float[Array, "*shape"] | float) -> Moments:
+def interval(lower: Float[Array, "..."] | float, upper: Float[Array, "..."] | float) -> Moments:
     """Moments of z ~ N(0, 1) given lower <= z <= upper, where lower <= upper.
 
     Relative errors stay below 1e-12 (float64) and 1e-5 (float32). An interval without width is a point: no variance,
