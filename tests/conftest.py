@@ -1,8 +1,23 @@
+import gc
 import os
 from pathlib import Path
 
 import jax
 import pytest
+
+
+MANY_MAPPINGS = 20_000
+"""Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_compiled_programs():
+    """Drops the programs of earlier files once they are many: a worker that runs half of the suite would crash."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MANY_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
