@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.mixture import MixtureState, heaviest
-from jaxfilters.models.articulated.anatomy import five_finger_limits
+from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
     Inequalities,
@@ -35,9 +35,10 @@ from jaxfilters.models.articulated.filters import (
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
+from jaxfilters.models.articulated.motion import about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated_start import NUM_STARTS, Starts, starts_from_points
-from jaxfilters.trackers.feature_sequence import FeatureFrame, FeatureSequence, Start
+from jaxfilters.trackers.feature_sequence import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
 from jaxfilters.trackers.tracker import SequenceTracker
 
 SEARCHING, TRACKING, LOST = range(3)
@@ -45,6 +46,8 @@ FRAME_INTERVAL = 1 / 30
 """Seconds: what the process noise takes for a frame."""
 LOST_NIS = 25.0
 """Normalised innovation squared, per measured row, above which the hand counts as not there: 5 deviations each."""
+HAND_DIAGONAL = 0.19
+"""Metres: of the box around the keypoints of an average hand; what a hand's speed in the image is measured by."""
 PATIENCE = 10
 """Frames in a row without the hand before it is searched anew, where keypoints allow it."""
 
@@ -121,13 +124,18 @@ class _Setup:
 
 
 def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> ArticulatedHand:
-    """The model of the hand that the features are of.
+    """The model of the hand that the features are of: five fingers move about their angles at ease.
+
+    Other hands move with constant velocity, as in the paper.
 
     Raises:
         ValueError: where neither a start is given nor keypoints of five fingers, from which one is found.
     """
     if sequence.features == KEYPOINTS and sequence.num_fingers == 5:
-        return articulated_hand(five_fingers(side=1.0 if config.hand == "right" else -1.0), features=KEYPOINTS)
+        layout = five_fingers(side=1.0 if config.hand == "right" else -1.0)
+        diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
+        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=diagonal / HAND_DIAGONAL)
+        return articulated_hand(layout, features=KEYPOINTS, motion=motion)
     if sequence.start is None:
         raise ValueError(
             f"{sequence.name}: a start (mean and covariance of the state before the first frame) is needed for "

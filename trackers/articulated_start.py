@@ -13,6 +13,7 @@ from jaxfilters.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.truncation import LinearConstraints
 
@@ -24,7 +25,7 @@ _ROLLS = (-45.0, 0.0, 45.0, 135.0, 180.0, 225.0)
 """Degrees about the axis along the palm: 0 shows its inner side, 180 its back."""
 STEPS = 8
 """Gauss-Newton steps from each orientation."""
-ROTATION_STD, ANGLE_STD = math.radians(15.0), math.radians(20.0)
+ROTATION_STD, ANGLE_STD = math.radians(15.0), ANGLE_SPREAD
 """About the fitted pose; angles also about the relaxed hand while it is fitted, radians."""
 SIZE_STD, LENGTH_STD = 0.1, 0.08
 """Of the hand as a whole, and of each length on its own: shares of the average hand's."""

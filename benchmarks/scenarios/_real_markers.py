@@ -31,27 +31,9 @@ class Marker:
 @dataclass(frozen=True)
 @no_type_check  # JAX rebuilds pytrees from leaves of any kind
 class MarkedHand(ArticulatedHand):
-    """An articulated hand whose observation is the image of its markers, (x, y) one after the other.
+    """An articulated hand whose observation is the image of its markers, (x, y) one after the other."""
 
-    It moves like a real one: its rates die away, and its angles return to those of a hand at ease, so that what the
-    image says nothing about stays as uncertain as any hand's pose and no more.
-    """
-
-    ease: Float[Array, " angles"]
-    """Angles of a hand at ease, radians."""
-    rate_kept: Float[Array, ""]
-    """Share of a rate that is left after a frame."""
-    angle_kept: Float[Array, ""]
-    """Share of an angle's distance from ease that is left after a frame."""
     markers: tuple[Marker, ...] = field(metadata=dict(static=True))
-
-    def transition(self, x: Float[Array, " n"], control: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
-        """The state some frames later, one unless `control` says otherwise."""
-        dt = 1.0 if control is None else control
-        kept = self.angle_kept**dt
-        x = ArticulatedHand.transition(self, x, control)
-        x = x.at[self.layout.angles].set(self.ease + kept * (x[self.layout.angles] - self.ease))
-        return x.at[self.layout.rates].multiply(self.rate_kept**dt)
 
     def marker_points(self, x: Float[Array, " n"]) -> Float[Array, "markers 3"]:
         """Markers in the camera frame: pixels from the wrist's depth, or metres."""
@@ -70,24 +52,10 @@ class MarkedHand(ArticulatedHand):
         return y - y_hat
 
 
-def marked_hand(
-    hand: ArticulatedHand,
-    markers: Sequence[Marker],
-    *,
-    ease: Float[Array | np.ndarray, " angles"],
-    rate_kept: float = 1.0,
-    angle_kept: float = 1.0,
-) -> MarkedHand:
-    """The hand with markers for its features; arguments as the fields."""
+def marked_hand(hand: ArticulatedHand, markers: Sequence[Marker]) -> MarkedHand:
+    """The hand with markers for its features."""
     parts = {part.name: getattr(hand, part.name) for part in dataclasses.fields(hand)}
-    kept = (jnp.asarray(share, dtype=float) for share in (rate_kept, angle_kept))
-    return MarkedHand(
-        **parts,
-        ease=jnp.asarray(ease, dtype=float),
-        rate_kept=next(kept),
-        angle_kept=next(kept),
-        markers=tuple(markers),
-    )
+    return MarkedHand(**parts, markers=tuple(markers))
 
 
 def _place(marker, size, joints):

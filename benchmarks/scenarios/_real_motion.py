@@ -1,10 +1,9 @@
 """Real hands from one view: detections of networks on two sets of depth images, and motion capture through a camera.
 
-Only (u, v) of a network is used. The noise of NYU's detections, the motion model and the fan of the fingers at ease
-were chosen with an eye on the truth of its first frames, as the constants say; these frames do not count.
+Only (u, v) of a network is used. The noise is what the tracker takes for keypoints, motion and the hand at ease are its
+own: nothing but the meaning of the markers is from these recordings.
 """
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,25 +21,15 @@ from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
+from jaxfilters.models.articulated.motion import about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated_hand import TRACKING, ArticulatedConfig, tracker_of
 from jaxfilters.trackers.articulated_start import starts_from_points
-from jaxfilters.trackers.feature_sequence import FeatureFrame
+from jaxfilters.trackers.feature_sequence import FeatureFrame, keypoint_noise
 
 FRAME_INTERVAL = 1 / 30
-NOISE_PER_JITTER = 6.0
-"""Errors of a network persist over several frames, which second differences do not show and a filter of white noise
-takes for fresh evidence. The factor was chosen by the error against the truth on the first 240 frames of NYU: the log
-evidence of the detections, blind to what persists, prefers two."""
-ACCELERATION_STD = (0.003, 0.01, math.radians(2.0))
-"""Metres, quaternion, radians per frame squared. With the shares below, of four settings on the first 240 frames of NYU
-at a noise of 4 px, the one with the largest log evidence and also with the smallest error. ICVL takes them as they are.
-"""
-RATE_KEPT, ANGLE_KEPT = 0.5, 0.9
 HYPOTHESES = 4
-TUNED_FRAMES = 240
-"""Of NYU, on which the two constants above were chosen: not among the frames that are judged."""
 QUICK_FRAMES = 240
 VARIANTS = ("backprojection", "limits_only", "filter_only", "recommended")
 
@@ -136,7 +125,7 @@ def load(data_dir: Path, chosen: HandSet, network: str, frames: int | None) -> D
     K, truth = np.abs(data["K"]), np.asarray(data["gt_uvd"][:frames], float)
     camera = Pinhole.from_matrix(K, chosen.image_shape)
     pixels = np.asarray(data[network][:frames, :, :2], float)
-    return Detections(camera, pixels, back_projected(camera, truth), NOISE_PER_JITTER * jitter(pixels))
+    return Detections(camera, pixels, back_projected(camera, truth), keypoint_noise(pixels))
 
 
 def back_projected(camera: Pinhole, uvd: np.ndarray) -> np.ndarray:
@@ -145,25 +134,14 @@ def back_projected(camera: Pinhole, uvd: np.ndarray) -> np.ndarray:
     return np.concatenate([ray, np.ones_like(ray[..., :1])], axis=-1) * uvd[..., 2:]
 
 
-def jitter(pixels: np.ndarray) -> float:
-    """Standard deviation of what differs from frame to frame, pixels: from the median of absolute second differences.
-
-    White noise of variance s^2 has second differences of variance 6 s^2.
-    """
-    return float(1.4826 * np.median(np.abs(np.diff(pixels, n=2, axis=0))) / math.sqrt(6))
-
-
 def hand_of(chosen: HandSet, detections: Detections) -> tuple[MarkedHand, Inequalities]:
     """The average hand before the camera, and its limits."""
     layout = five_fingers(3, chosen.side)
+    motion = about_ease(layout, relaxed_angles(layout).ravel())
     hand = articulated_hand(
-        layout,
-        projection=Perspective(detections.camera),
-        acceleration_std=ACCELERATION_STD,
-        point_std=detections.noise,
+        layout, projection=Perspective(detections.camera), motion=motion, point_std=detections.noise
     )
-    ease = relaxed_angles(layout).ravel()
-    marked = marked_hand(hand, chosen.markers, ease=ease, rate_kept=RATE_KEPT, angle_kept=ANGLE_KEPT)
+    marked = marked_hand(hand, chosen.markers)
     return marked, inequalities(limit_rows(layout, five_finger_limits(layout)))
 
 
@@ -219,9 +197,7 @@ def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detecti
     metrics, plain = {}, {}
     for variant, way in ways.items():
         lifted = way(chosen, detections)
-        # A short run has no other frames; its numbers say only that it runs.
-        judged = slice(TUNED_FRAMES if len(detections.truth) > 2 * TUNED_FRAMES else 0, None)
-        plain[variant], scaled = root_relative_errors(lifted.points[judged], detections.truth[judged], chosen.root)
+        plain[variant], scaled = root_relative_errors(lifted.points, detections.truth, chosen.root)
         metrics[f"{name}_root_relative_mm_{variant}{suffix}"] = Metric(plain[variant], "mm", "lower")
         metrics[f"{name}_scaled_root_relative_mm_{variant}{suffix}"] = Metric(scaled, "mm", "lower")
     reduction = 100 * (1 - plain["recommended"] / plain["backprojection"])

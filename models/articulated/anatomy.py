@@ -21,12 +21,11 @@ TOLERANCE = 0.25
 
 _THUMB = ((-35.0, 35.0), (-20.0, 60.0), (-5.0, 60.0), (-15.0, 80.0))
 _FINGER = ((-20.0, 20.0), (-15.0, 90.0), (0.0, 110.0), (-5.0, 80.0))
-"""Degrees: abduction from that of the fan below, then three flexions from the base out."""
-_FAN = (0.0, -8.0, 0.0, 8.0, 18.0)
-"""Degrees: abduction of the fingers of a right hand at ease, which spread from the wrist as its metacarpals do; rounded
-from fits to the true joints of two recorded hands."""
-_EASE = ((10.0, 15.0, 15.0), *([(20.0, 25.0, 15.0)] * 4))
-"""Degrees: flexions of a hand at ease."""
+"""Degrees: abduction from that at ease, then three flexions from the base out."""
+_EASE = ((10.0, 21.0, 18.0), *([(19.0, 23.0, 10.0)] * 4))
+"""Degrees: flexions of an open hand at ease: the lower ends of the ranges that daily activities use (G. I. Bain et al.,
+The functional range of motion of the finger joints, 2015); the last two joints of a thumb at their mean in such
+activities (M. C. Hume et al., Functional range of motion of the joints of the hand, 1990)."""
 
 
 def template_lengths() -> np.ndarray:
@@ -42,7 +41,7 @@ def template_shape() -> np.ndarray:
 
 def relaxed_angles(layout: Layout) -> np.ndarray:
     """(5, 4): abduction and three flexions of every finger of a hand at ease, radians."""
-    return np.radians(np.column_stack([_side(layout) * np.array(_FAN), _EASE]))
+    return np.column_stack([_side(layout) * _fan(), np.radians(_EASE)])
 
 
 def five_finger_limits(layout: Layout, tolerance: float = TOLERANCE) -> Sequence[Limit]:
@@ -54,15 +53,23 @@ def five_finger_limits(layout: Layout, tolerance: float = TOLERANCE) -> Sequence
     if layout.num_fingers != 5:
         raise ValueError(f"layout must have five fingers; got {layout.num_fingers}.")
     limits: list[Limit] = []
+    fan = _side(layout) * _fan()
     for finger in range(1, 6):
-        fan = _side(layout) * _FAN[finger - 1]
         for joint, (low, high) in enumerate(_THUMB if finger == 1 else _FINGER):
-            low, high = (fan + low, fan + high) if joint == 0 else (low, high)
-            limits.append(within(f"theta_{finger}{joint}", math.radians(low), math.radians(high)))
+            middle = float(fan[finger - 1]) if joint == 0 else 0.0
+            limits.append(within(f"theta_{finger}{joint}", middle + math.radians(low), middle + math.radians(high)))
         if finger > 1:
             last = math.radians(35.0)
             limits.append(difference(f"theta_{finger}{LINKS - 1}", f"theta_{finger}{LINKS}", -0.3 * last, 1.5 * last))
     return (*limits, *proportions(layout, template_lengths(), PALM_HEIGHT, tolerance))
+
+
+def _fan():
+    """(5,) radians: abduction of a right hand at ease, whose fingers go on as their metacarpals do."""
+    with jax.ensure_compile_time_eval():
+        hand = hand_geometry()
+        across, back, _ = np.asarray(hand.bases[1:] - hand.metacarpal_starts, dtype=float).T
+    return np.concatenate([np.zeros(1), np.arctan2(-across, -back)])
 
 
 def _side(layout):

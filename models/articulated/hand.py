@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.linalg import safe_norm
+from jaxfilters.linalg import matmul, safe_norm
 from jaxfilters.models.articulated.features import (
     FULL,
     SHORTEST_LINK,
@@ -19,7 +19,8 @@ from jaxfilters.models.articulated.features import (
     undirected_residual,
 )
 from jaxfilters.models.articulated.kinematics import Pivot, finger_points, pivot_base, turn, unit_rotation
-from jaxfilters.models.articulated.layout import Layout, white_acceleration_noise, white_acceleration_root
+from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.models.articulated.motion import ConstantVelocity, Motion
 from jaxfilters.models.articulated.projection import Projection, WeakPerspective
 
 POINT_STD, ALPHA_STD, RHO_STD = 1.0, float(np.deg2rad(2.0)), 1.0
@@ -37,8 +38,8 @@ class ArticulatedHand:
     """
 
     projection: Projection
-    acceleration_std: Float[Array, " m"]
-    """Of position, quaternion and angles, per frame squared, not negative."""
+    motion: Motion
+    """How the state moves."""
     point_std: Float[Array, ""]
     """Noise of each coordinate of a point, pixels, positive."""
     alpha_std: Float[Array, ""]
@@ -55,18 +56,18 @@ class ArticulatedHand:
     """`undirected_residual` or `directed_residual`."""
 
     def transition(self, x: Float[Array, " n"], control: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
-        """The state with everything moved on by its rate [6], [8]."""
-        dt = 1.0 if control is None else control
-        moved = x.at[self.layout.moving].add(dt * x[self.layout.rates])
+        """The expected state after a frame, or after `control` frames."""
+        moved = self.motion.advance(x, self.layout, 1.0 if control is None else control)
         return self.projection.settle(moved, self.layout)
 
     def process_noise(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n n"]:
         """Covariance of what accelerations add to a transition."""
-        return white_acceleration_noise(self.layout, self.acceleration_std, 1.0 if control is None else control)
+        root = self.process_noise_root(control)
+        return matmul(root, root.T)
 
-    def process_noise_root(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n m"]:
+    def process_noise_root(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n columns"]:
         """A root of `process_noise`."""
-        return white_acceleration_root(self.layout, self.acceleration_std, 1.0 if control is None else control)
+        return self.motion.noise_root(self.layout, 1.0 if control is None else control)
 
     def points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 3"]:
         """Joints of every finger from base to tip in the camera frame: pixels from the wrist's depth, or metres."""
@@ -130,13 +131,13 @@ def articulated_hand(
     features: FeatureSet = FULL,
     pivot: Pivot = pivot_base,
     compare: Residual = undirected_residual,
-    acceleration_std: tuple[float, float, float] | None = None,
+    motion: Motion | None = None,
     point_std: float = POINT_STD,
     alpha_std: float = ALPHA_STD,
     rho_std: float = RHO_STD,
     origin: tuple[float, float] | None = None,
 ) -> ArticulatedHand:
-    """The model with checked numbers; the defaults are weak perspective and the noise of the specification.
+    """The model with checked numbers; the defaults are weak perspective, motion and noise of the specification.
 
     Args:
         layout: Of the state.
@@ -144,7 +145,7 @@ def articulated_hand(
         features: What is observed.
         pivot: What abduction turns a finger about.
         compare: How observed and predicted features are subtracted.
-        acceleration_std: Of wrist, quaternion and angles, per frame squared; the projection's unless given.
+        motion: How the state moves; with constant velocity and the projection's accelerations unless given.
         point_std: Noise of a point's coordinates, pixels.
         alpha_std: Noise of a line's angle, radians.
         rho_std: Noise of a line's distance, pixels.
@@ -154,7 +155,6 @@ def articulated_hand(
         ValueError: if the layout is not one for the projection, or a number is not finite or has the wrong sign.
     """
     projection = WeakPerspective() if projection is None else projection
-    acceleration_std = projection.acceleration_std if acceleration_std is None else acceleration_std
     center = projection.center() if origin is None else np.asarray(origin)
     if layout.position_size != projection.position_size:
         raise ValueError(
@@ -164,13 +164,11 @@ def articulated_hand(
     for name, value in (("point_std", point_std), ("alpha_std", alpha_std), ("rho_std", rho_std)):
         if not 0 < value < np.inf:
             raise ValueError(f"{name} must be positive; got {value}.")
-    if len(acceleration_std) != 3 or not all(0 <= value < np.inf for value in acceleration_std):
-        raise ValueError(f"acceleration_std must be three numbers, zero or more; got {acceleration_std}.")
     if center.shape != (2,) or not np.all(np.isfinite(center)):
         raise ValueError(f"origin must be two finite numbers (pixels); got {origin}.")
     return ArticulatedHand(
         projection=projection,
-        acceleration_std=layout.per_moving(*acceleration_std),
+        motion=ConstantVelocity(layout.per_moving(*projection.acceleration_std)) if motion is None else motion,
         point_std=jnp.asarray(point_std, dtype=float),
         alpha_std=jnp.asarray(alpha_std, dtype=float),
         rho_std=jnp.asarray(rho_std, dtype=float),

@@ -13,14 +13,6 @@ from jaxfilters.models.articulated.kinematics import finger_points
 from jaxfilters.models.articulated.layout import five_fingers
 
 
-def test_jitter_of_white_noise_is_its_deviation_whatever_moves_slowly():
-    """20000 differences: the median of absolute deviations is within 4 % at 4 sigma."""
-    rng = np.random.default_rng(0)
-    slow = 100 * np.sin(np.arange(1000) / 200)[:, None, None]
-    pixels = slow + 1.7 * rng.standard_normal((1000, 10, 2))
-    assert motion.jitter(pixels) == pytest.approx(1.7, rel=0.04)
-
-
 def test_errors_are_those_of_a_shape_from_its_root():
     rng = np.random.default_rng(1)
     truth = rng.standard_normal((6, 5, 3))
@@ -33,20 +25,19 @@ def test_errors_are_those_of_a_shape_from_its_root():
 def test_markers_lie_between_joints_and_on_the_palm():
     layout = five_fingers()
     markers = (Marker("a", palm=(0.5, 0.1, -0.2)), Marker("b", finger=1, along=1.5), Marker("c", finger=4, along=3.0))
-    ease = relaxed_angles(layout).ravel()
-    hand = marked_hand(articulated_hand(layout), markers, ease=ease, rate_kept=0.5, angle_kept=0.9)
+    hand = marked_hand(articulated_hand(layout), markers)
     x = jnp.zeros(layout.size).at[layout.quaternion].set(jnp.array([1.0, 0, 0, 0]))
-    x = x.at[layout.static].set(jnp.asarray(template_shape())).at[layout.angles].set(jnp.asarray(ease + 0.1))
-    x = x.at[layout.rates].set(0.02)
+    x = (
+        x.at[layout.static]
+        .set(jnp.asarray(template_shape()))
+        .at[layout.angles]
+        .set(jnp.asarray(relaxed_angles(layout).ravel()))
+    )
     joints = np.asarray(finger_points(x, layout))
     width, height, thickness = np.asarray(x[layout.palm])
     expected = [(0.5 * height, 0.1 * thickness, -0.2 * width), joints[1, 1:3].mean(axis=0), joints[4, 3]]
     np.testing.assert_allclose(hand.marker_points(x), expected, atol=1e-4)
     np.testing.assert_allclose(hand.observe(x), np.array(expected)[:, :2].ravel(), atol=1e-4)
-    # 0.1 rad from ease and a rate of 0.02 come to 0.9 * 0.12 in one frame.
-    after = hand.transition(x)
-    np.testing.assert_allclose(after[layout.angles] - ease, 0.108, atol=1e-6)
-    np.testing.assert_allclose(after[layout.rates], 0.01, atol=1e-7)
 
 
 def test_a_triangle_is_known_from_its_sides():
@@ -68,10 +59,18 @@ def test_detections_lie_where_their_truth_is_seen(data_dir):
 
 @pytest.mark.data
 def test_one_frame_lifted_within_limits_is_nearer_than_its_back_projection(data_dir):
+    """By more than four standard errors of the difference, over poses a third of a second apart."""
     chosen = motion.SETS["nyu"]
-    found = motion.load(data_dir, chosen, chosen.networks[0], 40)
+    found = motion.load(data_dir, chosen, chosen.networks[0], 800)
+    found = found._replace(pixels=found.pixels[::10], truth=found.truth[::10])
     flat, lifted = (
-        motion.root_relative_errors(way(chosen, found).points, found.truth, chosen.root)[0]
+        np.array(
+            [
+                motion.root_relative_errors(p[None], t[None], chosen.root)[0]
+                for p, t in zip(way(chosen, found).points, found.truth, strict=True)
+            ]
+        )
         for way in (motion.onto_root_plane, motion.frame_by_frame)
     )
-    assert lifted < 0.8 * flat
+    nearer = flat - lifted
+    assert nearer.mean() > 4 * nearer.std() / np.sqrt(len(nearer))

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.devices import use_all_cores
 
 FAILURE, INTERRUPTED = 2, 130
@@ -28,7 +29,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jaxfilters.trackers.shell.track_command import track
 
     try:
-        track(_job(options), options)
+        if options.command == "calibrate":
+            from jaxfilters.trackers.shell.calibrate_command import calibrate
+
+            print(calibrate(options))
+        else:
+            track(_job(options), options)
     except (InputError, OutputError, CheckpointError) as error:
         print(f"jaxfilters: error: {error}", file=sys.stderr)
         return FAILURE
@@ -83,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(input=None, resume=False, overwrite=True)
     _add_filter_options(demo)
 
+    add_calibrate(commands, _image_size)
     commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
     return parser
 

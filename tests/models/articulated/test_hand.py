@@ -201,7 +201,6 @@ def test_the_comparison_is_the_one_that_was_chosen():
         (dict(point_std=0.0), "point_std must be positive"),
         (dict(alpha_std=float("nan")), "alpha_std must be positive"),
         (dict(rho_std=-1.0), "rho_std must be positive"),
-        (dict(acceleration_std=(1.0, -0.1, 0.1)), "acceleration_std must be three"),
         (dict(origin=(0.0, float("inf"))), "origin must be two finite"),
     ],
 )

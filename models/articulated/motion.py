@@ -1,0 +1,141 @@
+"""How an articulated hand moves from one frame to the next: with constant velocity, or as hands do that move about.
+
+Strategies with the same verbs. Frames are the unit of time; layouts are those of
+`jaxfilters.models.articulated.layout`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfilters.linalg import safe_sqrt
+from jaxfilters.models.articulated.layout import Layout, white_acceleration_root
+
+MOVEMENT_TIME = 10.0
+"""Frames of a thirtieth of a second: a third of a second is what a movement of the hand takes to run down; reaching and
+grasping last about twice that (M. Jeannerod, The timing of natural prehension movements, 1984)."""
+ANGLE_SPREAD = math.radians(20.0)
+"""Standard deviation of a finger's angle about that at ease. Nine in ten postures of daily activities lie within 26, 32
+and 27 degrees of the middle of their range, from the base of a finger out (G. I. Bain et al., The functional range of
+motion of the finger joints, 2015): deviations of 16 to 19 degrees."""
+SPEED = (0.08 / MOVEMENT_TIME, 0.5 * ANGLE_SPREAD / MOVEMENT_TIME, ANGLE_SPREAD / MOVEMENT_TIME)
+"""Of wrist (metres), quaternion and angles (radians), per frame: a movement takes the wrist by a palm's width, and
+turns palm and joints by the spread of an angle."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class ConstantVelocity:
+    """Everything moves on by its rate; accelerations are constant within a frame and independent between [6], [8]."""
+
+    acceleration_std: Float[Array, " m"]
+    """Of position, quaternion and angles, per frame squared, not negative."""
+
+    def advance(self, x: Float[Array, " n"], layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, " n"]:
+        """The expected state `dt` frames later."""
+        return x.at[layout.moving].add(dt * x[layout.rates])
+
+    def noise_root(self, layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, "n m"]:
+        """A root of the covariance of what is added to it."""
+        return white_acceleration_root(layout, self.acceleration_std, dt)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class AboutEase:
+    """Rates die away, and angles return to those of a hand at ease; white accelerations keep both alive.
+
+    With `a = 1 / time`, position and quaternion follow `p'' = -a p' + w`, angles `p'' = -2 a p' - a^2 (p - ease) + w`,
+    solved exactly. What the image says nothing about comes to rest at the deviations of a hand of which nothing is
+    known: `speed_std` of the rates and `time * speed_std` of the angles, however long a gap between frames is.
+    """
+
+    ease: Float[Array, " angles"]
+    """Angles of a hand at ease, radians."""
+    speed_std: Float[Array, " m"]
+    """Of the rates of position, quaternion and angles, per frame, not negative."""
+    time: Float[Array, " m"]
+    """Frames in which a rate of position, quaternion or angles falls to 1/e, positive."""
+
+    def advance(self, x: Float[Array, " n"], layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, " n"]:
+        """The expected state `dt` frames later."""
+        angles, rates = layout.angles, layout.angle_rates
+        pose, pose_rates = _pose(layout)
+        t = dt / self.time[pose]
+        x = x.at[pose].add(-self.time[pose] * jnp.expm1(-t) * x[pose_rates]).at[pose_rates].multiply(jnp.exp(-t))
+        t = dt / self.time[angles]
+        off, rate = x[angles] - self.ease, x[rates]
+        x = x.at[angles].set(self.ease + jnp.exp(-t) * ((1 + t) * off + dt * rate))
+        return x.at[rates].set(jnp.exp(-t) * ((1 - t) * rate - t / self.time[angles] * off))
+
+    def noise_root(self, layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, "n columns"]:
+        """A root of the covariance of what is added to it: the noise of three moments, weighted as Gauss does.
+
+        Its square is the integral over the frames to one part in 10^5 for steps up to `time`.
+        """
+        is_angle = np.arange(layout.num_moving) >= layout.angles.start
+        columns = []
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            since = 0.5 * (1 + float(node)) * dt
+            t = since / self.time
+            kept = jnp.exp(-t)
+            power = np.where(is_angle, 2.0, 1.0) * float(weight) / self.time
+            push = self.speed_std * jnp.sqrt(power) * safe_sqrt(jnp.asarray(dt, self.speed_std.dtype))
+            moved = jnp.where(is_angle, since * kept, -self.time * jnp.expm1(-t))
+            rate = jnp.where(is_angle, (1 - t) * kept, kept)
+            static = jnp.zeros((layout.num_static, layout.num_moving), push.dtype)
+            columns.append(jnp.concatenate([jnp.diag(push * moved), jnp.diag(push * rate), static]))
+        return jnp.concatenate(columns, axis=1)
+
+
+Motion = ConstantVelocity | AboutEase
+
+
+def about_ease(
+    layout: Layout,
+    ease: Float[Array | np.ndarray, " angles"],
+    *,
+    per_metre: float = 1.0,
+    speed_std: tuple[float, float, float] = SPEED,
+    time: float = MOVEMENT_TIME,
+) -> AboutEase:
+    """The motion of a hand about its angles at ease, with checked numbers.
+
+    Args:
+        layout: Of the state.
+        ease: Angles of a hand at ease, radians.
+        per_metre: Units of the position in a metre: 1 in space, pixels at the hand's distance in an image.
+        speed_std: Of wrist (metres), quaternion and angles, per frame.
+        time: Frames in which a rate falls to 1/e.
+
+    Raises:
+        ValueError: if the angles are not those of the layout, or a number is not finite or has the wrong sign.
+    """
+    expected = layout.angles.stop - layout.angles.start
+    if np.shape(ease) != (expected,) or not np.all(np.isfinite(ease)):
+        raise ValueError(f"ease must be {expected} finite angles (radians); got {ease}.")
+    if len(speed_std) != 3 or not all(0 <= value < math.inf for value in speed_std):
+        raise ValueError(f"speed_std must be three numbers, zero or more; got {speed_std}.")
+    for name, value in (("per_metre", per_metre), ("time", time)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name} must be positive; got {value}.")
+    wrist, quaternion, angle = speed_std
+    return AboutEase(
+        ease=jnp.asarray(ease, dtype=float),
+        speed_std=layout.per_moving(per_metre * wrist, quaternion, angle),
+        time=layout.per_moving(time, time, time),
+    )
+
+
+def _pose(layout):
+    """Where position and quaternion are, and their rates."""
+    size = layout.position_size + 4
+    return slice(0, size), slice(layout.num_moving, layout.num_moving + size)

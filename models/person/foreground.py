@@ -1,0 +1,118 @@
+"""Likelihood of a foreground probability map given people: small windows, each sampled at a fixed number of pixels.
+
+Every pixel is foreground or background on its own. A pixel that nobody covers is foreground with probability
+`CLUTTER`; a person makes it foreground with probability `presence(radius)`, independently of the others. With T the
+probability that neither clutter nor anybody else explains the pixel, and p the foreground probability that was
+observed (even prior), a person multiplies the likelihood by
+
+    (p + T (1 - q) (1 - 2 p)) / (p + T (1 - 2 p)) = 1 - q b,    b = T (1 - 2 p) / (p + T (1 - 2 p)),
+
+so that one number a pixel, `contrast`, is all that candidates have to be compared with. What one person gains is what
+the others do not explain: people who hide each other, and blobs of several people, need no case of their own.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Integer
+
+CLUTTER = 0.02
+"""Share of foreground pixels where nobody is."""
+DETECTED = 0.9
+"""Share of foreground pixels in the middle of a person."""
+LEAST, MOST = 0.06, 0.94
+"""Bounds on what a pixel may claim: background subtraction is wrong more often than it says."""
+FALLOFF = 4
+"""Exponent of the squared radius: how sharply a person ends at the outline, given that bodies are no ellipsoids."""
+_BLOCK = 16
+"""Factors multiplied before a logarithm: 16 factors of at most 1 / LEAST stay far from the ends of float32."""
+
+
+class Window(NamedTuple):
+    """Pixels at which people are compared with an image."""
+
+    uv: Float[Array, "samples 2"]
+    """Centres of pixels; some lie outside the image."""
+    index: Integer[Array, " samples"]
+    """Of the pixel in the flattened image; of some pixel where it lies outside."""
+    inside: Float[Array, " samples"]
+    """1 inside the image, 0 outside."""
+    area: Float[Array, ""]
+    """Square pixels for which one sample stands."""
+
+
+def window(box: Float[Array, " 4"], shape: tuple[int, int], grid: tuple[int, int]) -> Window:
+    """An even grid of pixels over a box (least u, least v, greatest u, greatest v)."""
+    rows, cols = grid
+    low, size = box[:2], box[2:] - box[:2]
+    u = low[0] + size[0] * (jnp.arange(cols) + 0.5) / cols
+    v = low[1] + size[1] * (jnp.arange(rows) + 0.5) / rows
+    u, v = (jnp.round(a) for a in jnp.meshgrid(u, v))
+    inside = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])
+    column, row = (jnp.clip(a, 0, top - 1).astype(jnp.int32) for a, top in ((u, shape[1]), (v, shape[0])))
+    return Window(
+        jnp.stack([u.ravel(), v.ravel()], axis=-1),
+        (row * shape[1] + column).ravel(),
+        inside.ravel().astype(float),
+        size[0] * size[1] / (rows * cols),
+    )
+
+
+def presence(squared_radius: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
+    """Probability that a person makes a pixel foreground, by its squared distance in units of the outline."""
+    return DETECTED / (1 + squared_radius**FALLOFF)
+
+
+def contrast(
+    foreground: Float[Array, "*pixels"], unexplained: Float[Array, "*pixels"]
+) -> Float[Array, "*pixels"]:
+    """What candidates are compared with: negative where a person would explain something, positive where not.
+
+    Args:
+        foreground: Observed probability of foreground.
+        unexplained: Probability that nothing else makes the pixel foreground.
+    """
+    p = jnp.clip(foreground, LEAST, MOST)
+    ahead = unexplained * (1 - 2 * p)
+    return ahead / (p + ahead)
+
+
+def log_likelihood_ratio(
+    presence: Float[Array, " samples"], contrast: Float[Array, " samples"]
+) -> Float[Array, ""]:
+    """Log likelihood of a person over that of nobody, in samples; both are computed for the same window."""
+    factors = 1 - presence * contrast
+    padded = jnp.pad(factors, (0, -len(factors) % _BLOCK), constant_values=1.0)
+    return jnp.sum(jnp.log(jnp.prod(padded.reshape(_BLOCK, -1), axis=0)))
+
+
+class Quadratic(NamedTuple):
+    """`value + gradient . d - d . curvature d / 2` around a point."""
+
+    value: Float[Array, ""]
+    gradient: Float[Array, " n"]
+    curvature: Float[Array, "n n"]
+    """Positive semidefinite where the point is near a maximum."""
+
+
+def lattice(dimensions: int, reach: int = 1) -> Float[Array, "points n"]:
+    """All points with whole coordinates from `-reach` to `reach`."""
+    axes = jnp.meshgrid(*[jnp.arange(-reach, reach + 1, dtype=float)] * dimensions, indexing="ij")
+    return jnp.stack([axis.ravel() for axis in axes], axis=-1)
+
+
+def quadratic_fit(values: Float[Array, " 3**n"], steps: Float[Array, " n"]) -> Quadratic:
+    """Least-squares parabola through values on `lattice(n) * steps`.
+
+    On a full lattice the regressors are orthogonal but for constant and squares, so that every coefficient is a
+    contrast of its own (G. Box, K. Wilson, "On the experimental attainment of optimum conditions", 1951).
+    """
+    n = round(math.log(len(values), 3))
+    x = lattice(n)
+    gradient = 3.0 ** (1 - n) / 2 * (values @ x)
+    mixed = 3.0 ** (2 - n) / 4 * jnp.einsum("p,pi,pj->ij", values, x, x)
+    squares = 3.0 ** (1 - n) / 2 * (values @ (3 * x**2 - 2))
+    second = jnp.where(jnp.eye(n, dtype=bool), 2 * squares, mixed)
+    value = jnp.mean(values) - jnp.sum(squares) * 2 / 3
+    return Quadratic(value, gradient / steps, -second / jnp.outer(steps, steps))

@@ -1,0 +1,210 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from jaxfilters.benchmarks.multi_object import evaluate, floor_tracks, match
+
+SEEDS = range(12)
+
+
+def random_case(seed, *, people=3, frames=6, spread=2.0, lost=0.25):
+    """People and estimates of them that are noisy, incomplete, sometimes exchanged and sometimes invented."""
+    rng = np.random.default_rng(seed)
+    truth, estimate = [], []
+    paths = rng.uniform(0, spread, (people, 1, 2)) + np.cumsum(rng.normal(0, 0.2, (people, frames, 2)), axis=1)
+    names = np.arange(people) + 10
+    for t in range(frames):
+        if rng.random() < 0.3:
+            names[rng.permutation(people)[:2]] = names[rng.permutation(people)[:2]] if rng.random() < 0.5 else names[:2]
+            names = np.where(np.bincount(names, minlength=200)[names] > 1, 100 + 10 * t + np.arange(people), names)
+        for i in rng.permutation(people):
+            if rng.random() > 0.1:
+                truth.append((t, i, *paths[i, t]))
+            if rng.random() > lost:
+                estimate.append((t, names[i], *(paths[i, t] + rng.normal(0, 0.4, 2))))
+        if rng.random() < 0.3:
+            estimate.append((t, 190 + t, *rng.uniform(0, spread, 2)))
+    return tracks(truth), tracks(estimate)
+
+
+def tracks(rows):
+    table = np.array(rows, float).reshape(-1, 4)
+    return floor_tracks(table[:, 0], table[:, 1], table[:, 2:])
+
+
+def all_pairings(n, m):
+    """Every one-to-one pairing of some of n with some of m, as lists of (i, j)."""
+    for size in range(min(n, m) + 1):
+        for left in itertools.combinations(range(n), size):
+            for right in itertools.permutations(range(m), size):
+                yield list(zip(left, right, strict=True))
+
+
+def enumerated_scores(truth, estimate, gate_m):
+    """MOTA in counts and the distances of pairs by trying every pairing of every frame."""
+    last, switches, distances = {}, 0, []
+    misses = false_positives = 0
+    for t in np.union1d(truth.frame, estimate.frame):
+        people, found = np.flatnonzero(truth.frame == t), np.flatnonzero(estimate.frame == t)
+        kept, best = [], []
+        for i in people:
+            for j in found:
+                near = np.hypot(*(truth.xy_m[i] - estimate.xy_m[j])) <= gate_m
+                if near and last.get(truth.identity[i]) == estimate.identity[j] and j not in [b for _, b in kept]:
+                    kept.append((i, j))
+        people = [i for i in people if i not in [a for a, _ in kept]]
+        found = [j for j in found if j not in [b for _, b in kept]]
+        for pairing in all_pairings(len(people), len(found)):
+            pairs = [(people[a], found[b]) for a, b in pairing]
+            lengths = [np.hypot(*(truth.xy_m[i] - estimate.xy_m[j])) for i, j in pairs]
+            if all(length <= gate_m for length in lengths):
+                best.append((-len(pairs), sum(lengths), pairs))
+        pairs = kept + min(best)[2]
+        for i, j in pairs:
+            who, name = truth.identity[i], estimate.identity[j]
+            switches += who in last and last[who] != name
+            last[who] = name
+            distances.append(np.hypot(*(truth.xy_m[i] - estimate.xy_m[j])))
+        misses += len(people) + len(kept) - len(pairs)
+        false_positives += len(found) + len(kept) - len(pairs)
+    return misses, false_positives, switches, np.mean(distances)
+
+
+def enumerated_idf1(truth, estimate, gate_m):
+    who, names = np.unique(truth.identity), np.unique(estimate.identity)
+    best = 0
+    for pairing in all_pairings(len(who), len(names)):
+        common = 0
+        for a, b in pairing:
+            for i in np.flatnonzero(truth.identity == who[a]):
+                for j in np.flatnonzero((estimate.identity == names[b]) & (estimate.frame == truth.frame[i])):
+                    common += np.hypot(*(truth.xy_m[i] - estimate.xy_m[j])) <= gate_m
+        best = max(best, common)
+    return 200 * best / (len(truth.frame) + len(estimate.frame))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_counts_are_those_of_the_best_among_all_pairings(seed):
+    truth, estimate = random_case(seed)
+    scores = evaluate(truth, estimate, gate_m=0.7)
+    misses, false_positives, switches, mean_error_m = enumerated_scores(truth, estimate, 0.7)
+    assert (scores.misses, scores.false_positives, scores.id_switches) == (misses, false_positives, switches)
+    np.testing.assert_allclose(scores.mean_error_m, mean_error_m, rtol=1e-12)
+    wrong = misses + false_positives + switches
+    np.testing.assert_allclose(scores.mota, 100 * (1 - wrong / len(truth.frame)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_identities_are_those_of_the_best_assignment_throughout(seed):
+    truth, estimate = random_case(seed, people=2, frames=4)
+    scores = evaluate(truth, estimate, gate_m=0.7)
+    np.testing.assert_allclose(scores.idf1, enumerated_idf1(truth, estimate, 0.7), rtol=1e-12)
+    np.testing.assert_allclose(scores.idf1, 2 / (1 / scores.idp + 1 / scores.idr), rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("seed", range(4))
+def test_scores_equal_those_of_motmetrics(seed):
+    motmetrics = pytest.importorskip("motmetrics")
+    truth, estimate = random_case(seed, people=8, frames=40, spread=5.0)
+    scores = evaluate(truth, estimate)
+    accumulator = motmetrics.MOTAccumulator()
+    for t in np.union1d(truth.frame, estimate.frame):
+        i, j = truth.frame == t, estimate.frame == t
+        distance = np.linalg.norm(truth.xy_m[i][:, None] - estimate.xy_m[j][None], axis=-1)
+        distance[distance > 1.0] = np.nan
+        accumulator.update(truth.identity[i], estimate.identity[j], distance, frameid=int(t))
+    theirs = motmetrics.metrics.create().compute(accumulator, metrics=motmetrics.metrics.motchallenge_metrics).iloc[0]
+    ours = [100 * theirs[name] for name in ("idf1", "idp", "idr", "mota")]
+    np.testing.assert_allclose([scores.idf1, scores.idp, scores.idr, scores.mota], ours, rtol=1e-9)
+    np.testing.assert_allclose(scores.mean_error_m, theirs["motp"], rtol=1e-9)
+    assert (scores.id_switches, scores.false_positives, scores.misses, scores.fragmentations) == tuple(
+        theirs[name] for name in ("num_switches", "num_false_positives", "num_misses", "num_fragmentations")
+    )
+    assert (scores.people, scores.mostly_tracked, scores.mostly_lost) == tuple(
+        theirs[name] for name in ("num_unique_objects", "mostly_tracked", "mostly_lost")
+    )
+
+
+def test_whoever_is_within_reach_keeps_the_identity_although_another_is_nearer():
+    truth = tracks([(0, 1, 0, 0), (1, 1, 0, 0)])
+    estimate = tracks([(0, 7, 0.1, 0), (1, 8, 0.1, 0), (1, 7, 0.9, 0)])
+    assert estimate.identity[match(truth, estimate).estimate].tolist() == [7, 7]
+    assert evaluate(truth, estimate).id_switches == 0
+
+
+def test_as_many_as_possible_are_paired():
+    """The nearest pair alone would leave the second person without a partner."""
+    truth, estimate = tracks([(0, 1, 0, 0), (0, 2, 0.9, 0)]), tracks([(0, 5, 0.1, 0), (0, 6, -0.9, 0)])
+    scores = evaluate(truth, estimate)
+    assert (scores.misses, scores.false_positives) == (0, 0)
+
+
+def test_a_perfect_track_and_no_track():
+    truth, _ = random_case(0)
+    perfect = evaluate(truth, truth._replace(identity=truth.identity + 50), camera_xy_m=(-5, 0))
+    assert (perfect.mota, perfect.idf1, perfect.mean_error_m, perfect.mostly_tracked) == (100, 100, 0, perfect.people)
+    assert perfect.radial_error_m == perfect.lateral_error_m == 0
+    nothing = evaluate(truth, tracks([]), camera_xy_m=(-5, 0))
+    assert (nothing.mota, nothing.idf1, nothing.misses, nothing.mostly_lost) == (0, 0, len(truth.frame), nothing.people)
+    assert np.isnan([nothing.mean_error_m, nothing.idp, nothing.radial_error_m]).all()
+
+
+def test_gaps_are_counted_as_fragments_and_the_ends_are_not():
+    truth = tracks([(t, 3, 0, 0) for t in range(10)])
+    estimate = tracks([(t, 1, 0, 0) for t in (1, 2, 4, 5, 8)])
+    scores = evaluate(truth, estimate)
+    assert (scores.fragmentations, scores.mostly_tracked, scores.mostly_lost) == (2, 0, 0)
+
+
+def test_errors_along_and_across_the_line_of_sight():
+    """The camera looks along (3, 4) / 5; to its left lies (-4, 3) / 5."""
+    truth = tracks([(0, 1, 3, 4), (1, 1, 6, 8)])
+    estimate = tracks([(0, 1, 3 + 0.06, 4 + 0.08), (1, 1, 6 - 0.04 * 4, 8 + 0.04 * 3)])
+    scores = evaluate(truth, estimate, camera_xy_m=(0, 0))
+    np.testing.assert_allclose([scores.radial_error_m, scores.radial_bias_m], [0.05, 0.05], atol=1e-12)
+    np.testing.assert_allclose([scores.lateral_error_m, scores.lateral_bias_m], [0.1, 0.1], atol=1e-12)
+
+
+def test_rows_outside_the_area_count_on_neither_side():
+    frame, identity, xy_m = [0, 0, 1], [1, 2, 1], [[0, 0], [5, 5], [0, 1]]
+    inside = floor_tracks(frame, identity, xy_m, in_area=[True, False, True])
+    assert inside.identity.tolist() == [1, 1]
+    scores = evaluate(inside, floor_tracks(frame, identity, xy_m, in_area=[1, 0, 0]))
+    assert (scores.misses, scores.false_positives, scores.people) == (1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([0, 1], [1], [[0, 0], [1, 1]]), r"one row each; got \(2, 1, 2, 2\) rows"),
+        (([0, 4], [1, 1], [[0, 0], [np.nan, 1]]), "xy_m must be finite; frame 4 is not"),
+        (([0, 3, 3], [1, 2, 2], np.zeros((3, 2))), "identity 2 stands twice in frame 3"),
+    ],
+)
+def test_wrong_rows_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        floor_tracks(*arguments)
+
+
+def test_wrong_questions_are_named():
+    truth, estimate = random_case(0)
+    with pytest.raises(ValueError, match="gate_m must be positive"):
+        evaluate(truth, estimate, gate_m=0)
+    with pytest.raises(ValueError, match="truth must have at least one row"):
+        evaluate(tracks([]), estimate)
+
+
+@pytest.mark.data
+def test_real_paths_with_one_exchange(data_dir):
+    """Two people of the recording exchange names once: four changes of row in the counts, all else perfect."""
+    rows = np.genfromtxt(data_dir / "pets09_s2l1_view001" / "gt_0_399.csv", delimiter=",", names=True, dtype=None)
+    truth = floor_tracks(rows["frame"], rows["id"], np.stack([rows["x_m"], rows["y_m"]], axis=1))
+    common = [t for t in range(400) if {1, 2} <= set(truth.identity[truth.frame == t].tolist())]
+    middle = common[len(common) // 2]
+    swapped = np.where(truth.identity == 1, 2, np.where(truth.identity == 2, 1, truth.identity))
+    scores = evaluate(truth, truth._replace(identity=np.where(truth.frame >= middle, swapped, truth.identity)))
+    assert (scores.misses, scores.false_positives, scores.mean_error_m) == (0, 0, 0)
+    assert scores.id_switches == 2
+    assert 100 > scores.idf1 > 100 * (1 - np.isin(truth.identity, [1, 2]).mean())

@@ -1,0 +1,97 @@
+"""Motions against the solution of their stochastic differential equations, and what they come to in the long run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from jaxfilters.models.articulated.anatomy import relaxed_angles
+from jaxfilters.models.articulated.layout import Layout, five_fingers
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD, MOVEMENT_TIME, AboutEase, about_ease
+
+SPEED_STD, TIME = (0.01, 0.02, 0.03), (5.0, 8.0, 12.0)
+"""Of position, quaternion and angles."""
+
+
+def uneven(layout):
+    """A motion in which every kind of entry has its own time."""
+    ease = np.linspace(-0.2, 0.5, 8)
+    return AboutEase(jnp.asarray(ease), layout.per_moving(*SPEED_STD), layout.per_moving(*TIME)), ease
+
+
+def exact(speed_std, time, dt, *, is_angle):
+    """Van Loan: transition and covariance of (p, p') over `dt`."""
+    a = 1 / time
+    A = np.array([[0.0, 1.0], [-(a**2), -2 * a]]) if is_angle else np.array([[0.0, 1.0], [0.0, -a]])
+    q = (4 if is_angle else 2) * a * speed_std**2
+    block = np.block([[-A, np.diag([0.0, q])], [np.zeros((2, 2)), A.T]]) * dt
+    solved = expm(block)
+    F = solved[2:, 2:].T
+    return F, F @ solved[:2, 2:]
+
+
+@pytest.mark.parametrize("dt", [0.3, 1.0, 6.0])
+def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
+    layout = Layout(2)
+    motion, ease = uneven(layout)
+    x = random_state(np.random.default_rng(0), layout)
+    after = np.asarray(motion.advance(jnp.asarray(x), layout, dt))
+    root = np.asarray(motion.noise_root(layout, dt))
+    noise = root @ root.T
+    kinds = np.repeat([0, 1, 2], [layout.position_size, 4, 8])
+    rest = np.zeros(layout.num_moving)
+    rest[layout.angles] = ease
+    for i, kind in enumerate(kinds):
+        F, Q = exact(SPEED_STD[kind], TIME[kind], dt, is_angle=kind == 2)
+        pair = [i, layout.num_moving + i]
+        np.testing.assert_allclose(after[pair], F @ (x[pair] - [rest[i], 0]) + [rest[i], 0], rtol=1e-12, atol=1e-12)
+        # The quadrature's error, 1e-5 of the larger terms, for steps up to the time.
+        np.testing.assert_allclose(noise[np.ix_(pair, pair)], Q, atol=2e-5 * np.abs(Q).max())
+        noise[np.ix_(pair, pair)] = 0
+    np.testing.assert_array_equal(noise, 0)
+    np.testing.assert_array_equal(after[layout.static], x[layout.static])
+
+
+def test_angles_that_nobody_sees_come_to_the_spread_of_hands():
+    layout = five_fingers()
+    ease = relaxed_angles(layout).ravel()
+    motion = about_ease(layout, ease)
+    F = jax.jacfwd(lambda x: motion.advance(x, layout, 1.0))(jnp.zeros(layout.size))
+    G = motion.noise_root(layout, 1.0)
+
+    def step(P, _):
+        return F @ P @ F.T + G @ G.T, None
+
+    P, _ = jax.lax.scan(step, jnp.zeros((layout.size, layout.size)), None, length=int(20 * MOVEMENT_TIME))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(P)[layout.angles]), ANGLE_SPREAD, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(P)[layout.rates]), motion.speed_std, rtol=1e-3)
+
+
+def test_no_time_changes_nothing():
+    layout = Layout(2)
+    motion, _ = uneven(layout)
+    x = jnp.arange(layout.size, dtype=float)
+    np.testing.assert_allclose(motion.advance(x, layout, 0.0), x, rtol=1e-6)
+    np.testing.assert_array_equal(motion.noise_root(layout, 0.0), 0)
+
+
+def test_speeds_in_an_image_are_those_in_space_times_its_scale():
+    layout = Layout(2)
+    speed = about_ease(layout, np.zeros(8), per_metre=500.0, speed_std=(0.01, 0.02, 0.03)).speed_std
+    np.testing.assert_allclose(speed, [5.0] * 2 + [0.02] * 4 + [0.03] * 8, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(ease=np.zeros(7)), "ease must be 8 finite angles"),
+        (dict(ease=np.full(8, np.nan)), "ease must be 8 finite angles"),
+        (dict(speed_std=(1.0, -0.1, 0.1)), "speed_std must be three numbers"),
+        (dict(time=0.0), "time must be positive; got 0.0"),
+        (dict(per_metre=float("inf")), "per_metre must be positive; got inf"),
+    ],
+)
+def test_bad_motions_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        about_ease(**{"layout": Layout(2), "ease": np.zeros(8), **options})

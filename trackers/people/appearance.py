@@ -1,0 +1,64 @@
+"""What people wear: colour histograms of the upper and the lower half of their silhouettes."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.models.person import foreground
+from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline, outline_radius
+from jaxfilters.models.person.foreground import presence
+from jaxfilters.trackers.people.fit import body_of
+from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleScene
+
+BINS = 8
+GRID = (24, 12)
+LEAST_PIXELS = 12.0
+"""Effective samples below which a half says nothing."""
+
+
+def appearances(
+    scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
+) -> tuple[Float[Array, "slots 48"], Bool[Array, " slots"]]:
+    """Histograms of everybody, and whose are worth something; of the first camera that sees enough of somebody."""
+    histograms, good = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)
+    for camera, depth, frame in zip(scene.cameras, scene.furniture, frames, strict=True):
+        found, enough = _in_camera(scene, camera, depth, frame, places, active)
+        use = enough & ~good & frame.present
+        histograms, good = jnp.where(use[:, None], found, histograms), good | use
+    return histograms, good
+
+
+def dissimilarity(a: Float[Array, "*batch 48"], b: Float[Array, "*batch 48"]) -> Float[Array, "*batch"]:
+    """Mean Hellinger distance of the six histograms, from 0 to 1."""
+    shape = (*jnp.broadcast_shapes(a.shape, b.shape)[:-1], APPEARANCE // BINS, BINS)
+    common = jnp.sum(jnp.sqrt(jnp.broadcast_to(a, shape[:-2] + (APPEARANCE,)).reshape(shape) * jnp.broadcast_to(
+        b, shape[:-2] + (APPEARANCE,)).reshape(shape)), axis=-1)
+    return jnp.mean(jnp.sqrt(jnp.maximum(1 - common, 0.0)), axis=-1)
+
+
+def _in_camera(scene, camera, furniture, frame, places, active):
+    outlines = jax.vmap(lambda place: outline(camera.P, body_of(place)))(places)
+    image, mask = jnp.asarray(frame.image).reshape(-1, 3), jnp.asarray(frame.foreground).ravel()
+
+    def one(k):
+        seen = jax.tree.map(lambda leaf: leaf[k], outlines)
+        shown = (seen.code == VISIBLE) & active[k]
+        box = jnp.where(shown, ellipse_of(seen).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
+        window = foreground.window(box, camera.shape, GRID)
+
+        def covers(other):
+            return presence(outline_radius(other, window.uv)) * (other.depth < seen.depth)
+
+        ahead = jax.vmap(covers)(outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
+        free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.index])
+        weight = presence(outline_radius(seen, window.uv)) * free * window.inside * shown * (mask[window.index] / 255)
+        upper = window.uv[:, 1] < seen.center[1]
+        halves = jnp.stack([weight * upper, weight * ~upper])
+        # Equal steps of the square root: clothes are mostly dark.
+        bins = jax.nn.one_hot((BINS * jnp.sqrt(image[window.index] / 256)).astype(jnp.int32), BINS)
+        counts = jnp.einsum("hs,scb->hcb", halves, bins)
+        sizes = jnp.sum(halves, axis=1)
+        histogram = counts / jnp.maximum(sizes, 1e-6)[:, None, None]
+        return histogram.ravel(), jnp.all(sizes > LEAST_PIXELS)
+
+    return jax.vmap(one)(jnp.arange(len(places)))

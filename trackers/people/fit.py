@@ -1,0 +1,289 @@
+"""Where the silhouettes say that everybody is: joint search over position and height, and how sure that is."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.person import foreground
+from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, outline_radius, standing
+from jaxfilters.models.person.foreground import Quadratic, Window, contrast, log_likelihood_ratio, presence
+from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
+
+LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
+"""How far from the prediction somebody is searched for, along each axis."""
+HEIGHT_STEP_M = 0.03
+"""First step of the search for the height."""
+CURVATURE_STEPS_M = (0.12, 0.06, 0.06, 0.05)
+"""Away from the camera, sideways, height, width: over which the score is taken for a parabola."""
+PROFILE_M = 0.3
+"""Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
+LEAST_CURVATURE = 1.0
+"""Inverse square metres: below it a direction counts as not seen at all."""
+LEAST_SIZE_M = 0.1
+PASSES = 2
+NEAR_M = 1.5
+"""Two who are nearer may be one."""
+BETWEEN = 5
+"""Places from one to the other at which one alone is tried."""
+
+
+class View(NamedTuple):
+    """One person's window in one camera."""
+
+    window: Window
+    foreground: Float[Array, " samples"]
+    """Probability."""
+    depth: Float[Array, " samples"]
+    """Of furniture, metres."""
+    visible: Float[Array, " samples"]
+    """1 where the person would be seen in the image and before the furniture, else 0."""
+    area: Float[Array, ""]
+    """Of the predicted outline, square pixels."""
+
+
+class Fit(NamedTuple):
+    """What the images say of everybody, one row a slot."""
+
+    place: Float[Array, "slots 4"]
+    """X, Y, height, width: metres; where the likelihood of the images times the prediction is largest."""
+    axes: Float[Array, "slots 4 4"]
+    """Rows: unit vectors away from the camera, sideways, along the height and the width."""
+    quadratic: Quadratic
+    """The log likelihood around `place`, along `axes`."""
+    score: Float[Array, " slots"]
+    """Mean log likelihood ratio a pixel."""
+    share_seen: Float[Array, " slots"]
+    flatness: Float[Array, " slots"]
+    surplus: Float[Array, " slots"]
+    """Mean log likelihood ratio a pixel that somebody explains which the nearest senior could not explain alone, in
+    the best place for that; `inf` without a senior near by."""
+
+
+def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
+    """X, Y, height and width of a state."""
+    return mean[..., jnp.array(PLACE)]
+
+
+def fit_people(
+    scene: PeopleScene,
+    predicted: Gaussian,
+    active: Bool[Array, " slots"],
+    seniority: Float[Array, " slots"],
+    frames: tuple[CameraFrame, ...],
+) -> Fit:
+    """Best places of everybody together, in turns, each with the others where they were last found.
+
+    Args:
+        scene: Cameras, furniture, floor.
+        predicted: Beliefs of all slots.
+        active: Which of them hold somebody.
+        seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
+        frames: One a camera.
+    """
+    config = scene.config
+    start = place_of(predicted.mean)
+    prior = _prior(predicted)
+    axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
+    reach = _reach(predicted, axes)
+    views = tuple(
+        jax.vmap(_view, in_axes=(None, None, None, None, 0, 0, 0))(config, camera, furniture, frame, start, axes, reach)
+        for camera, furniture, frame in zip(scene.cameras, scene.furniture, frames, strict=True)
+    )
+    order = _nearest_first(scene.cameras[0], start, active)
+
+    def one_person(turn, places):
+        k = order[turn % num_active]
+        mine = jax.tree.map(lambda leaf: leaf[k], views)
+        contrasts = _contrasts(scene, places, active.at[k].set(False), mine)
+
+        def best(place, offsets):
+            candidates = place + offsets @ axes[k]
+            scores = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
+            away = candidates - start[k]
+            total = scores - jnp.einsum("ci,ij,cj->c", away, prior[k], away) / 2
+            # Where candidates are equal, the one that moves least: the middle of the lattice comes first.
+            nearest_first = jnp.argsort(jnp.sum(offsets**2, axis=-1))
+            return candidates[nearest_first[jnp.argmax(total[nearest_first])]]
+
+        steps = jnp.concatenate([reach[k] / 2, jnp.array([HEIGHT_STEP_M, 0.0])])
+        wide = foreground.lattice(2, 2) @ jnp.eye(2, 4)
+        place = jax.lax.cond(turn < num_active, lambda p: best(p, wide * steps), lambda p: p, places[k])
+        for shrink in (2, 4):
+            place = best(place, foreground.lattice(3) @ jnp.eye(3, 4) * steps / shrink)
+        return places.at[k].set(place)
+
+    num_active = jnp.sum(active)
+    places = jax.lax.fori_loop(0, PASSES * num_active, one_person, start)
+    return _curvature(scene, places, active, seniority, views, axes)
+
+
+def _curvature(scene, places, active, seniority, views, axes) -> Fit:
+    steps = jnp.array(CURVATURE_STEPS_M)
+    away = PROFILE_M * jnp.eye(1, 4)
+    offsets = jnp.concatenate([foreground.lattice(4) * steps, -away, away])
+    middle = len(offsets) // 2 - 1
+
+    def one(k, fits):
+        mine = jax.tree.map(lambda leaf: leaf[k], views)
+        contrasts = _contrasts(scene, places, active.at[k].set(False), mine)
+        candidates = places[k] + offsets @ axes[k]
+        values = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
+        scores = values / scene.config.independent_patches
+        fit = Fit(
+            places[k],
+            axes[k],
+            foreground.quadratic_fit(values[:-2], steps),
+            scores[middle],
+            _share_seen(scene, places, active.at[k].set(False), mine, k),
+            scores[middle] - jnp.maximum(scores[-2], scores[-1]),
+            _surplus(scene, places, active, seniority, views, axes, k, scores[middle]),
+        )
+        return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
+
+    n = len(places)
+    empty = Fit(
+        places,
+        axes,
+        Quadratic(jnp.zeros(n), jnp.zeros((n, 4)), jnp.zeros((n, 4, 4))),
+        jnp.zeros(n),
+        jnp.zeros(n),
+        jnp.zeros(n),
+        jnp.full(n, jnp.inf),
+    )
+    order = jnp.argsort(~active)
+    return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
+
+
+def _surplus(scene, places, active, seniority, views, axes, k, score):
+    """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best."""
+    apart = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
+    apart = jnp.where(active & (seniority > seniority[k]), apart, jnp.inf)
+    senior = jnp.argmin(apart)
+
+    def alone():
+        theirs = jax.tree.map(lambda leaf: leaf[senior], views)
+        others = active.at[k].set(False).at[senior].set(False)
+        contrasts = _contrasts(scene, places, others, theirs)
+        between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])
+        offsets = (foreground.lattice(2) @ jnp.eye(2, 4)) * jnp.array(CURVATURE_STEPS_M) @ axes[senior]
+        candidates = places[senior] + (between[:, None] + offsets).reshape(-1, 4)
+        values = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
+        with_k = _log_likelihood(scene, places[senior], theirs, contrasts)
+        return score - (jnp.max(values) - with_k) / scene.config.independent_patches
+
+    return jax.lax.cond(apart[senior] < NEAR_M, alone, lambda: jnp.full_like(score, jnp.inf))
+
+
+def as_measurement(
+    fit: Fit, silhouette_sd: float
+) -> tuple[Float[Array, "slots 4"], Float[Array, "slots 4 4"], Float[Array, "slots 4 4"], Bool[Array, "slots 4"]]:
+    """Readings y = H place, H, their covariance R, and which of them say anything, from the curvature of the score.
+
+    A parabola of curvature J and slope g at z0 is that of a Gaussian reading z0 + J^-1 g with covariance J^-1. In the
+    directions of the eigenvectors of J each reading stands alone, and those without curvature drop out.
+    """
+
+    def one(place, axes, quadratic):
+        eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
+        seen = eigenvalues > LEAST_CURVATURE
+        curvature = jnp.where(seen, eigenvalues, 1.0)
+        limit = jnp.linalg.norm(jnp.array(CURVATURE_STEPS_M))
+        shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
+        H = vectors.T @ axes
+        return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen
+
+    return jax.vmap(one)(fit.place, fit.axes, fit.quadratic)
+
+
+def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
+    """The ellipsoid of X, Y, height and width; of a size that an outline can be had of."""
+    return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
+
+
+def _prior(predicted):
+    pick = jnp.array(PLACE)
+    covariance = predicted.covariance[:, pick[:, None], pick]
+    return jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
+
+
+def _axes(scene, place):
+    """Away from whichever camera is nearest, sideways, up."""
+    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
+    away = place[:2] - centers[jnp.argmin(jnp.sum((place[:2] - centers) ** 2, axis=-1))]
+    distance = jnp.linalg.norm(away)
+    # Straight below the camera any direction is as good.
+    x, y = jnp.where(distance > 0.1, away / jnp.maximum(distance, 0.1), jnp.array([0.0, 1.0]))
+    return jnp.eye(4).at[:2, :2].set(jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])]))
+
+
+def _reach(predicted, axes):
+    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], predicted.covariance[:, :2, :2], axes[:, :2, :2])
+    return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
+
+
+def _view(config: PeopleConfig, camera: FloorCamera, furniture, frame: CameraFrame, place, axes, reach) -> View:
+    corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
+    bodies = jax.vmap(body_of)(place + corners @ axes)
+    seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
+    boxes = jax.vmap(lambda one: ellipse_of(one).box)(seen)
+    box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])
+    margin = 0.15 * (box[2:] - box[:2]) + 1
+    shown = frame.present & jnp.all(seen.code == VISIBLE)
+    box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
+    window = foreground.window(box, camera.shape, config.grid)
+    probability = jnp.asarray(frame.foreground).ravel()[window.index].astype(float) / 255
+    depth = furniture.ravel()[window.index]
+    body = body_of(place)
+    visible = window.inside * shown * (near_depth(camera.P, body, window.uv) < depth)
+    return View(window, probability, depth, visible, _area(outline(camera.P, body)))
+
+
+def _area(seen: Outline):
+    (a, b), (_, c) = seen.shape
+    return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
+
+
+def _unexplained(scene, camera, places, others: Bool[Array, " slots"], view: View):
+    """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
+
+    def one(place):
+        seen = outline(camera.P, body_of(place))
+        return presence(outline_radius(seen, view.window.uv)) * (seen.depth < view.depth)
+
+    hidden = jax.vmap(one)(places) * others[:, None]
+    return (1 - foreground.CLUTTER) * jnp.prod(1 - hidden, axis=0)
+
+
+def _contrasts(scene, places, others, views):
+    return tuple(
+        contrast(view.foreground, _unexplained(scene, camera, places, others, view)) * view.visible
+        for camera, view in zip(scene.cameras, views, strict=True)
+    )
+
+
+def _log_likelihood(scene, place, views, contrasts):
+    total = jnp.zeros(())
+    for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
+        seen = outline(camera.P, body_of(place))
+        ratio = log_likelihood_ratio(presence(outline_radius(seen, view.window.uv)), b)
+        total += ratio * view.window.area / view.area
+    return scene.config.independent_patches * total
+
+
+def _share_seen(scene, places, others, views, k):
+    """Of the silhouette; the largest over the cameras."""
+    shares = []
+    for camera, view in zip(scene.cameras, views, strict=True):
+        mine = presence(outline_radius(outline(camera.P, body_of(places[k])), view.window.uv))
+        free = _unexplained(scene, camera, places, others, view) * view.visible
+        shares.append(jnp.sum(mine * free) / jnp.maximum(jnp.sum(mine), 1e-6))
+    return jnp.max(jnp.stack(shares))
+
+
+def _nearest_first(camera: FloorCamera, places, active) -> Int32[Array, " slots"]:
+    distance = jnp.sum((places[:, :2] - camera.position()[:2]) ** 2, axis=-1)
+    return jnp.argsort(jnp.where(active, distance, jnp.inf))

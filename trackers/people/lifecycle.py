@@ -1,0 +1,119 @@
+"""Who is there: confirmation, loss, memory of those who left, and exchanged identities put right."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.person.scene import walkable
+from jaxfilters.trackers.people.appearance import BINS, dissimilarity
+from jaxfilters.trackers.people.exchange import is_meeting
+from jaxfilters.trackers.people.fit import Fit
+from jaxfilters.trackers.people.newcomers import Newcomer
+from jaxfilters.trackers.people.state import (
+    DORMANT,
+    FREE,
+    STATE,
+    TENTATIVE,
+    TRACKED,
+    People,
+    PeopleConfig,
+    PeopleScene,
+    chosen,
+)
+
+MOST_LOG_ODDS = 8.0
+HIDDEN_SHARE = 0.2
+"""Below this share of the silhouette there is nothing to see of somebody."""
+HIDDEN_COST = 0.5
+"""Log odds per second lost by a person of whom nothing is to be seen: people can be hidden, but not for ever."""
+LEAST_SURPLUS = 0.5
+"""Mean log likelihood ratio a pixel that two people explain beyond what one of them explains alone."""
+SUPERFLUOUS_COST = 2.0
+"""Log odds per second lost by somebody who explains less than that."""
+LOST_SD_M = 1.2
+"""A place known no better than this is no place."""
+LIKENESS = 0.3
+"""Dissimilarity up to which somebody who comes is somebody who left."""
+WALKING_M_PER_S = 2.0
+LEARNING_RATE = 0.1
+"""Share of a new appearance in the remembered one."""
+NEWCOMER_SD_M = 0.3
+
+
+def judged(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], looked: Bool[Array, ""]) -> People:
+    """Log odds and modes after a frame that `looked` at the scene."""
+    config = scene.config
+    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    hidden = fit.share_seen < HIDDEN_SHARE
+    change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
+    # Somebody whom one other person explains as well is hidden behind that person, or nobody.
+    superfluous = fit.surplus < LEAST_SURPLUS
+    cost = jnp.where(people.mode == TRACKED, SUPERFLUOUS_COST * dt, LEAST_SURPLUS - fit.surplus)
+    change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
+    log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
+    unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)
+    sd = jnp.sqrt(jnp.max(jnp.diagonal(people.belief.covariance, axis1=1, axis2=2)[:, :2], axis=-1))
+    away = ~walkable(scene.floor, people.belief.mean[:, :2])
+    gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | (sd > LOST_SD_M) | away)
+    gone |= (people.mode == TENTATIVE) & (unseen > 0.5)
+    mode = jnp.where(gone, jnp.where(people.mode == TRACKED, DORMANT, FREE), people.mode)
+    mode = jnp.where((mode == DORMANT) & (unseen > config.memory_s + config.hidden_s), FREE, mode)
+    mode = jnp.where((mode == TENTATIVE) & (log_odds > config.confirmed), TRACKED, mode)
+    return people._replace(log_odds=log_odds, unseen_s=unseen, mode=mode)
+
+
+def seniority(people: People) -> Float[Array, " slots"]:
+    """Higher for who is the less likely to be a mistake: the tracked by identity, then the tentative by log odds."""
+    return jnp.where(people.mode == TRACKED, 1e4 - people.identity, people.log_odds - 1e-3 * jnp.arange(len(people.mode)))
+
+
+def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[Array, " slots"]) -> People:
+    """Appearances with what this frame shows of those who are certainly who they are said to be."""
+    good &= ~is_meeting(people.meetings)
+    blank = jnp.all(people.appearance == people.appearance[:, :1], axis=-1)
+    rate = jnp.where(blank, 1.0, LEARNING_RATE)[:, None]
+    learnt = people.appearance + rate * (histograms - people.appearance)
+    return people._replace(appearance=jnp.where(good[:, None], learnt, people.appearance))
+
+
+def named(people: People) -> People:
+    """Identities for those who were confirmed: that of somebody who left, where place and clothes agree, or a new one."""
+
+    def one(k, people):
+        reach = 1.0 + WALKING_M_PER_S * people.unseen_s
+        apart = jnp.linalg.norm(people.belief.mean[:, :2] - people.belief.mean[k, :2], axis=-1)
+        unlike = dissimilarity(people.appearance, people.appearance[k])
+        cost = jnp.where((people.mode == DORMANT) & (apart < reach) & (unlike < LIKENESS), unlike, jnp.inf)
+        old = jnp.argmin(cost)
+        back = jnp.isfinite(cost[old])
+        identity = jnp.where(back, people.identity[old], people.next_identity)
+        return people._replace(
+            identity=people.identity.at[k].set(identity),
+            mode=people.mode.at[old].set(jnp.where(back, FREE, people.mode[old])),
+            next_identity=people.next_identity + ~back,
+        )
+
+    fresh = (people.mode == TRACKED) & (people.identity < 0)
+    order = jnp.argsort(~fresh)
+    people = jax.lax.fori_loop(0, jnp.sum(fresh), lambda turn, p: one(order[turn], p), people)
+    return people._replace(identity=jnp.where(people.mode == FREE, -1, people.identity))
+
+
+def admitted(config: PeopleConfig, people: People, found: Newcomer) -> People:
+    """The newcomer in a free slot; without one, nobody comes in."""
+    free = people.mode == FREE
+    slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
+    n = len(free)
+    mean = jnp.concatenate([found.xy, jnp.zeros(2), jnp.array([config.height_m, config.width_m])])
+    sd = jnp.array([NEWCOMER_SD_M, NEWCOMER_SD_M, config.speed_sd, config.speed_sd, config.height_sd_m, config.width_sd_m])
+    fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(jnp.diag(sd**2), (n, STATE, STATE)))
+    return people._replace(
+        belief=chosen(slot, fresh, people.belief),
+        mode=jnp.where(slot, TENTATIVE, people.mode),
+        identity=jnp.where(slot, -1, people.identity),
+        log_odds=jnp.where(slot, 0.0, people.log_odds),
+        unseen_s=jnp.where(slot, 0.0, people.unseen_s),
+        appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
+    )
+

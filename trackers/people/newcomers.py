@@ -1,0 +1,125 @@
+"""People nobody knows yet: foreground that nobody explains, looked for at floor points half a step apart."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.person import foreground
+from jaxfilters.models.person.ellipsoid import VISIBLE, outline, outline_radius, standing
+from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
+from jaxfilters.models.person.scene import walkable
+from jaxfilters.trackers.people.fit import body_of
+from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
+
+REDUCED_COLS = 240
+"""Columns of the images in which newcomers are looked for, at most."""
+SAMPLES = (12, 6)
+"""Over the box of an ellipse half as wide and high again: rows and columns."""
+MARGIN = 1.25
+LEAST_SHARE = 0.5
+"""Of the samples that an image must show for somebody to be found there."""
+
+
+class Newcomer(NamedTuple):
+    """Where somebody may have come in this frame."""
+
+    xy: Float[Array, " 2"]
+    """Metres."""
+    found: Bool[Array, ""]
+
+
+def cells_of(
+    cameras: tuple[FloorCamera, ...], furniture: tuple[Array, ...], floor: np.ndarray, config: PeopleConfig
+) -> Cells:
+    """All floor points that some camera sees well enough, and what to look at for each.
+
+    Raises:
+        ValueError: if no camera sees a person anywhere on the floor.
+    """
+    low, high = floor.min(axis=0), floor.max(axis=0)
+    axes = [np.arange(a + config.cell_m / 2, b, config.cell_m) for a, b in zip(low, high, strict=True)]
+    xy = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
+    xy = jnp.asarray(xy[np.asarray(walkable(jnp.asarray(floor), jnp.asarray(xy)))], jnp.float32)
+    offsets = _offsets()
+    looks = [_look(camera, depth, config, xy, offsets) for camera, depth in zip(cameras, furniture, strict=True)]
+    kept = np.max([np.asarray(share) for _, share in looks], axis=0) >= LEAST_SHARE if len(xy) else np.zeros(0, bool)
+    if not kept.any():
+        raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
+    return Cells(
+        xy[kept],
+        tuple(index[kept] for index, _ in looks),
+        presence(jnp.sum(offsets**2, axis=-1)),
+        tuple(share[kept] for _, share in looks),
+    )
+
+
+def _offsets():
+    v, u = jnp.meshgrid(*[MARGIN * (2 * (jnp.arange(n) + 0.5) / n - 1) for n in SAMPLES], indexing="ij")
+    return jnp.stack([u.ravel(), v.ravel()], axis=-1)
+
+
+def stride(shape: tuple[int, int]) -> int:
+    """Every how many pixels one is looked at for newcomers."""
+    return max(1, -(-shape[1] // REDUCED_COLS))
+
+
+def _look(camera, furniture, config, xy, offsets):
+    """Indices into the reduced image (cells, samples), and the share of samples that see the person."""
+    rows, cols = camera.shape
+    step = stride(camera.shape)
+    reduced_rows, reduced_cols = -(-rows // step), -(-cols // step)
+
+    def one(xy):
+        seen = outline(camera.P, standing(xy, config.height_m, config.width_m))
+        # Ellipse coordinates along the image of the vertical axis and across, so that feet are below.
+        uv = seen.center + offsets @ jnp.linalg.cholesky(seen.shape[::-1, ::-1])[::-1, ::-1].T
+        u, v = jnp.round(uv[:, 0] / step).astype(jnp.int32), jnp.round(uv[:, 1] / step).astype(jnp.int32)
+        inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (seen.code == VISIBLE)
+        u, v = jnp.clip(u, 0, reduced_cols - 1), jnp.clip(v, 0, reduced_rows - 1)
+        free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > seen.depth)
+        weight = presence(jnp.sum(offsets**2, axis=-1))
+        return jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols), jnp.sum(weight * free) / weight.sum()
+
+    return jax.jit(jax.vmap(one))(xy)
+
+
+def newcomer(
+    scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
+) -> Newcomer:
+    """The floor point with most unexplained evidence, if it is enough.
+
+    One a frame: whoever stands beside is found in the next, once it is known what the first explains.
+    """
+    config, cells = scene.config, scene.cells
+    total, shares = jnp.zeros(len(cells.xy)), jnp.zeros(len(cells.xy))
+    for camera, depth, frame, index, share in zip(
+        scene.cameras, scene.furniture, frames, cells.index, cells.share, strict=True
+    ):
+        b = jnp.append(_reduced_contrast(scene, camera, depth, places, active, frame).ravel(), 0.0)
+        ratio = jax.vmap(log_likelihood_ratio, in_axes=(None, 0))(cells.presence, b[index])
+        seen = frame.present * (share >= LEAST_SHARE)
+        total, shares = total + seen * ratio, shares + seen * share
+    # One sample stands for this share of the ellipse's area.
+    per_area = (2 * MARGIN) ** 2 / (jnp.pi * cells.presence.size)
+    evidence = total * per_area / jnp.maximum(shares, 1e-6)
+    best = jnp.argmax(evidence)
+    return Newcomer(cells.xy[best], evidence[best] > config.newcomer_evidence)
+
+
+def _reduced_contrast(scene, camera, furniture, places, active, frame):
+    step = stride(camera.shape)
+    reduced = jnp.asarray(frame.foreground)[::step, ::step].astype(float) / 255
+    v, u = jnp.meshgrid(*[step * jnp.arange(n, dtype=float) for n in reduced.shape], indexing="ij")
+    uv, depth = jnp.stack([u, v], axis=-1), furniture[::step, ::step]
+    order = jnp.argsort(~active)
+
+    def cover(turn, unexplained):
+        seen = outline(camera.P, body_of(places[order[turn]]))
+        return unexplained * (1 - presence(outline_radius(seen, uv)) * (seen.depth < depth))
+
+    free = jnp.full(reduced.shape, 1 - foreground.CLUTTER)
+    return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))

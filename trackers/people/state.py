@@ -1,0 +1,190 @@
+"""What the people tracker is told, what it remembers from frame to frame, and what it says of each."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int32, Num, UInt8
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.floor_camera import FloorCamera
+
+FREE, TENTATIVE, TRACKED, DORMANT = range(4)
+MODE_NAMES = ("free", "tentative", "tracked", "dormant")
+"""Slots: unused; somebody who may be a mistake; somebody; somebody who was lost sight of and may come back."""
+APPEARANCE = 48
+"""Numbers that describe clothes: histograms of eight bins of three colours, of the upper and the lower half."""
+STATE = 6
+"""X, Y, velocity along X and Y, height, width: metres and metres per second."""
+HEIGHT, WIDTH = 4, 5
+PLACE = (0, 1, HEIGHT, WIDTH)
+"""X, Y, height and width in a state: what one image shows."""
+
+
+@dataclass(frozen=True)
+class PeopleConfig:
+    """Constants of the tracker; Python values that are read when it is built.
+
+    Raises:
+        ValueError: naming the field, what was expected and what came.
+    """
+
+    capacity: int = 32
+    """People at a time, the lost ones who may come back included."""
+    height_m: float = 1.72
+    """Of an unknown person."""
+    height_sd_m: float = 0.08
+    """Over people."""
+    width_m: float = 0.45
+    """Of the ellipsoid of an unknown person, clothes, arms and stride included."""
+    width_sd_m: float = 0.06
+    acceleration_sd: float = 0.5
+    """Metres per second squared per root second: how walking varies."""
+    speed_sd: float = 1.0
+    """Metres per second, of somebody new, along each axis."""
+    independent_patches: float = 40.0
+    """How many independent looks one silhouette is worth, whatever its size in pixels."""
+    silhouette_sd_m: float = 0.05
+    """Of what shape and gait add to every coordinate."""
+    grid: tuple[int, int] = (32, 16)
+    """Samples of a person's window, rows and columns."""
+    cell_m: float = 0.3
+    """Between floor points at which newcomers are looked for."""
+    newcomer_evidence: float = 0.5
+    """Mean log likelihood ratio a pixel from which on unexplained foreground is a newcomer."""
+    confirmed: float = 4.0
+    """Log odds of being somebody, to count as tracked."""
+    dropped: float = -1.0
+    """Log odds below which a slot is given up."""
+    memory_s: float = 5.0
+    """How long somebody who was lost is remembered."""
+    hidden_s: float = 3.0
+    """How long somebody who is hidden is believed to be there."""
+
+    def __post_init__(self) -> None:
+        for name in [entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity")]:
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0 < value < np.inf):
+                raise ValueError(f"{name} must be positive; got {value!r}.")
+        sizes = (self.capacity, *self.grid)
+        if len(sizes) != 3 or any(not isinstance(size, int) or size < 1 for size in sizes):
+            raise ValueError(f"capacity and grid must be positive integers; got {self.capacity!r}, {self.grid!r}.")
+        if not self.dropped < 0:
+            raise ValueError(f"dropped must be negative log odds; got {self.dropped!r}.")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+class PeopleScene:
+    """Cameras, furniture and floor: one entry a camera, in the order of the images."""
+
+    cameras: tuple[FloorCamera, ...]
+    furniture: tuple[Float[Array, "rows cols"], ...]
+    """Depth of what stands in front of people, metres; `inf` where nothing does."""
+    floor: Float[Array, "corners 2"]
+    """Polygon in which people can walk, metres."""
+    cells: "Cells"
+    config: PeopleConfig = field(metadata=dict(static=True))
+
+
+class Cells(NamedTuple):
+    """Floor points at which newcomers are looked for, and the pixels to look at for each camera."""
+
+    xy: Float[Array, "cells 2"]
+    """Metres."""
+    index: tuple[Int32[Array, "cells samples"], ...]
+    """Into the reduced image of each camera, flattened; the last entry stands for pixels outside."""
+    presence: Float[Array, " samples"]
+    """Of a person at the samples, the same for all cells."""
+    share: tuple[Float[Array, " cells"], ...]
+    """Of the samples that lie in each image and in front of furniture."""
+
+
+class CameraFrame(NamedTuple):
+    """What one camera delivers at one time, without lens distortion."""
+
+    foreground: Num[Array | np.ndarray, "rows cols"]
+    """Probability of foreground times 255, as bytes."""
+    image: UInt8[Array | np.ndarray, "rows cols 3"]
+    """Blue, green, red."""
+    present: Bool[Array | np.ndarray, ""] | bool
+    """False where the camera has nothing new; the images are then not looked at."""
+
+
+class Meetings(NamedTuple):
+    """Pairs of slots that were close and have not been told apart since; symmetric matrices."""
+
+    is_open: Bool[Array, "slots slots"]
+    evidence: Float[Array, "slots slots"]
+    """For an exchange; positive says that identities changed hands."""
+    clear_s: Float[Array, "slots slots"]
+    """Seconds during which both were seen well."""
+
+
+def no_meetings(slots: int) -> Meetings:
+    """Nobody has met anybody."""
+    none = jnp.zeros((slots, slots))
+    return Meetings(none.astype(bool), none, none)
+
+
+class People(NamedTuple):
+    """Everybody, one slot each."""
+
+    belief: Gaussian
+    """Mean (slots, 6) and covariance (slots, 6, 6)."""
+    mode: Int32[Array, " slots"]
+    identity: Int32[Array, " slots"]
+    """-1 where there is none yet."""
+    log_odds: Float[Array, " slots"]
+    """Of being somebody."""
+    unseen_s: Float[Array, " slots"]
+    """Seconds since there was anything to see."""
+    appearance: Float[Array, "slots 48"]
+    meetings: Meetings
+    next_identity: Int32[Array, ""]
+
+
+class Report(NamedTuple):
+    """What is known after a frame, one row a slot."""
+
+    identity: Int32[Array, " slots"]
+    mode: Int32[Array, " slots"]
+    xy: Float[Array, "slots 2"]
+    """Metres."""
+    sd_radial: Float[Array, " slots"]
+    """Metres, along the line of sight of the nearest camera."""
+    sd_lateral: Float[Array, " slots"]
+    """Metres, at right angles to it on the floor."""
+    height: Float[Array, " slots"]
+    """Metres."""
+    score: Float[Array, " slots"]
+    """Mean log likelihood ratio a pixel, against nobody being there."""
+    share_seen: Float[Array, " slots"]
+    """Of the silhouette, in an image and hidden by nobody and nothing."""
+    flatness: Float[Array, " slots"]
+    """How much the score drops 0.3 m nearer or farther along the line of sight: small where depth cannot be seen."""
+    nis: Float[Array, " slots"]
+    """Normalised innovation squared of the update, over its four coordinates."""
+
+
+def nobody(config: PeopleConfig) -> People:
+    """The state before anybody has come."""
+    n = config.capacity
+    return People(
+        Gaussian(jnp.zeros((n, STATE)), jnp.broadcast_to(jnp.eye(STATE), (n, STATE, STATE))),
+        jnp.full(n, FREE, jnp.int32),
+        jnp.full(n, -1, jnp.int32),
+        jnp.zeros(n),
+        jnp.zeros(n),
+        jnp.full((n, APPEARANCE), 1 / 8),
+        no_meetings(n),
+        jnp.zeros((), jnp.int32),
+    )
+
+
+def chosen(mask: Bool[Array, " slots"], yes: Any, no: Any) -> Any:
+    """`yes` in the slots of the mask, `no` elsewhere, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(b) - 1)), a, b), yes, no)

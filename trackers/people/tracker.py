@@ -1,0 +1,156 @@
+"""The people tracker: a Kalman filter a person, measured by a joint search in the silhouettes."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.kalman import joseph
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people.appearance import appearances
+from jaxfilters.trackers.people.exchange import after_meetings
+from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people, place_of
+from jaxfilters.trackers.people.newcomers import cells_of, newcomer
+from jaxfilters.trackers.people.state import (
+    HEIGHT,
+    PLACE,
+    STATE,
+    TENTATIVE,
+    TRACKED,
+    WIDTH,
+    CameraFrame,
+    People,
+    PeopleConfig,
+    PeopleScene,
+    Report,
+    chosen,
+    nobody,
+)
+from jaxfilters.views import consider
+
+HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
+"""Metres per root second: posture; arms, stride and which side is seen."""
+MOST_DT_S = 1.0
+"""A longer gap is treated as one of this length: nobody is followed across it anyway."""
+CLEAR = 0.5
+"""Share of the silhouette from which on clothes are looked at."""
+WHOLE = 0.9
+"""Share of the silhouette from which on somebody's height is measured."""
+
+
+def people_scene(
+    cameras: Sequence[FloorCamera],
+    floor: ArrayLike | Sequence,
+    *,
+    furniture: Sequence[ArrayLike] | None = None,
+    config: PeopleConfig | None = None,
+) -> PeopleScene:
+    """What the tracker knows of a place.
+
+    Args:
+        cameras: In the order in which their images will come.
+        floor: (corners, 2) polygon in which people can walk, metres.
+        furniture: A depth image a camera (`models.person.scene`), metres, `inf` where nothing stands; none by default.
+        config: Constants.
+
+    Raises:
+        ValueError: shapes that do not fit, no camera, a polygon without area, or a floor that no camera sees.
+    """
+    config = config or PeopleConfig()
+    corners = np.asarray(floor, float)
+    if not cameras:
+        raise ValueError("cameras: at least one is needed.")
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.all(np.isfinite(corners)):
+        raise ValueError(f"floor must be a polygon of at least 3 finite corners (n, 2); got shape {corners.shape}.")
+    x, y = corners.T
+    if abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) < 1e-6:
+        raise ValueError("floor: its corners enclose no area, so nobody can walk anywhere.")
+    depths = [jnp.full(camera.shape, jnp.inf) for camera in cameras] if furniture is None else list(furniture)
+    if [np.shape(depth) for depth in depths] != [camera.shape for camera in cameras]:
+        raise ValueError(
+            f"furniture must be one depth image a camera, {[camera.shape for camera in cameras]}; "
+            f"got {[np.shape(depth) for depth in depths]}."
+        )
+    images = tuple(jnp.asarray(depth, jnp.float32) for depth in depths)
+    cells = cells_of(tuple(cameras), images, corners, config)
+    return PeopleScene(tuple(cameras), images, jnp.asarray(corners, jnp.float32), cells, config)
+
+
+def start(scene: PeopleScene) -> People:
+    """The state before the first frame."""
+    return nobody(scene.config)
+
+
+@jax.jit
+def step(
+    scene: PeopleScene, people: People, frames: tuple[CameraFrame, ...], dt: Float[ArrayLike, ""]
+) -> tuple[People, Report]:
+    """One time further: everybody predicted, searched for together, corrected, and newcomers let in.
+
+    Args:
+        scene: What is known of the place.
+        people: State after the last time.
+        frames: What the cameras deliver, in their order.
+        dt: Seconds since the last time.
+    """
+    dt = jnp.clip(jnp.asarray(dt, float), 0.0, MOST_DT_S)
+    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    predicted = chosen(active, _predicted(scene.config, people.belief, dt), people.belief)
+    fit = fit_people(scene, predicted, active, lifecycle.seniority(people), frames)
+    belief, nis = _updated(scene.config, predicted, fit)
+    people = people._replace(belief=chosen(active, belief, people.belief))
+    looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
+    people = lifecycle.judged(scene, people, fit, dt, looked)
+    places = place_of(people.belief.mean)
+    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    histograms, good = appearances(scene, places, active, frames)
+    good &= fit.share_seen > CLEAR
+    people = after_meetings(people, histograms, good, dt)
+    people = lifecycle.named(lifecycle.remembered(people, histograms, good))
+    people = lifecycle.admitted(scene.config, people, newcomer(scene, places, active, frames))
+    return people, _report(people, fit, nis)
+
+
+def _predicted(config: PeopleConfig, belief: Gaussian, dt: Array) -> Gaussian:
+    """Constant velocity with white acceleration; height with a small drift."""
+    F = jnp.eye(STATE).at[0, 2].set(dt).at[1, 3].set(dt)
+    block = config.acceleration_sd**2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    Q = jnp.zeros((STATE, STATE)).at[HEIGHT, HEIGHT].set(HEIGHT_DRIFT**2 * dt).at[WIDTH, WIDTH].set(WIDTH_DRIFT**2 * dt)
+    for axis in (0, 1):
+        Q = Q.at[jnp.ix_(jnp.array([axis, axis + 2]), jnp.array([axis, axis + 2]))].set(block)
+    return jax.vmap(joseph.predict, in_axes=(0, None, None))(belief, F, Q)
+
+
+def _updated(config: PeopleConfig, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:
+    y, H, R, seen = as_measurement(fit, config.silhouette_sd_m)
+    in_state = jnp.eye(STATE)[jnp.array(PLACE)]
+
+    def one(belief, y, H, R, seen, whole):
+        after, info = joseph.update(belief, y, H @ in_state, R, mask=seen)
+        size = jnp.arange(STATE) >= HEIGHT
+        return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
+
+    return jax.vmap(one)(predicted, y, H, R, seen, fit.share_seen > WHOLE)
+
+
+def _report(people: People, fit: Fit, nis: Array) -> Report:
+    covariance = people.belief.covariance[:, :2, :2]
+    variance = jnp.einsum("kai,kij,kaj->ka", fit.axes[:, :2, :2], covariance, fit.axes[:, :2, :2])
+    radial, lateral = jnp.sqrt(jnp.maximum(variance, 0.0)).T
+    return Report(
+        people.identity,
+        people.mode,
+        people.belief.mean[:, :2],
+        radial,
+        lateral,
+        people.belief.mean[:, HEIGHT],
+        fit.score,
+        fit.share_seen,
+        fit.flatness,
+        nis,
+    )
