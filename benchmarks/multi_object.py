@@ -183,7 +183,9 @@ def match(truth: FloorTracks, estimate: FloorTracks, *, gate_m: float = GATE_M) 
 
 def _rows_by_frame(rows: FloorTracks) -> dict[int, np.ndarray]:
     frames, first = np.unique(rows.frame, return_index=True)
-    return dict(zip(frames.tolist(), np.split(np.arange(len(rows.frame)), first[1:]), strict=True)) if len(first) else {}
+    return (
+        dict(zip(frames.tolist(), np.split(np.arange(len(rows.frame)), first[1:]), strict=True)) if len(first) else {}
+    )
 
 
 def _pairs_of_frame(people, names, distance, gate_m, last) -> list[tuple[int, int]]:

@@ -270,7 +270,8 @@ def _focal_of_homography(H: np.ndarray, size: float) -> float:
 
 
 def _checked_points(points_m: np.ndarray, pixels: np.ndarray, fewest: int) -> tuple[np.ndarray, np.ndarray]:
-    points_m, pixels = np.asarray(points_m, float), np.asarray(pixels, float)
+    # OpenCV takes no columns of a larger array.
+    points_m, pixels = np.ascontiguousarray(points_m, float), np.ascontiguousarray(pixels, float)
     if points_m.ndim != 2 or points_m.shape[1] != 3 or pixels.shape != (len(points_m), 2):
         raise ValueError(f"points_m must be (n, 3) and pixels (n, 2); got {points_m.shape} and {pixels.shape}.")
     if not (np.isfinite(points_m).all() and np.isfinite(pixels).all()):

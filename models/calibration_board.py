@@ -65,7 +65,9 @@ def detect_board(image: np.ndarray, board: Any) -> BoardView:
     return BoardView(np.asarray(points, float).reshape(-1, 3), np.asarray(pixels, float).reshape(-1, 2))
 
 
-def calibrate_intrinsics(views: Sequence[BoardView], image_size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, float]:
+def calibrate_intrinsics(
+    views: Sequence[BoardView], image_size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, float]:
     """`(K, distortion, rms_px)` from several views of the board (Zhang 2000, with OpenCV's five coefficients).
 
     Args:

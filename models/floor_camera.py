@@ -36,8 +36,8 @@ class FloorCamera:
 
         Raises:
             ValueError: if `P` is not (3, 4), not finite or singular; if the camera stands on or below the floor; if
-                no pixel of the image sees the floor in front of it (it looks away, or `P` is mirrored); if `shape` is
-                not two positive integers.
+                no pixel of the image sees the floor in front of it, or only pixels above the horizon (it looks away,
+                or `P` is mirrored); if `shape` is not two positive integers.
         """
         if len(shape) != 2 or any(int(size) != size or size < 1 for size in shape):
             raise ValueError(f"shape must be (rows, columns), two positive integers; got {tuple(shape)}.")
@@ -51,10 +51,15 @@ class FloorCamera:
         if height <= 0:
             raise ValueError(f"P puts the camera at a height of {height:.3g} m; it must be above the floor, Z = 0.")
         rows, cols = int(shape[0]), int(shape[1])
-        if not np.any(_floor_depth(P, _grid(rows, cols)) > 0):
+        sees_floor = _floor_depth(P, _grid(rows, cols)) > 0
+        if not sees_floor.any():
             raise ValueError(
                 "P shows no floor in front of the camera at any pixel: it looks away from Z = 0, or P is mirrored "
                 "(world axes must be right-handed, Z up, pixels u right and v down)."
+            )
+        if not sees_floor.all() and _is_upside_down(P, rows, cols):
+            raise ValueError(
+                "P shows the floor above the horizon: P is mirrored, or the image upside down (turn it by 180 degrees)."
             )
         return cls(jnp.asarray(P, float), (rows, cols))
 
@@ -110,3 +115,10 @@ def _floor_depth(P: np.ndarray, homogeneous: np.ndarray) -> np.ndarray:
     down = np.linalg.solve(P[:, :3], homogeneous)[2]
     height = -np.linalg.solve(P[:, :3], P[:, 3])[2]
     return -height / np.where(np.abs(down) > 1e-12, down, 1e-12)
+
+
+def _is_upside_down(P: np.ndarray, rows: int, cols: int) -> bool:
+    """Whether things that fall rise, in the middle of the image, more than they move sideways."""
+    middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
+    u, v = middle * P[2, 2] - P[:2, 2]
+    return bool(v < -abs(u))

@@ -14,6 +14,8 @@ SHADOW_BRIGHTNESS = (0.5, 0.95)
 """How bright the background may remain within a shadow."""
 SHADOW_CHROMATICITY = 0.02
 """Largest change of red / (red + green + blue), or of green or blue, within a shadow."""
+_SHADOW_SIDE = 5
+"""Pixels: shadows are at least as wide everywhere; the edges of dark clothes, which look alike, are not."""
 
 
 class Difference:
@@ -74,14 +76,14 @@ class Difference:
         if probability is not None:
             still |= (probability >= 0.5).view(np.uint8)
         moves = 1 - still
-        self.noise = _stepped(self.noise, cv2.multiply(self._smooth, np.uint8(NOISE_STEPS)), moves)
+        self.noise = _stepped(self.noise, cv2.convertScaleAbs(self._smooth, alpha=NOISE_STEPS), moves)
         step = moves if image.ndim == 2 else cv2.merge([moves, moves, moves])
         self.background = _stepped(background, image, step)
         self._set_threshold()
 
     def noise_of(self, deviations: np.ndarray) -> np.ndarray:
         """Noise as stored, of median absolute deviations in levels, smoothed over neighbours."""
-        return cv2.blur(cv2.multiply(deviations, np.uint8(NOISE_STEPS)), (5, 5))
+        return cv2.blur(cv2.convertScaleAbs(deviations, alpha=NOISE_STEPS), (5, 5))
 
     def _set_threshold(self) -> None:
         levels = cv2.convertScaleAbs(self.noise, alpha=self._spread * _MAD_TO_STD / NOISE_STEPS)
@@ -99,13 +101,15 @@ class Difference:
     def _weaken_shadows(self, image: np.ndarray, probability: np.ndarray) -> None:
         """Only what differs at all is looked at: a few percent of an image."""
         assert self.background is not None
-        places = np.flatnonzero(cv2.compare(self._ratio, _AT_THRESHOLD * 3 // 4, cv2.CMP_GT))
-        channels = 1 if image.ndim == 2 else 3
-        now = image.reshape(-1, channels)[places].astype(np.float32)
-        empty = self.background.reshape(-1, channels)[places].astype(np.float32)
-        shadows = places[is_shadow(now, empty)]
-        flat = probability.reshape(-1)
-        flat[shadows] = np.minimum(flat[shadows], np.float32(self._shadow_probability))
+        found = cv2.findNonZero(cv2.inRange(self._ratio, _AT_THRESHOLD * 3 // 4, 255))
+        if found is None:
+            return
+        cols, rows = found[:, 0].T
+        places = rows * np.int32(image.shape[1]) + cols
+        mask = np.zeros(probability.shape, np.uint8)
+        mask.reshape(-1)[places] = is_shadow(_colors(image, places), _colors(self.background, places))
+        weakened = np.minimum(probability, np.float32(self._shadow_probability))
+        cv2.copyTo(weakened, wide(mask), probability)
 
 
 def logistic_table() -> np.ndarray:
@@ -115,12 +119,23 @@ def logistic_table() -> np.ndarray:
 
 
 def is_shadow(now: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """(n,) whether colours (n, channels) are those of the empty room, only darker (Kato et al., improvement 2)."""
-    sum_now, sum_empty = now.sum(axis=-1), np.maximum(empty.sum(axis=-1), 1)
-    brightness = sum_now / sum_empty
+    """(n,) whether colours (channels, n) are those of the empty room, only darker (Kato et al., improvement 2)."""
+    now, empty = now.astype(np.float32), empty.astype(np.float32)
+    sum_now, sum_empty = sum(now), sum(empty)
     low, high = SHADOW_BRIGHTNESS
-    change = np.abs(now / np.maximum(sum_now, 1)[:, None] - empty / sum_empty[:, None]).max(axis=-1)
-    return (low <= brightness) & (brightness <= high) & (change < SHADOW_CHROMATICITY)
+    is_darker = (low * sum_empty <= sum_now) & (sum_now <= high * sum_empty) & (sum_now > 0)
+    change = [np.abs(a * sum_empty - b * sum_now) for a, b in zip(now, empty, strict=True)]
+    return is_darker & (np.max(change, axis=0) < np.float32(SHADOW_CHROMATICITY) * sum_now * sum_empty)
+
+
+def wide(mask: np.ndarray) -> np.ndarray:
+    """The parts of a mask (rows, cols) that are at least as wide as a shadow."""
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((_SHADOW_SIDE, _SHADOW_SIDE), np.uint8))
+
+
+def _colors(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(channels, n): the image (rows, cols[, channels]) at flat places."""
+    return image.reshape(len(image) * image.shape[1], -1).take(places, axis=0).T.copy()
 
 
 def _stepped(values: np.ndarray, targets: np.ndarray, step: np.ndarray) -> np.ndarray:

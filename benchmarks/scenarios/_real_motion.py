@@ -4,6 +4,7 @@ Only (u, v) of a network is used. The noise is what the tracker takes for keypoi
 own: nothing but the meaning of the markers is from these recordings.
 """
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
-from jaxfilters.models.articulated.motion import about_ease
+from jaxfilters.models.articulated.motion import MOVEMENT_TIME, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated_hand import TRACKING, ArticulatedConfig, tracker_of
@@ -29,6 +30,9 @@ from jaxfilters.trackers.articulated_start import starts_from_points
 from jaxfilters.trackers.feature_sequence import FeatureFrame, keypoint_noise
 
 FRAME_INTERVAL = 1 / 30
+PERSISTENCE = math.sqrt(2 * MOVEMENT_TIME)
+"""By which a filter of white noise has to raise the noise of a detection. A network errs by what it sees: its errors
+last as long as a pose. Errors with the correlation exp(-t / time) tell in 2 time frames what white ones tell in one."""
 HYPOTHESES = 4
 QUICK_FRAMES = 240
 VARIANTS = ("backprojection", "limits_only", "filter_only", "recommended")
@@ -92,7 +96,7 @@ class Detections(NamedTuple):
     truth: np.ndarray
     """(frames, markers, 3) millimetres."""
     noise: float
-    """Pixels, from the detections alone."""
+    """Pixels, in one frame; from the detections alone."""
 
 
 class Lifted(NamedTuple):
@@ -172,6 +176,7 @@ def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
     """The tracker in one of its modes, started by itself."""
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
+        detections = detections._replace(noise=PERSISTENCE * detections.noise)
         hand, limits = hand_of(chosen, detections)
         frames = _frames(detections)
         tracker = tracker_of(hand, limits, None, ArticulatedConfig(mode=mode, hypotheses=HYPOTHESES))

@@ -26,7 +26,9 @@ motion of the finger joints, 2015): deviations of 16 to 19 degrees."""
 SPEED = (0.08 / MOVEMENT_TIME, 0.5 * ANGLE_SPREAD / MOVEMENT_TIME, ANGLE_SPREAD / MOVEMENT_TIME)
 """Of wrist (metres), quaternion and angles (radians), per frame: a movement takes the wrist by a palm's width, and
 turns palm and joints by the spread of an angle."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+REMEMBERED = 5.0
+"""Times after which a push has run down."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 @jax.tree_util.register_dataclass
@@ -77,22 +79,26 @@ class AboutEase:
         return x.at[rates].set(jnp.exp(-t) * ((1 - t) * rate - t / self.time[angles] * off))
 
     def noise_root(self, layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, "n columns"]:
-        """A root of the covariance of what is added to it: the noise of three moments, weighted as Gauss does.
+        """A root of the covariance of what is added to it: the noise of five moments, weighted as Gauss does.
 
-        Its square is the integral over the frames to one part in 10^5 for steps up to `time`.
+        Its square is the integral over the frames, to one part in 10^5 for steps up to `time` and 2 % for any.
         """
         is_angle = np.arange(layout.num_moving) >= layout.angles.start
+        dt = jnp.asarray(dt, self.speed_std.dtype)
+        # What came earlier has left the rates and angles, and moved all else by as much as it ever will.
+        recent = jnp.minimum(dt, REMEMBERED * self.time)
+        push = self.speed_std * jnp.sqrt(np.where(is_angle, 4.0, 2.0) / self.time)
+        nothing = jnp.zeros((layout.num_static, layout.num_moving), push.dtype)
         columns = []
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-            since = 0.5 * (1 + float(node)) * dt
-            t = since / self.time
-            kept = jnp.exp(-t)
-            power = np.where(is_angle, 2.0, 1.0) * float(weight) / self.time
-            push = self.speed_std * jnp.sqrt(power) * safe_sqrt(jnp.asarray(dt, self.speed_std.dtype))
-            moved = jnp.where(is_angle, since * kept, -self.time * jnp.expm1(-t))
-            rate = jnp.where(is_angle, (1 - t) * kept, kept)
-            static = jnp.zeros((layout.num_static, layout.num_moving), push.dtype)
-            columns.append(jnp.concatenate([jnp.diag(push * moved), jnp.diag(push * rate), static]))
+            since = 0.5 * (1 + float(node)) * recent
+            kept = jnp.exp(-since / self.time)
+            moved = jnp.where(is_angle, since * kept, -self.time * jnp.expm1(-since / self.time))
+            rate = jnp.where(is_angle, (1 - since / self.time) * kept, kept)
+            now = push * safe_sqrt(0.5 * float(weight) * recent)
+            columns.append(jnp.concatenate([jnp.diag(now * moved), jnp.diag(now * rate), nothing]))
+        before = jnp.where(is_angle, 0.0, push * self.time * safe_sqrt(dt - recent))
+        columns.append(jnp.concatenate([jnp.diag(before), jnp.zeros_like(jnp.diag(before)), nothing]))
         return jnp.concatenate(columns, axis=1)
 
 

@@ -1,7 +1,7 @@
 """Likelihood of a foreground probability map given people: small windows, each sampled at a fixed number of pixels.
 
 Every pixel is foreground or background on its own. A pixel that nobody covers is foreground with probability
-`CLUTTER`; a person makes it foreground with probability `presence(radius)`, independently of the others. With T the
+`CLUTTER`; a person makes it foreground with probability q, its `presence` there, independently of the others. With T the
 probability that neither clutter nor anybody else explains the pixel, and p the foreground probability that was
 observed (even prior), a person multiplies the likelihood by
 
@@ -15,16 +15,34 @@ import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
+
+from jaxfilters.models.person.ellipsoid import Ellipsoid, outline, outline_radius
 
 CLUTTER = 0.02
 """Share of foreground pixels where nobody is."""
-DETECTED = 0.9
-"""Share of foreground pixels in the middle of a person."""
 LEAST, MOST = 0.06, 0.94
 """Bounds on what a pixel may claim: background subtraction is wrong more often than it says."""
-FALLOFF = 4
-"""Exponent of the squared radius: how sharply a person ends at the outline, given that bodies are no ellipsoids."""
+
+
+class Part(NamedTuple):
+    """A soft ellipsoid of a body; lengths in body heights, but the radius in body widths."""
+
+    center: float
+    half_height: float
+    radius: float
+    presence: float
+    """Probability in its middle that it makes a pixel foreground."""
+    falloff: int
+    """Exponent of the squared distance in units of the outline: how sharply it ends there."""
+
+
+PARTS = (Part(0.31, 0.28, 0.38, 0.80, 3), Part(0.66, 0.20, 0.39, 0.98, 4), Part(0.90, 0.088, 0.20, 0.98, 4))
+"""Legs, trunk with arms, head. One ellipsoid that touches soles, crown and arms cannot be found where bodies are:
+people are then taken for shorter and nearer than they are. These are the most likely ones, rounded, for the silhouettes
+of 600 bodies of `models.synthetic.walkers` (heights 1.72 +- 0.09 m, widths 0.26 +- 0.02 heights, walking or standing,
+turned anyhow, seen 3 to 75 degrees from above): 0.203 nats a pixel, where the best single ellipsoid has 0.224."""
 _BLOCK = 16
 """Factors multiplied before a logarithm: 16 factors of at most 1 / LEAST stay far from the ends of float32."""
 
@@ -59,9 +77,32 @@ def window(box: Float[Array, " 4"], shape: tuple[int, int], grid: tuple[int, int
     )
 
 
-def presence(squared_radius: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
-    """Probability that a person makes a pixel foreground, by its squared distance in units of the outline."""
-    return DETECTED / (1 + squared_radius**FALLOFF)
+def presence(
+    P: Float[Array, "3 4"],
+    xy: Float[Array, " 2"],
+    height: Float[ArrayLike, ""],
+    width: Float[ArrayLike, ""],
+    uv: Float[Array, "*pixels 2"],
+) -> Float[Array, "*pixels"]:
+    """Probability that a person makes a pixel foreground.
+
+    Args:
+        P: Projection matrix in canonical scale.
+        xy: Where the person stands, metres.
+        height: Metres.
+        width: From arm to arm, metres.
+        uv: Pixels.
+    """
+    height, width = jnp.asarray(height), jnp.asarray(width)
+    absent = jnp.ones(uv.shape[:-1])
+    for part in PARTS:
+        radius = part.radius * width
+        body = Ellipsoid(
+            jnp.append(xy, part.center * height), jnp.stack([radius, radius, part.half_height * height])
+        )
+        squared = outline_radius(outline(P, body), uv)
+        absent = absent * (1 - part.presence / (1 + squared**part.falloff))
+    return 1 - absent
 
 
 def contrast(

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int8, Real
 
+Pixels = Real[Array, "*pixels"] | Bool[Array, "*pixels"]
 RING = 5
 """Pixels around a region that count against it (section 3.4 of the paper)."""
 
@@ -31,14 +32,14 @@ def dilated(mask: Bool[Array, "rows cols"], ring: int) -> Bool[Array, "rows cols
     return mask
 
 
-def match_score(sim: Real[Array, "*pixels"], real: Real[Array, "*pixels"]) -> Float[Array, ""]:
+def match_score(sim: Pixels, real: Pixels) -> Float[Array, ""]:
     """`sum sim real / sum |sim|` in [-1, 1] ([5]); `-inf` for an empty simulated image."""
     agreement = jnp.sum(sim.astype(jnp.float32) * real)
     size = jnp.sum(jnp.abs(sim).astype(jnp.float32))
     return jnp.where(size > 0, agreement / jnp.where(size > 0, size, 1.0), -jnp.inf)
 
 
-def overlap(sim: Real[Array, "*pixels"], real: Real[Array, "*pixels"]) -> Float[Array, ""]:
+def overlap(sim: Pixels, real: Pixels) -> Float[Array, ""]:
     """Intersection over union of two masks, or of two images of probabilities in [0, 1]; 0 if both are empty."""
     sim, real = sim.astype(jnp.float32), real.astype(jnp.float32)
     common = jnp.sum(sim * real)

@@ -126,7 +126,7 @@ def test_floor_errors_are_the_metres_that_pixels_make():
     camera = paper_camera()
     points = points_in_view(7, 12)
     assert floor_errors_m(camera, points, camera.project(points)).max() < 1e-9
-    moved = points + [0.03, -0.04, 0]
+    moved = points + np.array([0.03, -0.04, 0])
     np.testing.assert_allclose(floor_errors_m(camera, points, camera.project(moved)), 0.05, rtol=1e-9)
     assert np.isnan(floor_errors_m(camera, np.array([[0, 1.0, 0]]), np.array([[80.0, -500.0]]))).all()
 

@@ -5,7 +5,7 @@ from scipy.ndimage import median_filter
 from jaxfilters.trackers.background_difference import NOISE_STEPS, Difference, is_shadow
 
 
-def made(background, *, difference=25, spread=0.0, shadow_probability=1.0, noise=0):
+def made(background, *, difference=25.0, spread=0.0, shadow_probability=1.0, noise=0):
     found = Difference(difference, spread, shadow_probability)
     found.set_background(background.copy(), np.full(background.shape[:2], noise, np.uint8))
     return found
@@ -46,8 +46,8 @@ def test_shadows_are_darker_and_of_the_same_colour():
     empty = np.array([[100.0, 150, 200]] * 5)
     now = empty * [[0.7], [0.4], [0.97], [1.2], [0.7]]
     now[4] += [0, 0, 12]
-    np.testing.assert_array_equal(is_shadow(now, empty), [True, False, False, False, False])
-    assert not is_shadow(np.zeros((1, 3)), empty[:1]).any()
+    np.testing.assert_array_equal(is_shadow(now.T, empty.T), [True, False, False, False, False])
+    assert not is_shadow(np.zeros((3, 1)), empty[:1].T).any()
 
 
 def test_shadows_are_weakened_and_nothing_else():
@@ -59,6 +59,14 @@ def test_shadows_are_weakened_and_nothing_else():
     np.testing.assert_allclose(probability[5:-5, 2:18], 0.3, atol=1e-6)
     assert probability[:, 22:38].max() < 0.01
     assert probability[:, 42:].min() > 0.99
+
+
+def test_edges_of_dark_clothes_are_no_shadows():
+    background = np.full((30, 60, 3), (100, 150, 200), np.uint8)
+    image = background.copy()
+    image[:, 20:24] = (70, 105, 140)
+    probability = made(background, shadow_probability=0.3).probability(image)
+    assert probability[5:-5, 20:24].min() > 0.9
 
 
 def test_the_background_follows_by_one_level_where_it_may():
@@ -76,7 +84,7 @@ def test_the_background_follows_by_one_level_where_it_may():
 def test_noise_becomes_the_median_deviation():
     rng = np.random.default_rng(3)
     background = np.full((8, 8), 120, np.uint8)
-    difference = made(background, spread=6.0, difference=200)
+    difference = made(background, spread=6.0, difference=200.0)
     for _ in range(400):
         image = np.clip(rng.normal(120, 8, (8, 8)), 0, 255).round().astype(np.uint8)
         difference.probability(image)
@@ -92,4 +100,4 @@ def test_images_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match="got float32"):
         made(background).probability(image.astype(np.float32))
     with pytest.raises(ValueError, match="background must be set"):
-        Difference(25, 6, 1).probability(image)
+        Difference(25.0, 6.0, 1.0).probability(image)

@@ -5,9 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.person import foreground
-from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline, outline_radius
-from jaxfilters.models.person.foreground import presence
-from jaxfilters.trackers.people.fit import body_of
+from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
+from jaxfilters.trackers.people.fit import body_of, presence_of
 from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleScene
 
 BINS = 8
@@ -46,12 +45,12 @@ def _in_camera(scene, camera, furniture, frame, places, active):
         box = jnp.where(shown, ellipse_of(seen).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
         window = foreground.window(box, camera.shape, GRID)
 
-        def covers(other):
-            return presence(outline_radius(other, window.uv)) * (other.depth < seen.depth)
+        def covers(place, other):
+            return presence_of(camera, place, window.uv) * (other.depth < seen.depth)
 
-        ahead = jax.vmap(covers)(outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
+        ahead = jax.vmap(covers)(places, outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
         free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.index])
-        weight = presence(outline_radius(seen, window.uv)) * free * window.inside * shown * (mask[window.index] / 255)
+        weight = presence_of(camera, places[k], window.uv) * free * window.inside * shown * (mask[window.index] / 255)
         upper = window.uv[:, 1] < seen.center[1]
         halves = jnp.stack([weight * upper, weight * ~upper])
         # Equal steps of the square root: clothes are mostly dark.

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
-from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, outline_radius, standing
+from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, standing
 from jaxfilters.models.person.foreground import Quadratic, Window, contrast, log_likelihood_ratio, presence
 from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
 
@@ -23,6 +23,8 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
 """Inverse square metres: below it a direction counts as not seen at all."""
+MARGIN = 0.3
+"""Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
 LEAST_SIZE_M = 0.1
 PASSES = 2
 NEAR_M = 1.5
@@ -204,6 +206,11 @@ def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
     return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
 
 
+def presence_of(camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]) -> Array:
+    """`presence` of X, Y, height and width in a camera."""
+    return presence(camera.P, place[:2], *(jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3)), uv)
+
+
 def _prior(predicted):
     pick = jnp.array(PLACE)
     covariance = predicted.covariance[:, pick[:, None], pick]
@@ -231,7 +238,7 @@ def _view(config: PeopleConfig, camera: FloorCamera, furniture, frame: CameraFra
     seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
     boxes = jax.vmap(lambda one: ellipse_of(one).box)(seen)
     box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])
-    margin = 0.15 * (box[2:] - box[:2]) + 1
+    margin = MARGIN * (box[2:] - box[:2]) + 1
     shown = frame.present & jnp.all(seen.code == VISIBLE)
     box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
     window = foreground.window(box, camera.shape, config.grid)
@@ -251,8 +258,7 @@ def _unexplained(scene, camera, places, others: Bool[Array, " slots"], view: Vie
     """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
 
     def one(place):
-        seen = outline(camera.P, body_of(place))
-        return presence(outline_radius(seen, view.window.uv)) * (seen.depth < view.depth)
+        return presence_of(camera, place, view.window.uv) * (outline(camera.P, body_of(place)).depth < view.depth)
 
     hidden = jax.vmap(one)(places) * others[:, None]
     return (1 - foreground.CLUTTER) * jnp.prod(1 - hidden, axis=0)
@@ -268,8 +274,7 @@ def _contrasts(scene, places, others, views):
 def _log_likelihood(scene, place, views, contrasts):
     total = jnp.zeros(())
     for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
-        seen = outline(camera.P, body_of(place))
-        ratio = log_likelihood_ratio(presence(outline_radius(seen, view.window.uv)), b)
+        ratio = log_likelihood_ratio(presence_of(camera, place, view.window.uv), b)
         total += ratio * view.window.area / view.area
     return scene.config.independent_patches * total
 
@@ -278,7 +283,7 @@ def _share_seen(scene, places, others, views, k):
     """Of the silhouette; the largest over the cameras."""
     shares = []
     for camera, view in zip(scene.cameras, views, strict=True):
-        mine = presence(outline_radius(outline(camera.P, body_of(places[k])), view.window.uv))
+        mine = presence_of(camera, places[k], view.window.uv)
         free = _unexplained(scene, camera, places, others, view) * view.visible
         shares.append(jnp.sum(mine * free) / jnp.maximum(jnp.sum(mine), 1e-6))
     return jnp.max(jnp.stack(shares))

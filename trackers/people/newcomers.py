@@ -5,17 +5,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
-from jaxfilters.models.person.ellipsoid import VISIBLE, outline, outline_radius, standing
+from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import walkable
-from jaxfilters.trackers.people.fit import body_of
+from jaxfilters.trackers.people.fit import body_of, presence_of
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
 
-REDUCED_COLS = 240
+REDUCED_COLS = 160
 """Columns of the images in which newcomers are looked for, at most."""
 SAMPLES = (12, 6)
 """Over the box of an ellipse half as wide and high again: rows and columns."""
@@ -46,14 +46,14 @@ def cells_of(
     xy = jnp.asarray(xy[np.asarray(walkable(jnp.asarray(floor), jnp.asarray(xy)))], jnp.float32)
     offsets = _offsets()
     looks = [_look(camera, depth, config, xy, offsets) for camera, depth in zip(cameras, furniture, strict=True)]
-    kept = np.max([np.asarray(share) for _, share in looks], axis=0) >= LEAST_SHARE if len(xy) else np.zeros(0, bool)
+    kept = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE if len(xy) else np.zeros(0, bool)
     if not kept.any():
         raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
     return Cells(
         xy[kept],
-        tuple(index[kept] for index, _ in looks),
-        presence(jnp.sum(offsets**2, axis=-1)),
-        tuple(share[kept] for _, share in looks),
+        tuple(look.index[kept] for look in looks),
+        tuple(look.presence[kept] for look in looks),
+        tuple(look.share[kept] for look in looks),
     )
 
 
@@ -67,8 +67,15 @@ def stride(shape: tuple[int, int]) -> int:
     return max(1, -(-shape[1] // REDUCED_COLS))
 
 
+class _Look(NamedTuple):
+    """One camera's part of `Cells`."""
+
+    index: Int32[Array, "cells samples"]
+    presence: Float[Array, "cells samples"]
+    share: Float[Array, " cells"]
+
+
 def _look(camera, furniture, config, xy, offsets):
-    """Indices into the reduced image (cells, samples), and the share of samples that see the person."""
     rows, cols = camera.shape
     step = stride(camera.shape)
     reduced_rows, reduced_cols = -(-rows // step), -(-cols // step)
@@ -81,8 +88,9 @@ def _look(camera, furniture, config, xy, offsets):
         inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (seen.code == VISIBLE)
         u, v = jnp.clip(u, 0, reduced_cols - 1), jnp.clip(v, 0, reduced_rows - 1)
         free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > seen.depth)
-        weight = presence(jnp.sum(offsets**2, axis=-1))
-        return jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols), jnp.sum(weight * free) / weight.sum()
+        weight = presence(camera.P, xy, config.height_m, config.width_m, uv)
+        index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
+        return _Look(index, weight, jnp.sum(weight * free) / weight.sum())
 
     return jax.jit(jax.vmap(one))(xy)
 
@@ -96,15 +104,15 @@ def newcomer(
     """
     config, cells = scene.config, scene.cells
     total, shares = jnp.zeros(len(cells.xy)), jnp.zeros(len(cells.xy))
-    for camera, depth, frame, index, share in zip(
-        scene.cameras, scene.furniture, frames, cells.index, cells.share, strict=True
+    for camera, depth, frame, index, weight, share in zip(
+        scene.cameras, scene.furniture, frames, cells.index, cells.presence, cells.share, strict=True
     ):
         b = jnp.append(_reduced_contrast(scene, camera, depth, places, active, frame).ravel(), 0.0)
-        ratio = jax.vmap(log_likelihood_ratio, in_axes=(None, 0))(cells.presence, b[index])
+        ratio = jax.vmap(log_likelihood_ratio)(weight, b[index])
         seen = frame.present * (share >= LEAST_SHARE)
         total, shares = total + seen * ratio, shares + seen * share
     # One sample stands for this share of the ellipse's area.
-    per_area = (2 * MARGIN) ** 2 / (jnp.pi * cells.presence.size)
+    per_area = (2 * MARGIN) ** 2 / (jnp.pi * SAMPLES[0] * SAMPLES[1])
     evidence = total * per_area / jnp.maximum(shares, 1e-6)
     best = jnp.argmax(evidence)
     return Newcomer(cells.xy[best], evidence[best] > config.newcomer_evidence)
@@ -118,8 +126,9 @@ def _reduced_contrast(scene, camera, furniture, places, active, frame):
     order = jnp.argsort(~active)
 
     def cover(turn, unexplained):
-        seen = outline(camera.P, body_of(places[order[turn]]))
-        return unexplained * (1 - presence(outline_radius(seen, uv)) * (seen.depth < depth))
+        place = places[order[turn]]
+        ahead = outline(camera.P, body_of(place)).depth < depth
+        return unexplained * (1 - presence_of(camera, place, uv) * ahead)
 
     free = jnp.full(reduced.shape, 1 - foreground.CLUTTER)
     return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))

@@ -97,8 +97,8 @@ class Cells(NamedTuple):
     """Metres."""
     index: tuple[Int32[Array, "cells samples"], ...]
     """Into the reduced image of each camera, flattened; the last entry stands for pixels outside."""
-    presence: Float[Array, " samples"]
-    """Of a person at the samples, the same for all cells."""
+    presence: tuple[Float[Array, "cells samples"], ...]
+    """Of a person at the samples."""
     share: tuple[Float[Array, " cells"], ...]
     """Of the samples that lie in each image and in front of furniture."""
 

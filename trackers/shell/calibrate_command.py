@@ -63,9 +63,7 @@ def _from_points(options: argparse.Namespace) -> str:
     return _written(calibration, options, how, points_m, pixels, lines)
 
 
-def _camera_of_points(
-    points_m: np.ndarray, pixels: np.ndarray, options: argparse.Namespace
-) -> tuple[Calibration, str]:
+def _camera_of_points(points_m: np.ndarray, pixels: np.ndarray, options: argparse.Namespace) -> tuple[Calibration, str]:
     if options.intrinsics is not None:
         K, distortion, size = open_intrinsics(options.intrinsics)
         if size != options.image_size:
@@ -139,7 +137,9 @@ def _from_boards(options: argparse.Namespace) -> str:
     calibration = _named(options.floor, lambda: calibrate_on_floor(view, K, distortion))
     options.image_size = size
     points_m = view.points_m * (1, -1, -1)
-    return "\n".join([*told, _written(calibration, options, "the pose over the board on the floor", points_m, view.pixels)])
+    return "\n".join(
+        [*told, _written(calibration, options, "the pose over the board on the floor", points_m, view.pixels)]
+    )
 
 
 def _read_image(path: Path) -> np.ndarray:
@@ -185,9 +185,7 @@ def _written(
     return "\n".join([*told, f"camera in {options.out}"])
 
 
-def _errors(
-    calibration: Calibration, points_m: np.ndarray, pixels: np.ndarray, lines: list[int] | None
-) -> list[str]:
+def _errors(calibration: Calibration, points_m: np.ndarray, pixels: np.ndarray, lines: list[int] | None) -> list[str]:
     errors_px = np.linalg.norm(calibration.project(points_m) - pixels, axis=1)
     errors_m = floor_errors_m(calibration, points_m, pixels)
     worst = int(np.argmax(errors_px))
@@ -207,4 +205,3 @@ def _named(path: Path, make: Callable):
         raise
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
-

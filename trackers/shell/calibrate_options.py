@@ -23,8 +23,8 @@ def _add_points(sources: Any, pair: Callable[[str], Pair]) -> None:
         "file",
         type=Path,
         metavar="FILE.csv",
-        help="columns x_m,y_m,z_m,u,v: metres with Z up from the floor, pixels from the centre of the top left one; six "
-        "or more at several heights, or four or more in one plane",
+        help="columns x_m,y_m,z_m,u,v: metres with Z up from the floor, pixels from the centre of the top left one; "
+        "six or more at several heights, or four or more in one plane",
     )
     points.add_argument("--image-size", type=pair, required=True, metavar="WIDTHxHEIGHT", help="of the images")
     points.add_argument("--distortion", action="store_true", help="find the lens's distortion as well")

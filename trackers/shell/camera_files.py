@@ -228,6 +228,4 @@ def _projection(settings: dict[str, Any], K: np.ndarray | None, path: Path) -> n
 
 def _check_intrinsics(K: np.ndarray, path: Path) -> None:
     if np.any(K[2] != (0, 0, 1)) or K[1, 0] != 0 or K[0, 1] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise InputError(
-            f"{path}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; got {K.tolist()}."
-        )
+        raise InputError(f"{path}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; got {K.tolist()}.")

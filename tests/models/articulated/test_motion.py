@@ -31,7 +31,7 @@ def exact(speed_std, time, dt, *, is_angle):
     return F, F @ solved[:2, 2:]
 
 
-@pytest.mark.parametrize("dt", [0.3, 1.0, 6.0])
+@pytest.mark.parametrize("dt", [0.3, 1.0, 6.0, 60.0])
 def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
     layout = Layout(2)
     motion, ease = uneven(layout)
@@ -46,8 +46,8 @@ def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
         F, Q = exact(SPEED_STD[kind], TIME[kind], dt, is_angle=kind == 2)
         pair = [i, layout.num_moving + i]
         np.testing.assert_allclose(after[pair], F @ (x[pair] - [rest[i], 0]) + [rest[i], 0], rtol=1e-12, atol=1e-12)
-        # The quadrature's error, 1e-5 of the larger terms, for steps up to the time.
-        np.testing.assert_allclose(noise[np.ix_(pair, pair)], Q, atol=2e-5 * np.abs(Q).max())
+        # The error of the quadrature.
+        np.testing.assert_allclose(noise[np.ix_(pair, pair)], Q, atol=(1e-5 if dt < 10 else 0.02) * np.abs(Q).max())
         noise[np.ix_(pair, pair)] = 0
     np.testing.assert_array_equal(noise, 0)
     np.testing.assert_array_equal(after[layout.static], x[layout.static])

@@ -1,10 +1,11 @@
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.models.calibration import Calibration
+from jaxfilters.models.calibration import Calibration, distort
 from jaxfilters.models.calibration_board import charuco_board
 from jaxfilters.trackers.shell.camera_files import open_camera, open_intrinsics
 from jaxfilters.trackers.shell.cli import FAILURE, main
@@ -90,6 +91,7 @@ def test_the_worst_point_is_pointed_at(tmp_path, capsys):
         ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n1,2,3,4\n", "line 3: expected five finite numbers"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,five\n", "line 2: expected five finite numbers"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,5,6\n", "line 2: expected five finite numbers"),
+        ("x_m,y_m,z_m,u,v\n1,2,3,-4,5\n", "line 2: pixel (-4, 5) lies outside an image of 640x480"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,500\n", "line 2: pixel (4, 500) lies outside an image of 640x480"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n2,3,4,5,6\n", "6 points or more are needed, or 4 in one plane; got 2"),
         ("x_m,y_m,z_m,u,v\n", "got 0"),
@@ -126,6 +128,7 @@ def test_pictures_of_a_board(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "in 5 pictures: reprojection error 0." in told
     assert "the pose over the board on the floor" in told
+    assert re.search(r"floor error 0\.00\d m on average", told)
     np.testing.assert_allclose(open_camera(out).camera.position(), position, atol=0.01)
 
     assert calibrate("charuco", *files, *size, "--out", out) == 0
@@ -157,4 +160,8 @@ def test_parameters_of_pets(data_dir, tmp_path, capsys):
     theirs = json.loads((folder / "calibration.json").read_text())
     opened = open_camera(out, image_size=(480, 360))
     np.testing.assert_allclose(opened.camera.P, theirs["P_480x360"], rtol=1e-5, atol=1e-3)
-    np.testing.assert_allclose(opened.undistortion.distortion, theirs["opencv_distCoeffs"], atol=2e-3)
+    u, v = np.meshgrid(np.linspace(0, 479, 9), np.linspace(0, 359, 9))
+    focal, middle = opened.undistortion.K[[0, 1], [0, 1]], opened.undistortion.K[:2, 2]
+    x = (np.stack([u.ravel(), v.ravel()], axis=-1) - middle) / focal
+    ours, expected = (distort(x, np.asarray(k)) for k in (opened.undistortion.distortion, theirs["opencv_distCoeffs"]))
+    np.testing.assert_allclose(ours * focal, expected * focal, atol=0.01)
