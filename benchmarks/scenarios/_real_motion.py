@@ -2,6 +2,9 @@
 
 Only (u, v) of a network is used. The noise is what the tracker takes for keypoints, motion and the hand at ease are its
 own: nothing but the meaning of the markers is from these recordings.
+
+What limits it: a hand of 90 pixels that faces the camera (ICVL) is flatter, 22 mm in depth, than its foreshortening can
+be read from detections that are 4 pixels off; there the plane at the depth of the root is nearer to the truth.
 """
 
 import math

@@ -9,6 +9,7 @@ from typing import NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 VISIBLE, INSIDE, BEHIND, CROSSING = 0, 1, 2, 3
@@ -96,6 +97,13 @@ def outline_radius(seen: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, 
     x, y = d[..., 0], d[..., 1]
     squared = (c * x**2 - 2 * b * x * y + a * y**2) / (a * c - b**2)
     return jnp.where(seen.code == VISIBLE, squared, jnp.where(seen.code == INSIDE, 0.0, jnp.inf))
+
+
+def grown(seen: Outline, pixels: Float[ArrayLike, ""]) -> Outline:
+    """An outline that reaches farther by some pixels to the left and right, above and below."""
+    reach = jnp.sqrt(jnp.diagonal(seen.shape))
+    scale = 1 + pixels / reach
+    return seen._replace(shape=seen.shape * jnp.outer(scale, scale))
 
 
 def ellipse_of(seen: Outline) -> Ellipse:

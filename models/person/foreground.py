@@ -1,8 +1,8 @@
 """Likelihood of a foreground probability map given people: small windows, each sampled at a fixed number of pixels.
 
 Every pixel is foreground or background on its own. A pixel that nobody covers is foreground with probability
-`CLUTTER`; a person makes it foreground with probability q, its `presence` there, independently of the others. With T the
-probability that neither clutter nor anybody else explains the pixel, and p the foreground probability that was
+`CLUTTER`; a person makes it foreground with probability q, its `presence` there, independently of the others. With T
+the probability that neither clutter nor anybody else explains the pixel, and p the foreground probability that was
 observed (even prior), a person multiplies the likelihood by
 
     (p + T (1 - q) (1 - 2 p)) / (p + T (1 - 2 p)) = 1 - q b,    b = T (1 - 2 p) / (p + T (1 - 2 p)),
@@ -11,14 +11,13 @@ so that one number a pixel, `contrast`, is all that candidates have to be compar
 the others do not explain: people who hide each other, and blobs of several people, need no case of their own.
 """
 
-import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
 
-from jaxfilters.models.person.ellipsoid import Ellipsoid, outline, outline_radius
+from jaxfilters.models.person.ellipsoid import Ellipsoid, grown, outline, outline_radius
 
 CLUTTER = 0.02
 """Share of foreground pixels where nobody is."""
@@ -83,6 +82,7 @@ def presence(
     height: Float[ArrayLike, ""],
     width: Float[ArrayLike, ""],
     uv: Float[Array, "*pixels 2"],
+    spread_px: float = 0.0,
 ) -> Float[Array, "*pixels"]:
     """Probability that a person makes a pixel foreground.
 
@@ -92,6 +92,7 @@ def presence(
         height: Metres.
         width: From arm to arm, metres.
         uv: Pixels.
+        spread_px: How far silhouettes reach beyond their edges, pixels.
     """
     height, width = jnp.asarray(height), jnp.asarray(width)
     absent = jnp.ones(uv.shape[:-1])
@@ -100,7 +101,7 @@ def presence(
         body = Ellipsoid(
             jnp.append(xy, part.center * height), jnp.stack([radius, radius, part.half_height * height])
         )
-        squared = outline_radius(outline(P, body), uv)
+        squared = outline_radius(grown(outline(P, body), spread_px), uv)
         absent = absent * (1 - part.presence / (1 + squared**part.falloff))
     return 1 - absent
 
@@ -143,13 +144,18 @@ def lattice(dimensions: int, reach: int = 1) -> Float[Array, "points n"]:
     return jnp.stack([axis.ravel() for axis in axes], axis=-1)
 
 
-def quadratic_fit(values: Float[Array, " 3**n"], steps: Float[Array, " n"]) -> Quadratic:
+def quadratic_fit(values: Float[Array, " points"], steps: Float[Array, " n"]) -> Quadratic:
     """Least-squares parabola through values on `lattice(n) * steps`.
 
     On a full lattice the regressors are orthogonal but for constant and squares, so that every coefficient is a
     contrast of its own (G. Box, K. Wilson, "On the experimental attainment of optimum conditions", 1951).
+
+    Raises:
+        ValueError: if there is not one value for each point of the lattice.
     """
-    n = round(math.log(len(values), 3))
+    n = len(steps)
+    if len(values) != 3**n:
+        raise ValueError(f"values must be those on lattice({n}), {3**n} of them; got {len(values)}.")
     x = lattice(n)
     gradient = 3.0 ** (1 - n) / 2 * (values @ x)
     mixed = 3.0 ** (2 - n) / 4 * jnp.einsum("p,pi,pj->ij", values, x, x)

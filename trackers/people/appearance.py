@@ -46,11 +46,11 @@ def _in_camera(scene, camera, furniture, frame, places, active):
         window = foreground.window(box, camera.shape, GRID)
 
         def covers(place, other):
-            return presence_of(camera, place, window.uv) * (other.depth < seen.depth)
+            return presence_of(scene.config, camera, place, window.uv) * (other.depth < seen.depth)
 
         ahead = jax.vmap(covers)(places, outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
         free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.index])
-        weight = presence_of(camera, places[k], window.uv) * free * window.inside * shown * (mask[window.index] / 255)
+        weight = presence_of(scene.config, camera, places[k], window.uv) * free * window.inside * shown * (mask[window.index] / 255)
         upper = window.uv[:, 1] < seen.center[1]
         halves = jnp.stack([weight * upper, weight * ~upper])
         # Equal steps of the square root: clothes are mostly dark.

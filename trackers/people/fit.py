@@ -206,9 +206,12 @@ def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
     return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
 
 
-def presence_of(camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]) -> Array:
+def presence_of(
+    config: PeopleConfig, camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
+) -> Float[Array, "*pixels"]:
     """`presence` of X, Y, height and width in a camera."""
-    return presence(camera.P, place[:2], *(jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3)), uv)
+    height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
+    return presence(camera.P, place[:2], height, width, uv, config.spread_px)
 
 
 def _prior(predicted):
@@ -258,7 +261,7 @@ def _unexplained(scene, camera, places, others: Bool[Array, " slots"], view: Vie
     """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
 
     def one(place):
-        return presence_of(camera, place, view.window.uv) * (outline(camera.P, body_of(place)).depth < view.depth)
+        return presence_of(scene.config, camera, place, view.window.uv) * (outline(camera.P, body_of(place)).depth < view.depth)
 
     hidden = jax.vmap(one)(places) * others[:, None]
     return (1 - foreground.CLUTTER) * jnp.prod(1 - hidden, axis=0)
@@ -274,7 +277,7 @@ def _contrasts(scene, places, others, views):
 def _log_likelihood(scene, place, views, contrasts):
     total = jnp.zeros(())
     for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
-        ratio = log_likelihood_ratio(presence_of(camera, place, view.window.uv), b)
+        ratio = log_likelihood_ratio(presence_of(scene.config, camera, place, view.window.uv), b)
         total += ratio * view.window.area / view.area
     return scene.config.independent_patches * total
 
@@ -283,7 +286,7 @@ def _share_seen(scene, places, others, views, k):
     """Of the silhouette; the largest over the cameras."""
     shares = []
     for camera, view in zip(scene.cameras, views, strict=True):
-        mine = presence_of(camera, places[k], view.window.uv)
+        mine = presence_of(scene.config, camera, places[k], view.window.uv)
         free = _unexplained(scene, camera, places, others, view) * view.visible
         shares.append(jnp.sum(mine * free) / jnp.maximum(jnp.sum(mine), 1e-6))
     return jnp.max(jnp.stack(shares))

@@ -88,7 +88,7 @@ def _look(camera, furniture, config, xy, offsets):
         inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (seen.code == VISIBLE)
         u, v = jnp.clip(u, 0, reduced_cols - 1), jnp.clip(v, 0, reduced_rows - 1)
         free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > seen.depth)
-        weight = presence(camera.P, xy, config.height_m, config.width_m, uv)
+        weight = presence(camera.P, xy, config.height_m, config.width_m, uv, config.spread_px)
         index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
         return _Look(index, weight, jnp.sum(weight * free) / weight.sum())
 
@@ -128,7 +128,7 @@ def _reduced_contrast(scene, camera, furniture, places, active, frame):
     def cover(turn, unexplained):
         place = places[order[turn]]
         ahead = outline(camera.P, body_of(place)).depth < depth
-        return unexplained * (1 - presence_of(camera, place, uv) * ahead)
+        return unexplained * (1 - presence_of(scene.config, camera, place, uv) * ahead)
 
     free = jnp.full(reduced.shape, 1 - foreground.CLUTTER)
     return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))

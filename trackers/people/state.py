@@ -48,6 +48,9 @@ class PeopleConfig:
     """How many independent looks one silhouette is worth, whatever its size in pixels."""
     silhouette_sd_m: float = 0.05
     """Of what shape and gait add to every coordinate."""
+    spread_px: float = 0.5
+    """How far silhouettes reach beyond their edges: an edge that lens, video coder and resampling blur by 0.8 pixels
+    crosses a threshold of 30 grey levels that much too far out where the contrast is 100."""
     grid: tuple[int, int] = (32, 16)
     """Samples of a person's window, rows and columns."""
     cell_m: float = 0.3
@@ -64,13 +67,15 @@ class PeopleConfig:
     """How long somebody who is hidden is believed to be there."""
 
     def __post_init__(self) -> None:
-        for name in [entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity")]:
+        for name in [entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity", "spread_px")]:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and 0 < value < np.inf):
                 raise ValueError(f"{name} must be positive; got {value!r}.")
         sizes = (self.capacity, *self.grid)
         if len(sizes) != 3 or any(not isinstance(size, int) or size < 1 for size in sizes):
             raise ValueError(f"capacity and grid must be positive integers; got {self.capacity!r}, {self.grid!r}.")
+        if not 0 <= self.spread_px < np.inf:
+            raise ValueError(f"spread_px must be 0 or more pixels; got {self.spread_px!r}.")
         if not self.dropped < 0:
             raise ValueError(f"dropped must be negative log odds; got {self.dropped!r}.")
 
