@@ -220,14 +220,18 @@ def _prior(predicted):
     return jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
 
 
-def _axes(scene, place):
-    """Away from whichever camera is nearest, sideways, up."""
+def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+    """Rows: unit vectors on the floor away from whichever camera is nearest, and at right angles."""
     centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
-    away = place[:2] - centers[jnp.argmin(jnp.sum((place[:2] - centers) ** 2, axis=-1))]
+    away = xy - centers[jnp.argmin(jnp.sum((xy - centers) ** 2, axis=-1))]
     distance = jnp.linalg.norm(away)
     # Straight below the camera any direction is as good.
     x, y = jnp.where(distance > 0.1, away / jnp.maximum(distance, 0.1), jnp.array([0.0, 1.0]))
-    return jnp.eye(4).at[:2, :2].set(jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])]))
+    return jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])])
+
+
+def _axes(scene, place):
+    return jnp.eye(4).at[:2, :2].set(line_of_sight(scene, place[:2]))
 
 
 def _reach(predicted, axes):

@@ -11,10 +11,12 @@ from jaxtyping import Array, Float
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.kalman import joseph
 from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.appearance import appearances
 from jaxfilters.trackers.people.exchange import after_meetings
-from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people, place_of
+from jaxfilters.trackers.people.fit import Fit, as_measurement, body_of, fit_people, place_of
+from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.newcomers import cells_of, newcomer
 from jaxfilters.trackers.people.state import (
     HEIGHT,
@@ -22,7 +24,6 @@ from jaxfilters.trackers.people.state import (
     STATE,
     TENTATIVE,
     TRACKED,
-    WIDTH,
     CameraFrame,
     People,
     PeopleConfig,
@@ -33,8 +34,6 @@ from jaxfilters.trackers.people.state import (
 )
 from jaxfilters.views import consider
 
-HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
-"""Metres per root second: posture; arms, stride and which side is seen."""
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""
 CLEAR = 0.5
@@ -100,7 +99,8 @@ def step(
     """
     dt = jnp.clip(jnp.asarray(dt, float), 0.0, MOST_DT_S)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
-    predicted = chosen(active, _predicted(scene.config, people.belief, dt), people.belief)
+    F, Q = motion(scene.config, dt)
+    predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
     fit = fit_people(scene, predicted, active, lifecycle.seniority(people), frames)
     belief, nis = _updated(scene.config, predicted, fit)
     people = people._replace(belief=chosen(active, belief, people.belief))
@@ -116,14 +116,11 @@ def step(
     return people, _report(people, fit, nis)
 
 
-def _predicted(config: PeopleConfig, belief: Gaussian, dt: Array) -> Gaussian:
-    """Constant velocity with white acceleration; height with a small drift."""
-    F = jnp.eye(STATE).at[0, 2].set(dt).at[1, 3].set(dt)
-    block = config.acceleration_sd**2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    Q = jnp.zeros((STATE, STATE)).at[HEIGHT, HEIGHT].set(HEIGHT_DRIFT**2 * dt).at[WIDTH, WIDTH].set(WIDTH_DRIFT**2 * dt)
-    for axis in (0, 1):
-        Q = Q.at[jnp.ix_(jnp.array([axis, axis + 2]), jnp.array([axis, axis + 2]))].set(block)
-    return jax.vmap(joseph.predict, in_axes=(0, None, None))(belief, F, Q)
+@jax.jit
+def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
+    """The outlines of everybody in each camera, one row a slot."""
+    bodies = jax.vmap(body_of)(place_of(people.belief.mean))
+    return tuple(jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies) for camera in scene.cameras)
 
 
 def _updated(config: PeopleConfig, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:

@@ -1,0 +1,133 @@
+"""Tracks as they are kept: collected while the tracker runs, and smoothed when a recording has ended."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.kalman import joseph
+from jaxfilters.trackers.people.fit import line_of_sight
+from jaxfilters.trackers.people.motion import motion
+from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, PeopleScene, Report
+
+HIDDEN_SHARE = 0.2
+"""Somebody of whose silhouette less is seen is `hidden`."""
+NO_DEPTH_SD_M = 0.5
+"""Somebody whose place along the line of sight is known no better has no measurable depth (section 4, E2)."""
+
+
+class Sighting(NamedTuple):
+    """One person in one frame."""
+
+    frame: int
+    time_s: float
+    mean: np.ndarray
+    """(6,)."""
+    covariance: np.ndarray
+    """(6, 6)."""
+    score: float
+    mode: str
+    """`tentative`, `tracked`, `hidden` (nothing to be seen) or `no_depth` (not measurable along the line of sight)."""
+
+
+class Recorder:
+    """Collects sightings by identity; those from before a confirmation follow once there is an identity."""
+
+    def __init__(self) -> None:
+        self.tracks: dict[int, list[Sighting]] = {}
+        self._unconfirmed: dict[int, list[Sighting]] = {}
+
+    def add(self, frame: int, time_s: float, people: People, report: Report) -> list[tuple[int, Sighting]]:
+        """The sightings of a frame and, for the newly confirmed, of the frames before; NumPy leaves."""
+        added: list[tuple[int, Sighting]] = []
+        for slot, (mode, identity) in enumerate(zip(people.mode, people.identity, strict=True)):
+            if mode not in (TENTATIVE, TRACKED):
+                self._unconfirmed.pop(slot, None)
+                continue
+            seen = _sighting(frame, time_s, slot, people, report)
+            if mode == TENTATIVE:
+                # A slot that was given up and taken again within one frame holds somebody else.
+                if people.log_odds[slot] == 0:
+                    self._unconfirmed.pop(slot, None)
+                self._unconfirmed.setdefault(slot, []).append(seen)
+                continue
+            added += [(int(identity), one) for one in [*self._unconfirmed.pop(slot, []), seen]]
+        for identity, seen in added:
+            self.tracks.setdefault(identity, []).append(seen)
+        return added
+
+
+def _sighting(frame, time_s, slot, people, report) -> Sighting:
+    mode = "tentative" if people.mode[slot] == TENTATIVE else "tracked"
+    if mode == "tracked" and report.share_seen[slot] < HIDDEN_SHARE:
+        mode = "hidden"
+    elif mode == "tracked" and report.sd_radial[slot] > NO_DEPTH_SD_M:
+        mode = "no_depth"
+    return Sighting(
+        frame,
+        time_s,
+        np.array(people.belief.mean[slot], np.float64),
+        np.array(people.belief.covariance[slot], np.float64),
+        float(report.score[slot]),
+        mode,
+    )
+
+
+def spreads(scene: PeopleScene, seen: Sighting) -> tuple[float, float]:
+    """Standard deviations along and across the line of sight of the nearest camera, metres."""
+    axes = np.asarray(line_of_sight(scene, jnp.asarray(seen.mean[:2], jnp.float32)))
+    radial, lateral = np.einsum("ai,ij,aj->a", axes, seen.covariance[:2, :2], axes)
+    return float(np.sqrt(max(radial, 0.0))), float(np.sqrt(max(lateral, 0.0)))
+
+
+def smoothed(config: PeopleConfig, tracks: dict[int, list[Sighting]]) -> dict[int, list[Sighting]]:
+    """The same tracks, every belief given all frames of its track (H. Rauch, F. Tung, C. Striebel 1965).
+
+    A gap longer than `hidden_s` seconds ends one piece and begins another.
+    """
+    return {
+        identity: [seen for piece in _pieces(track, config.hidden_s) for seen in _smoothed(config, piece)]
+        for identity, track in tracks.items()
+    }
+
+
+def _pieces(track: list[Sighting], longest_s: float) -> list[list[Sighting]]:
+    ordered = sorted(track, key=lambda seen: seen.frame)
+    cuts = [i for i in range(1, len(ordered)) if ordered[i].time_s - ordered[i - 1].time_s > longest_s]
+    return [ordered[a:b] for a, b in zip([0, *cuts], [*cuts, len(ordered)], strict=True)]
+
+
+def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:
+    length = len(piece)
+    # One compilation for each power of two.
+    padding = (1 << (length - 1).bit_length()) - length
+    beliefs = Gaussian(
+        jnp.asarray(np.stack([seen.mean for seen in piece] + [piece[-1].mean] * padding), jnp.float32),
+        jnp.asarray(np.stack([seen.covariance for seen in piece] + [piece[-1].covariance] * padding), jnp.float32),
+    )
+    steps = np.diff([seen.time_s for seen in piece], append=piece[-1].time_s)
+    found = _backward(config, beliefs, jnp.asarray(np.append(steps, np.zeros(padding)), jnp.float32), length)
+    mean, covariance = np.asarray(found.mean, np.float64), np.asarray(found.covariance, np.float64)
+    return [seen._replace(mean=mean[i], covariance=covariance[i]) for i, seen in enumerate(piece)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _backward(config: PeopleConfig, beliefs: Gaussian, steps: jax.Array, length: jax.Array) -> Gaussian:
+    def back(following: Gaussian, inputs):
+        belief, dt, is_last = inputs
+        F, Q = motion(config, dt)
+        given = joseph.rts(belief, following, F, Q)
+        chosen = jax.tree.map(lambda now, smooth: jnp.where(is_last, now, smooth), belief, given)
+        return chosen, chosen
+
+    is_last = jnp.arange(len(steps)) >= length - 1
+    last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
+    return jax.lax.scan(back, last, (beliefs, steps, is_last), reverse=True)[1]
+
+
+def height_of(seen: Sighting) -> float:
+    """Metres."""
+    return float(seen.mean[HEIGHT])
