@@ -1,12 +1,13 @@
 """`jaxfilters bench SCENARIO`, also `python -m jaxfilters.benchmarks SCENARIO`.
 
 A scenario is a module in `scenarios/` with `run(*, quick, seed, out) -> dict[str, Metric]`; its docstring says what it
-measures, and its file name, with dashes, is its name.
+measures, and its file name, with dashes, is its name. One that compares with a file of truth takes `truth`, too.
 """
 
 import argparse
 import ast
 import importlib
+import inspect
 import json
 import pkgutil
 import sys
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxfilters.benchmarks import metrics, scenarios
+from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.trackers.shell.devices import use_all_cores
 
 FAILURE = 2
@@ -33,7 +35,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name is None or error.name.startswith("jaxfilters"):
             raise
         return _fail(f"{options.scenario} needs {error.name}: pip install 'jaxfilters[bench]'")
-    measured = scenario.run(quick=options.quick, seed=options.seed, out=options.out)
+    more = {"truth": options.truth} if options.truth else {}
+    if more and "truth" not in inspect.signature(scenario.run).parameters:
+        return _fail(f"--truth: {options.scenario} compares with no file")
+    try:
+        measured = scenario.run(quick=options.quick, seed=options.seed, out=options.out, **more)
+    except RecordingError as error:
+        return _fail(f"{options.scenario}: {error}")
     print(metrics.table(measured))
     if options.json:
         from jaxfilters.benchmarks.environment import environment
@@ -66,6 +74,7 @@ def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="fewer seeds and rounds: to see that it runs")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers and the environment there")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="what to compare with, where it is a file's to say")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the plots of the scenario there")
     return parser
 

@@ -45,7 +45,7 @@ class FloorCamera:
         if P.shape != (3, 4) or not np.all(np.isfinite(P)):
             raise ValueError(f"P must be a finite matrix of shape (3, 4); got shape {P.shape}.")
         if np.linalg.cond(P[:, :3] / np.linalg.norm(P[:, :3], axis=1, keepdims=True).clip(1e-300)) > 1e8:
-            raise ValueError("P is singular: its left 3 x 3 block has no inverse, so it is no camera at a finite place.")
+            raise ValueError("P is singular: its left 3 x 3 block has no inverse, so it is no camera at a place.")
         P = canonical(P)
         height = -np.linalg.solve(P[:, :3], P[:, 3])[2]
         if height <= 0:
@@ -74,9 +74,7 @@ class FloorCamera:
         safe = jnp.where(jnp.abs(depth) > 1e-9, depth, 1e-9)
         return homogeneous[..., :2] / safe[..., None], depth
 
-    def floor_points(
-        self, uv: Float[Array, "*batch 2"]
-    ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
+    def floor_points(self, uv: Float[Array, "*batch 2"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
         """Floor points (X, Y) seen at pixels, and their depths; not positive where a pixel sees no floor."""
         directions = self.rays(uv)
         center = self.position()

@@ -52,7 +52,8 @@ OFFSETS_M = (0.15, 0.3, 0.5, 0.7, 0.9)
 FOUND_M = 0.15
 """Off by less than this at the end, somebody was found."""
 PAPER, HALVING = PaperConfig(capacity=2), PaperConfig(capacity=2, steps_m=STEP_HALVING)
-MODERN = PeopleConfig(capacity=4)
+MODERN = PeopleConfig(capacity=4, spread_px=0.0)
+"""The silhouettes made here end at their edges, as no camera's do."""
 
 Tracking = Callable[[Runs], Estimates]
 

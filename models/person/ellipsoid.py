@@ -1,7 +1,7 @@
 """Outlines and depths of upright ellipsoids on a floor.
 
-Source: H. Kato, A. Nakazawa, S. Inokuchi, "Realtime human tracking using ellipsoid model", 1999; the outline is the dual
-form of its equation [4]. Lengths in metres, pixels (u, v), projection matrices in canonical scale (`FloorCamera`).
+Source: H. Kato, A. Nakazawa, S. Inokuchi, "Realtime human tracking using ellipsoid model", 1999; the outline is the
+dual form of its equation [4]. Lengths in metres, pixels (u, v), projection matrices in canonical scale (`FloorCamera`).
 """
 
 from dataclasses import dataclass
@@ -146,10 +146,8 @@ def outline_coefficients(P: Float[Array, "3 4"], body: Ellipsoid) -> Float[Array
     return jnp.stack([K[0, 0], K[1, 1], 2 * K[0, 1], 2 * K[0, 2], 2 * K[1, 2], K[2, 2]])
 
 
-def near_depth(
-    P: Float[Array, "3 4"], body: Ellipsoid, uv: Float[Array, "*batch 2"]
-) -> Float[Array, "*batch"]:
-    """Depth of the nearer side of the ellipsoid at pixels, metres; outside the outline, where a ray passes it nearest."""
+def near_depth(P: Float[Array, "3 4"], body: Ellipsoid, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Depth of the nearer side of the ellipsoid at pixels, metres; outside the outline, where rays pass it nearest."""
     inverse = jnp.linalg.inv(P[:, :3])
     v = (uv @ inverse[:, :2].T + inverse[:, 2]) / body.semi_axes
     away = (-inverse @ P[:, 3] - body.center) / body.semi_axes

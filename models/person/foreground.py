@@ -98,17 +98,13 @@ def presence(
     absent = jnp.ones(uv.shape[:-1])
     for part in PARTS:
         radius = part.radius * width
-        body = Ellipsoid(
-            jnp.append(xy, part.center * height), jnp.stack([radius, radius, part.half_height * height])
-        )
+        body = Ellipsoid(jnp.append(xy, part.center * height), jnp.stack([radius, radius, part.half_height * height]))
         squared = outline_radius(grown(outline(P, body), spread_px), uv)
         absent = absent * (1 - part.presence / (1 + squared**part.falloff))
     return 1 - absent
 
 
-def contrast(
-    foreground: Float[Array, "*pixels"], unexplained: Float[Array, "*pixels"]
-) -> Float[Array, "*pixels"]:
+def contrast(foreground: Float[Array, "*pixels"], unexplained: Float[Array, "*pixels"]) -> Float[Array, "*pixels"]:
     """What candidates are compared with: negative where a person would explain something, positive where not.
 
     Args:
@@ -120,9 +116,7 @@ def contrast(
     return ahead / (p + ahead)
 
 
-def log_likelihood_ratio(
-    presence: Float[Array, " samples"], contrast: Float[Array, " samples"]
-) -> Float[Array, ""]:
+def log_likelihood_ratio(presence: Float[Array, " samples"], contrast: Float[Array, " samples"]) -> Float[Array, ""]:
     """Log likelihood of a person over that of nobody, in samples; both are computed for the same window."""
     factors = 1 - presence * contrast
     padded = jnp.pad(factors, (0, -len(factors) % _BLOCK), constant_values=1.0)

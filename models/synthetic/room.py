@@ -73,7 +73,7 @@ def room_camera(key: AnyKey, pinhole: Pinhole, T_camera_world: RigidTransform, f
     floor = jnp.array([128.0, 140.0, 150.0]) + 22.0 * checks[..., None] + grain[..., None]
     wall = jnp.array([176.0, 170.0, 160.0]) + grain[..., None]
     background = jnp.where(((depth > 0) & (depth < 40))[..., None], floor, wall)
-    slope = jnp.nan_to_num(jnp.abs(jnp.gradient(jnp.where(jnp.isfinite(furniture), furniture, 0.0), axis=0)), nan=0.0)
+    slope = jnp.abs(jnp.asarray(jnp.gradient(jnp.where(jnp.isfinite(furniture), furniture, 0.0), axis=0)))
     wood = jnp.array([60.0, 95.0, 140.0]) + 40 * jnp.clip(60 * slope, 0, 1)[..., None] + grain[..., None] / 2
     empty = jnp.where((furniture < jnp.where(depth > 0, depth, jnp.inf))[..., None], wood, background)
     return RoomCamera(pinhole, T_camera_world, jnp.asarray(furniture), empty, pinhole.shape)
@@ -81,13 +81,13 @@ def room_camera(key: AnyKey, pinhole: Pinhole, T_camera_world: RigidTransform, f
 
 @jax.jit
 def room_image(
-    camera: RoomCamera, key: AnyKey, people: Walker, clothes: Float[Array, "people 2 3"], here: Bool[Array, " people"]
+    key: AnyKey, camera: RoomCamera, people: Walker, clothes: Float[Array, "people 2 3"], here: Bool[Array, " people"]
 ) -> tuple[UInt8[Array, "rows cols 3"], Int[Array, "rows cols"]]:
     """What the camera delivers, and who is seen at each pixel, -1 for nobody.
 
     Args:
-        camera: Who looks.
         key: Of the noise.
+        camera: Who looks.
         people: A batch of walkers.
         clothes: Colours of shirts and trousers, blue, green, red, 0 to 255.
         here: Who is in the room at all.

@@ -1,4 +1,4 @@
-"""People who walk: bodies of jointed ellipsoids, not the one ellipsoid that trackers look for, on routes over a floor."""
+"""People who walk on routes over a floor: bodies of jointed ellipsoids, not the one ellipsoid of the trackers."""
 
 import math
 from dataclasses import dataclass
@@ -62,28 +62,30 @@ def body(walker: Walker) -> Ellipsoids:
     hip = HIP * MODEL_HEIGHT_M * jnp.cos(legs)
     lift = hip - HIP * MODEL_HEIGHT_M
     shoulder = SHOULDER * MODEL_HEIGHT_M + lift
-    parts = [
-        ((0.0, 0.0, 1.54 + lift), (0.10, 0.085, 0.12), 0.0),
-        ((0.0, 0.0, 1.17 + lift), (0.12, 0.17, 0.31), 0.0),
-    ]
+    upright = jnp.zeros(())
+    centers = [_at(0.0, 0.0, 1.54 + lift), _at(0.0, 0.0, 1.17 + lift)]
+    radii, tilts = [(0.10, 0.085, 0.12), (0.12, 0.17, 0.31)], [upright, upright]
     for side in (-1.0, 1.0):
-        for reach, radii in ((0.24, (0.085, 0.085, 0.26)), (0.66, (0.07, 0.065, 0.24))):
-            parts.append((_hanging(0.08 * side, hip, reach, side * legs), radii, side * legs))
-        arm = -side * arms
-        parts.append((_hanging(0.17 * side, shoulder, 0.30, arm), (0.06, 0.045, 0.34), arm))
+        leg, arm = side * legs, -side * arms
+        centers += [_hanging(0.08 * side, hip, reach, leg) for reach in (0.24, 0.66)]
+        centers.append(_hanging(0.17 * side, shoulder, 0.30, arm))
+        radii += [(0.085, 0.085, 0.26), (0.07, 0.065, 0.24), (0.06, 0.045, 0.34)]
+        tilts += [leg, leg, arm]
     size = jnp.stack([walker.width / MODEL_WIDTH_M, walker.width / MODEL_WIDTH_M, walker.height / MODEL_HEIGHT_M])
-    center = jnp.stack([jnp.stack([jnp.asarray(c, float) for c in at]) for at, _, _ in parts]) * size
-    radii = jnp.array([radius for _, radius, _ in parts]) * size
-    tilt = jnp.stack([jnp.asarray(angle, float) for _, _, angle in parts])
+    center = jnp.stack(centers) * size
     cos, sin = jnp.cos(walker.heading), jnp.sin(walker.heading)
     turn = jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
     center = jnp.concatenate([center[:, :2] @ turn.T + walker.xy, center[:, 2:]], axis=1)
-    return Ellipsoids(center, _quaternions(walker.heading, tilt), radii)
+    return Ellipsoids(center, _quaternions(walker.heading, jnp.stack(tilts)), jnp.array(radii) * size)
 
 
 def _hanging(aside, joint, reach, angle):
     """Centre of a limb that hangs from a joint, swung forward by an angle."""
-    return (reach * jnp.sin(angle), aside, joint - reach * jnp.cos(angle))
+    return _at(reach * jnp.sin(angle), aside, joint - reach * jnp.cos(angle))
+
+
+def _at(*coordinates):
+    return jnp.stack([jnp.asarray(coordinate, float) for coordinate in coordinates])
 
 
 def _quaternions(heading, tilt):

@@ -31,7 +31,12 @@ SPEEDS_M_PER_S = (1.25, 1.1, 1.35, 0.95)
 STARTS_S = (0.0, 1.5, 4.0, 2.5)
 SIZES_M = ((1.78, 0.46), (1.66, 0.42), (1.85, 0.48), (1.60, 0.40))
 """Heights and widths."""
-CLOTHES = (((60, 60, 170), (70, 50, 40)), ((150, 90, 50), (40, 40, 45)), ((70, 140, 70), (90, 110, 130)), ((200, 200, 205), (120, 60, 30)))
+CLOTHES = (
+    ((60, 60, 170), (70, 50, 40)),
+    ((150, 90, 50), (40, 40, 45)),
+    ((70, 140, 70), (90, 110, 130)),
+    ((200, 200, 205), (120, 60, 30)),
+)
 """Shirts and trousers: blue, green, red."""
 WAYPOINTS = (
     ((-4.5, 1.2), (0.6, 1.2), (2.6, 4.9), (-2.2, 4.6), (-2.4, 0.4), (4.5, 0.4)),
@@ -66,7 +71,7 @@ class DemoRoom:
         )
         key = jax.random.fold_in(jax.random.key(self.seed), index * len(PLACES) + camera)
         clothes = jnp.asarray(CLOTHES[: self.routes.xy.shape[1]], jnp.float32)
-        return np.asarray(room_image(self.rooms[camera], key, people, clothes, self.present(index))[0])
+        return np.asarray(room_image(key, self.rooms[camera], people, clothes, self.present(index))[0])
 
     def present(self, index: int) -> np.ndarray:
         """(people,) who is on the floor."""
@@ -85,15 +90,22 @@ def demo_room(seed: int, *, cameras: int = 1, frames: int = 240, fps: float = 10
     rng = np.random.default_rng(seed)
     speeds = [speed * rng.uniform(0.92, 1.08) for speed in SPEEDS_M_PER_S]
     routes = along_routes([np.array(path) for path in WAYPOINTS], speeds, list(STARTS_S), frames, fps)
-    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in BOXES]
-    mesh = trimesh.util.concatenate(boxes)
+    vertices, faces = _furniture()
     pinhole = Pinhole.from_intrinsics(FOCAL_PX, ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), SHAPE)
     transforms = [looking(*place) for place in PLACES[:cameras]]
     views = tuple(floor_camera(pinhole, transform) for transform in transforms)
-    furniture = tuple(mesh_depth(view, np.asarray(mesh.vertices), np.asarray(mesh.faces)) for view in views)
+    furniture = tuple(mesh_depth(view, vertices, faces) for view in views)
     keys = jax.random.split(jax.random.key(seed), cameras)
     rooms = tuple(
         room_camera(key, pinhole, transform, depth)
         for key, transform, depth in zip(keys, transforms, furniture, strict=True)
     )
     return DemoRoom(views, FLOOR_M, furniture, routes, fps, rooms, seed)
+
+
+def _furniture() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) in metres and triangles (m, 3) of all boxes."""
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in BOXES]
+    first = np.cumsum([0, *[len(box.vertices) for box in boxes[:-1]]])
+    vertices = np.concatenate([np.asarray(box.vertices) for box in boxes])
+    return vertices, np.concatenate([np.asarray(box.faces) + i for box, i in zip(boxes, first, strict=True)])

@@ -9,9 +9,8 @@ import numpy as np
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.kalman import joseph
-from jaxfilters.trackers.people.fit import line_of_sight
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, PeopleScene, Report
+from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, Report
 
 HIDDEN_SHARE = 0.2
 """Somebody of whose silhouette less is seen is `hidden`."""
@@ -76,9 +75,17 @@ def _sighting(frame, time_s, slot, people, report) -> Sighting:
     )
 
 
-def spreads(scene: PeopleScene, seen: Sighting) -> tuple[float, float]:
-    """Standard deviations along and across the line of sight of the nearest camera, metres."""
-    axes = np.asarray(line_of_sight(scene, jnp.asarray(seen.mean[:2], jnp.float32)))
+def spreads(centers: np.ndarray, seen: Sighting) -> tuple[float, float]:
+    """Standard deviations along and across the line of sight of the nearest camera, metres.
+
+    Args:
+        centers: (cameras, 2) where the cameras are above the floor, metres.
+        seen: Of whom.
+    """
+    away = seen.mean[:2] - centers[np.argmin(np.sum((seen.mean[:2] - centers) ** 2, axis=1))]
+    distance = np.linalg.norm(away)
+    x, y = away / distance if distance > 0.1 else np.array([0.0, 1.0])
+    axes = np.array([[x, y], [y, -x]])
     radial, lateral = np.einsum("ai,ij,aj->a", axes, seen.covariance[:2, :2], axes)
     return float(np.sqrt(max(radial, 0.0))), float(np.sqrt(max(lateral, 0.0)))
 

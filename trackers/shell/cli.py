@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.devices import use_all_cores
+from jaxfilters.trackers.shell.people_options import add_people
 
 FAILURE, INTERRUPTED = 2, 130
 """Exit codes: wrong input or a full disk; Ctrl-C."""
@@ -33,6 +34,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             from jaxfilters.trackers.shell.calibrate_command import calibrate
 
             print(calibrate(options))
+        elif getattr(options, "what", None) == "people":
+            from jaxfilters.trackers.shell.people_command import track_people
+
+            track_people(options)
         else:
             track(_job(options), options)
     except (InputError, OutputError, CheckpointError) as error:
@@ -83,6 +88,8 @@ def _parser() -> argparse.ArgumentParser:
         "landmarks",
     )
     _add_articulated_options(articulated)
+
+    add_people(what, _seed)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.person import ellipsoid
 from jaxfilters.models.floor_camera import FloorCamera, canonical
+from jaxfilters.models.person import ellipsoid
 from jaxfilters.models.person.ellipsoid import (
     BEHIND,
     CROSSING,

@@ -12,7 +12,11 @@ from jaxfilters.models.person.ellipsoid import pixel_grid
 from jaxfilters.models.person.scene import mesh_depth, patch_depth, patch_floor_distance, upright_depth, walkable
 
 SHAPE = (30, 40)
-BOXES = (((-0.6, 1.0, 0.365), (1.2, 0.6, 0.73)), ((-1.8, 2.0, 0.5), (0.5, 0.5, 1.0)), ((-1.0, 0.4, 0.2), (0.3, 0.3, 0.4)))
+BOXES = (
+    ((-0.6, 1.0, 0.365), (1.2, 0.6, 0.73)),
+    ((-1.8, 2.0, 0.5), (0.5, 0.5, 1.0)),
+    ((-1.0, 0.4, 0.2), (0.3, 0.3, 0.4)),
+)
 """Centres and sizes, metres."""
 
 

@@ -321,7 +321,7 @@ def test_bad_scenes_people_and_masks_are_named(scene):
     for xy in ((np.nan, 0.0), (1.0, 2.0, 3.0)):
         with pytest.raises(ValueError, match="xy must be two finite numbers"):
             with_person(state, xy)
-    with pytest.raises(ValueError, match="height_m and width_m must be positive; got 0.0"):
+    with pytest.raises(ValueError, match=r"height_m and width_m must be positive; got 0\.0"):
         with_person(state, (0, 0), height_m=0.0)
     with pytest.raises(ValueError, match="all 3 slots are taken"):
         state_of(scene, *[(0, 1)] * 4)

@@ -1,0 +1,98 @@
+"""The recording PETS 2009 S2.L1 View_001: camera, furniture, floor and images."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.person.scene import upright_depth
+from jaxfilters.trackers.background import Background
+from jaxfilters.trackers.people.state import PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.tracker import people_scene
+from jaxfilters.trackers.undistortion import Undistortion
+
+SHAPE = (360, 480)
+BEYOND_M = 3.0
+"""How far people are followed beyond the evaluation area: most come from there."""
+TRIPOD_LINE_PX = 3
+
+
+class Pets(NamedTuple):
+    """What is known of the place."""
+
+    folder: Path
+    camera: FloorCamera
+    undistortion: Undistortion
+    scene: PeopleScene
+    area: np.ndarray
+    """(2, 2) metres: least and greatest X, Y of the evaluation area."""
+
+    def is_inside(self, xy: np.ndarray) -> np.ndarray:
+        """(n,) which places (n, 2) lie in the evaluation area."""
+        return np.all((xy >= self.area[0]) & (xy <= self.area[1]), axis=-1)
+
+
+def load_pets(folder: Path, config: PeopleConfig) -> Pets:
+    """The recording in a folder.
+
+    Raises:
+        RecordingError: if its calibration cannot be read.
+    """
+    try:
+        calibration = json.loads((folder / "calibration.json").read_text())
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{folder / 'calibration.json'} cannot be read: {error}") from error
+    camera = FloorCamera.from_matrix(calibration["P_480x360"], SHAPE)
+    K, distortion = np.array(calibration["K_480x360"]), np.array(calibration["opencv_distCoeffs"])
+    limits = calibration["evaluation_area"]
+    area = np.array([[limits[f"{axis}{end}"] for axis in "xy"] for end in ("min", "max")])
+    (left, near), (right, far) = area[0] - BEYOND_M, area[1] + BEYOND_M
+    floor = [(left, near), (right, near), (right, far), (left, far)]
+    depth = furniture(camera, calibration["occluders_undistorted_480x360"])
+    scene = people_scene([camera], floor, furniture=[depth], config=config)
+    return Pets(folder, camera, Undistortion(SHAPE, K, distortion), scene, area)
+
+
+def furniture(camera: FloorCamera, outlines: dict[str, Any]) -> np.ndarray:
+    """Depth image (rows, cols) in metres of the lamp post with its sign and of the tripod, as thin upright things."""
+    post, tripod = np.zeros(camera.shape, np.uint8), np.zeros(camera.shape, np.uint8)
+    cv2.line(post, *outlines["pole_line"], 255, outlines["pole_width_px"])
+    cv2.rectangle(post, *outlines["sign_rect"], 255, cv2.FILLED)
+    for line in outlines["tripod_lines"]:
+        cv2.line(tripod, *line, 255, TRIPOD_LINE_PX)
+    depths = [
+        np.where(mask > 0, np.asarray(upright_depth(camera, jnp.array(outlines[name], float))), np.inf)
+        for mask, name in ((post, "pole_ground_xy"), (tripod, "tripod_ground_xy"))
+    ]
+    return np.minimum(*depths).astype(np.float32)
+
+
+def images(pets: Pets) -> Iterator[np.ndarray]:
+    """Straightened images (rows, cols, 3) uint8 of the video, one after the other.
+
+    Raises:
+        RecordingError: if the video does not open.
+    """
+    path = pets.folder / "vtest_480x360.avi"
+    video = cv2.VideoCapture(str(path))
+    try:
+        if not video.isOpened():
+            raise RecordingError(f"{path} cannot be opened as a video.")
+        while True:
+            there, image = video.read()
+            if not there:
+                return
+            yield pets.undistortion.apply(image)
+    finally:
+        video.release()
+
+
+def probability(subtraction: Background, image: np.ndarray) -> np.ndarray:
+    """(rows, cols) uint8: probability of foreground times 255."""
+    return cv2.convertScaleAbs(subtraction.apply(image), alpha=255.0)

@@ -1,0 +1,207 @@
+"""Where images come from: video files, folders of images, and live cameras; several of them on one clock."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+
+from jaxfilters.trackers.recording import InputError
+
+_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
+DEFAULT_FPS = 30.0
+PRIMING_IMAGES = 40
+"""Images from which the empty room is learnt before a recording is followed."""
+SILENT_S = 2.0
+"""A live camera that delivers nothing for so long has stopped."""
+
+
+@runtime_checkable
+class VideoSource(Protocol):
+    """One camera's images in their order."""
+
+    name: str
+    image_size: tuple[int, int]
+    """Columns and rows."""
+    fps: float
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        """Up to `most` images spread over the recording; none of a live camera."""
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        """Seconds from the start and the image (rows, cols, 3); None where a live camera has nothing new."""
+
+    def trouble(self) -> str | None:
+        """What went wrong while it was read, for a person; None if nothing did."""
+
+
+def open_video(place: str, *, fps: float | None = None) -> VideoSource:
+    """A video file, a folder of images, or the number of a live camera.
+
+    Args:
+        place: A path, or a number such as 0.
+        fps: Frames per second of a recording, in place of what it says of itself.
+
+    Raises:
+        InputError: nothing there, or nothing that OpenCV can read.
+    """
+    if place.isdecimal():
+        return LiveCamera(int(place))
+    path = Path(place)
+    if path.is_dir():
+        return ImageFolder(path, fps or DEFAULT_FPS)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; a live camera is given by its number, as in 0.")
+    return VideoFile(path, fps)
+
+
+class VideoFile:
+    """A video that OpenCV can decode."""
+
+    def __init__(self, path: Path, fps: float | None = None):
+        self.name, self._path = str(path), path
+        capture = self._open()
+        self.image_size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        self.fps = fps or float(capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self.frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        capture.release()
+        self._trouble: str | None = None
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened() or not capture.get(cv2.CAP_PROP_FRAME_WIDTH):
+            raise InputError(f"{self.name}: not a video that can be decoded (damaged, empty, or an unknown codec).")
+        return capture
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        """Every n-th image; decoded in order, since seeking is not exact in all containers."""
+        every = max(1, self.frames // most)
+        return [image for i, (_, image) in enumerate(self.images()) if i % every == 0 and image is not None][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        capture, done = self._open(), 0
+        try:
+            while True:
+                there, image = capture.read()
+                if not there:
+                    break
+                yield done / self.fps, image
+                done += 1
+        finally:
+            capture.release()
+        if done == 0:
+            raise InputError(f"{self.name}: no frame can be decoded.")
+        if self.frames > 0 and done < self.frames:
+            self._trouble = f"{self.name}: ends after {done} of {self.frames} frames (cut off or damaged)"
+
+    def trouble(self) -> str | None:
+        return self._trouble
+
+
+class ImageFolder:
+    """Images of one size in a folder, in the order of their names."""
+
+    def __init__(self, path: Path, fps: float):
+        self.name, self.fps = str(path), fps
+        self._files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES)
+        if not self._files:
+            raise InputError(f"{path}: no images in it ({', '.join(sorted(_IMAGES))}).")
+        rows, cols = self._read(self._files[0]).shape[:2]
+        self.image_size = (cols, rows)
+
+    def _read(self, file: Path) -> np.ndarray:
+        encoded = np.fromfile(file, np.uint8)
+        image = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
+        if image is None:
+            raise InputError(f"{file}: not an image that can be decoded.")
+        return image
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        return [self._read(file) for file in self._files[:: max(1, len(self._files) // most)]][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        for i, file in enumerate(self._files):
+            image = self._read(file)
+            if image.shape[1::-1] != self.image_size:
+                raise InputError(f"{file}: {image.shape[1]}x{image.shape[0]} pixels; the first has {self.image_size}.")
+            yield i / self.fps, image
+
+    def trouble(self) -> str | None:
+        return None
+
+
+class LiveCamera:
+    """A camera of this machine, read in a thread of its own: the newest image counts, what was missed is missed."""
+
+    def __init__(self, number: int):
+        self.name = f"camera {number}"
+        self._capture = cv2.VideoCapture(number)
+        there, image = self._capture.read()
+        if not there:
+            self._capture.release()
+            raise InputError(f"{self.name}: cannot be opened, or delivers no image.")
+        self.image_size = (image.shape[1], image.shape[0])
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self._newest: np.ndarray | None = None
+        self._trouble: str | None = None
+        self._lock, self._arrived = threading.Lock(), threading.Event()
+
+    def sample(self, most: int) -> list[np.ndarray]:  # noqa: ARG002
+        return []
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        threading.Thread(target=self._follow, daemon=True).start()
+        began = heard = time.monotonic()
+        while True:
+            self._arrived.wait(1 / self.fps)
+            with self._lock:
+                image, self._newest = self._newest, None
+                self._arrived.clear()
+            now = time.monotonic()
+            heard = now if image is not None else heard
+            if now - heard > SILENT_S and self._trouble is None:
+                self._trouble = f"{self.name}: no image since {heard - began:.0f} s after the start"
+            yield now - began, image
+
+    def _follow(self) -> None:
+        while True:
+            there, image = self._capture.read()
+            if not there:
+                time.sleep(0.05)
+                continue
+            with self._lock:
+                self._newest = image
+            self._arrived.set()
+
+    def trouble(self) -> str | None:
+        return self._trouble
+
+
+class Moment(NamedTuple):
+    """What all sources have at one time."""
+
+    time_s: float
+    images: tuple[np.ndarray | None, ...]
+    """None where a source has nothing new."""
+
+
+def together(sources: list[VideoSource]) -> Iterator[Moment]:
+    """The images of several sources on the clock of the fastest; a slower one has nothing new in between.
+
+    Ends when the last recording ends; one that ends earlier has nothing new from then on.
+    """
+    streams = [source.images() for source in sources]
+    waiting = [next(stream, None) for stream in streams]
+    half = 0.5 / max(source.fps for source in sources)
+    while any(item is not None for item in waiting):
+        now = min(item[0] for item in waiting if item is not None)
+        images: list[np.ndarray | None] = []
+        for i, item in enumerate(waiting):
+            due = item is not None and item[0] <= now + half
+            images.append(item[1] if due and item is not None else None)
+            if due:
+                waiting[i] = next(streams[i], None)
+        yield Moment(now, tuple(images))
