@@ -5,7 +5,6 @@ from pathlib import Path
 import jax
 import pytest
 
-
 MANY_MAPPINGS = 20_000
 """Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several."""
 

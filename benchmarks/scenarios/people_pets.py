@@ -3,9 +3,9 @@
 Needs the folder `pets09_s2l1_view001` of JAXFILTERS_DATA. The whole video is decoded, straightened, told from its
 background (median of every 20th frame) and tracked with the constants that everything else has; scores are on the
 frames from the first to the last of the file of truth, `gt_0_399.csv` or what `--truth` names (columns `frame`, `id`,
-`x_m`, `y_m` and, if there is one, `in_area`). Names without a suffix are of the tracks that a recording leaves, smoothed
-and from before their confirmation; `_filtered` is what was known of the confirmed at every frame. A folder given with
-`--out` receives `tracks.csv` and `floor_plan.png`.
+`x_m`, `y_m` and, if there is one, `in_area`). Names without a suffix are of the tracks that remain of a recording,
+smoothed and from before their confirmation; `_filtered` is what was known of the confirmed at every frame. A folder
+given with `--out` receives `tracks.csv` and `floor_plan.png`.
 """
 
 import csv
@@ -31,20 +31,9 @@ FRAMES_PER_SECOND = 7.0
 """Of the camera; the file says 10."""
 PRIME_EVERY = 20
 QUICK_FRAMES = 40
-UNITS = {
-    "mota": ("%", "higher"),
-    "idf1": ("%", "higher"),
-    "mean_error_m": ("m", "lower"),
-    "id_switches": ("", "lower"),
-    "false_positives": ("", "lower"),
-    "misses": ("", "lower"),
-    "fragmentations": ("", "lower"),
-    "radial_error_m": ("m", "lower"),
-    "lateral_error_m": ("m", "lower"),
-    "radial_bias_m": ("m", "lower"),
-    "lateral_bias_m": ("m", "lower"),
-}
-"""Of scores; biases are best at zero."""
+IN_METRES = ("mean_error_m", "radial_error_m", "lateral_error_m", "radial_bias_m", "lateral_bias_m")
+"""Biases are best at zero."""
+COUNTED = ("id_switches", "false_positives", "misses", "fragmentations")
 
 
 class Followed(NamedTuple):
@@ -151,8 +140,10 @@ def within(rows: list[tuple[int, int, float, float]], pets: Pets, frames: tuple[
 
 def score_metrics(scores: MultiObjectScores, suffix: str) -> dict[str, Metric]:
     """By name."""
-    values = scores._asdict()
-    return {f"{name}{suffix}": Metric(float(values[name]), unit, better) for name, (unit, better) in UNITS.items()}  # type: ignore[arg-type]
+    values = {name: float(value) for name, value in scores._asdict().items()}
+    metrics = {f"{name}{suffix}": Metric(values[name], "%", "higher") for name in ("mota", "idf1")}
+    metrics |= {f"{name}{suffix}": Metric(values[name], "m", "lower") for name in IN_METRES}
+    return metrics | {f"{name}{suffix}": Metric(values[name], "", "lower") for name in COUNTED}
 
 
 def write_tracks(path: Path, tracks: dict[int, list[Sighting]]) -> None:

@@ -30,10 +30,10 @@ class Ellipsoid:
 
 
 def standing(
-    xy: Float[Array, "*batch 2"], height: Float[Array, "*#batch"], width: Float[Array, "*#batch"]
+    xy: Float[Array, "*batch 2"], height: Float[ArrayLike, "*#batch"], width: Float[ArrayLike, "*#batch"]
 ) -> Ellipsoid:
     """A person at a floor point as an ellipsoid that stands on the floor ([2]); all in metres."""
-    height, width = (jnp.broadcast_to(size, xy.shape[:-1]) for size in (height, width))
+    height, width = (jnp.broadcast_to(jnp.asarray(size), xy.shape[:-1]) for size in (height, width))
     return Ellipsoid(
         jnp.concatenate([xy, height[..., None] / 2], axis=-1), jnp.stack([width, width, height], axis=-1) / 2
     )
@@ -102,7 +102,7 @@ def outline_radius(seen: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, 
 def grown(seen: Outline, pixels: Float[ArrayLike, ""]) -> Outline:
     """An outline that reaches farther by some pixels to the left and right, above and below."""
     reach = jnp.sqrt(jnp.diagonal(seen.shape))
-    scale = 1 + pixels / reach
+    scale = 1 + jnp.asarray(pixels) / reach
     return seen._replace(shape=seen.shape * jnp.outer(scale, scale))
 
 

@@ -51,8 +51,8 @@ class Window(NamedTuple):
 
     uv: Float[Array, "samples 2"]
     """Centres of pixels; some lie outside the image."""
-    index: Integer[Array, " samples"]
-    """Of the pixel in the flattened image; of some pixel where it lies outside."""
+    pixel: Integer[Array, " samples"]
+    """Number of the pixel in the flattened image; of some pixel where it lies outside."""
     inside: Float[Array, " samples"]
     """1 inside the image, 0 outside."""
     area: Float[Array, ""]

@@ -27,11 +27,9 @@ def appearances(
     return histograms, good
 
 
-def dissimilarity(a: Float[Array, "*batch 48"], b: Float[Array, "*batch 48"]) -> Float[Array, "*batch"]:
+def dissimilarity(a: Float[Array, "*#batch 48"], b: Float[Array, "*#batch 48"]) -> Float[Array, "*_"]:
     """Mean Hellinger distance of the six histograms, from 0 to 1."""
-    shape = (*jnp.broadcast_shapes(a.shape, b.shape)[:-1], APPEARANCE // BINS, BINS)
-    common = jnp.sum(jnp.sqrt(jnp.broadcast_to(a, shape[:-2] + (APPEARANCE,)).reshape(shape) * jnp.broadcast_to(
-        b, shape[:-2] + (APPEARANCE,)).reshape(shape)), axis=-1)
+    common = jnp.sum(jnp.sqrt(a * b).reshape(*jnp.broadcast_shapes(a.shape, b.shape)[:-1], -1, BINS), axis=-1)
     return jnp.mean(jnp.sqrt(jnp.maximum(1 - common, 0.0)), axis=-1)
 
 
@@ -49,12 +47,18 @@ def _in_camera(scene, camera, furniture, frame, places, active):
             return presence_of(scene.config, camera, place, window.uv) * (other.depth < seen.depth)
 
         ahead = jax.vmap(covers)(places, outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
-        free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.index])
-        weight = presence_of(scene.config, camera, places[k], window.uv) * free * window.inside * shown * (mask[window.index] / 255)
+        free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.pixel])
+        weight = (
+            presence_of(scene.config, camera, places[k], window.uv)
+            * free
+            * window.inside
+            * shown
+            * (mask[window.pixel] / 255)
+        )
         upper = window.uv[:, 1] < seen.center[1]
         halves = jnp.stack([weight * upper, weight * ~upper])
         # Equal steps of the square root: clothes are mostly dark.
-        bins = jax.nn.one_hot((BINS * jnp.sqrt(image[window.index] / 256)).astype(jnp.int32), BINS)
+        bins = jax.nn.one_hot((BINS * jnp.sqrt(image[window.pixel] / 256)).astype(jnp.int32), BINS)
         counts = jnp.einsum("hs,scb->hcb", halves, bins)
         sizes = jnp.sum(halves, axis=1)
         histogram = counts / jnp.maximum(sizes, 1e-6)[:, None, None]

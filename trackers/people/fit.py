@@ -249,8 +249,8 @@ def _view(config: PeopleConfig, camera: FloorCamera, furniture, frame: CameraFra
     shown = frame.present & jnp.all(seen.code == VISIBLE)
     box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
     window = foreground.window(box, camera.shape, config.grid)
-    probability = jnp.asarray(frame.foreground).ravel()[window.index].astype(float) / 255
-    depth = furniture.ravel()[window.index]
+    probability = jnp.asarray(frame.foreground).ravel()[window.pixel].astype(float) / 255
+    depth = furniture.ravel()[window.pixel]
     body = body_of(place)
     visible = window.inside * shown * (near_depth(camera.P, body, window.uv) < depth)
     return View(window, probability, depth, visible, _area(outline(camera.P, body)))
@@ -265,7 +265,9 @@ def _unexplained(scene, camera, places, others: Bool[Array, " slots"], view: Vie
     """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
 
     def one(place):
-        return presence_of(scene.config, camera, place, view.window.uv) * (outline(camera.P, body_of(place)).depth < view.depth)
+        return presence_of(scene.config, camera, place, view.window.uv) * (
+            outline(camera.P, body_of(place)).depth < view.depth
+        )
 
     hidden = jax.vmap(one)(places) * others[:, None]
     return (1 - foreground.CLUTTER) * jnp.prod(1 - hidden, axis=0)

@@ -65,7 +65,9 @@ def judged(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], l
 
 def seniority(people: People) -> Float[Array, " slots"]:
     """Higher for who is the less likely to be a mistake: the tracked by identity, then the tentative by log odds."""
-    return jnp.where(people.mode == TRACKED, 1e4 - people.identity, people.log_odds - 1e-3 * jnp.arange(len(people.mode)))
+    return jnp.where(
+        people.mode == TRACKED, 1e4 - people.identity, people.log_odds - 1e-3 * jnp.arange(len(people.mode))
+    )
 
 
 def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[Array, " slots"]) -> People:
@@ -78,7 +80,7 @@ def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[
 
 
 def named(people: People) -> People:
-    """Identities for those who were confirmed: that of somebody who left, where place and clothes agree, or a new one."""
+    """Identities for the confirmed: that of somebody who left, where place and clothes agree, or a new one."""
 
     def one(k, people):
         reach = 1.0 + WALKING_M_PER_S * people.unseen_s
@@ -106,7 +108,9 @@ def admitted(config: PeopleConfig, people: People, found: Newcomer) -> People:
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
     n = len(free)
     mean = jnp.concatenate([found.xy, jnp.zeros(2), jnp.array([config.height_m, config.width_m])])
-    sd = jnp.array([NEWCOMER_SD_M, NEWCOMER_SD_M, config.speed_sd, config.speed_sd, config.height_sd_m, config.width_sd_m])
+    sd = jnp.array(
+        [NEWCOMER_SD_M, NEWCOMER_SD_M, config.speed_sd, config.speed_sd, config.height_sd_m, config.width_sd_m]
+    )
     fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(jnp.diag(sd**2), (n, STATE, STATE)))
     return people._replace(
         belief=chosen(slot, fresh, people.belief),
@@ -116,4 +120,3 @@ def admitted(config: PeopleConfig, people: People, found: Newcomer) -> People:
         unseen_s=jnp.where(slot, 0.0, people.unseen_s),
         appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
     )
-

@@ -10,8 +10,10 @@ HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
 
 
 def motion(config: PeopleConfig, dt: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
-    """Transition matrix and noise covariance of `dt` seconds (Y. Bar-Shalom, X. Li, "Estimation with applications to
-    tracking and navigation", 2001, section 6.2.2)."""
+    """Transition matrix and noise covariance of `dt` seconds.
+
+    Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section 6.2.2.
+    """
     F = jnp.eye(STATE).at[0, 2].set(dt).at[1, 3].set(dt)
     block = config.acceleration_sd**2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     Q = jnp.zeros((STATE, STATE))

@@ -42,8 +42,8 @@ def cells_of(
     """
     low, high = floor.min(axis=0), floor.max(axis=0)
     axes = [np.arange(a + config.cell_m / 2, b, config.cell_m) for a, b in zip(low, high, strict=True)]
-    xy = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
-    xy = jnp.asarray(xy[np.asarray(walkable(jnp.asarray(floor), jnp.asarray(xy)))], jnp.float32)
+    points = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
+    xy = jnp.asarray(points[np.asarray(walkable(jnp.asarray(floor), jnp.asarray(points)))], jnp.float32)
     offsets = _offsets()
     looks = [_look(camera, depth, config, xy, offsets) for camera, depth in zip(cameras, furniture, strict=True)]
     kept = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE if len(xy) else np.zeros(0, bool)
@@ -51,7 +51,7 @@ def cells_of(
         raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
     return Cells(
         xy[kept],
-        tuple(look.index[kept] for look in looks),
+        tuple(look.pixels[kept] for look in looks),
         tuple(look.presence[kept] for look in looks),
         tuple(look.share[kept] for look in looks),
     )
@@ -70,7 +70,7 @@ def stride(shape: tuple[int, int]) -> int:
 class _Look(NamedTuple):
     """One camera's part of `Cells`."""
 
-    index: Int32[Array, "cells samples"]
+    pixels: Int32[Array, "cells samples"]
     presence: Float[Array, "cells samples"]
     share: Float[Array, " cells"]
 
@@ -105,7 +105,7 @@ def newcomer(
     config, cells = scene.config, scene.cells
     total, shares = jnp.zeros(len(cells.xy)), jnp.zeros(len(cells.xy))
     for camera, depth, frame, index, weight, share in zip(
-        scene.cameras, scene.furniture, frames, cells.index, cells.presence, cells.share, strict=True
+        scene.cameras, scene.furniture, frames, cells.pixels, cells.presence, cells.share, strict=True
     ):
         b = jnp.append(_reduced_contrast(scene, camera, depth, places, active, frame).ravel(), 0.0)
         ratio = jax.vmap(log_likelihood_ratio)(weight, b[index])

@@ -112,11 +112,11 @@ def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:
     # One compilation for each power of two.
     padding = (1 << (length - 1).bit_length()) - length
     beliefs = Gaussian(
-        jnp.asarray(np.stack([seen.mean for seen in piece] + [piece[-1].mean] * padding), jnp.float32),
-        jnp.asarray(np.stack([seen.covariance for seen in piece] + [piece[-1].covariance] * padding), jnp.float32),
+        jnp.asarray(np.stack([seen.mean for seen in piece] + [piece[-1].mean] * padding), float),
+        jnp.asarray(np.stack([seen.covariance for seen in piece] + [piece[-1].covariance] * padding), float),
     )
     steps = np.diff([seen.time_s for seen in piece], append=piece[-1].time_s)
-    found = _backward(config, beliefs, jnp.asarray(np.append(steps, np.zeros(padding)), jnp.float32), length)
+    found = _backward(config, beliefs, jnp.asarray(np.append(steps, np.zeros(padding)), float), length)
     mean, covariance = np.asarray(found.mean, np.float64), np.asarray(found.covariance, np.float64)
     return [seen._replace(mean=mean[i], covariance=covariance[i]) for i, seen in enumerate(piece)]
 

@@ -67,7 +67,9 @@ class PeopleConfig:
     """How long somebody who is hidden is believed to be there."""
 
     def __post_init__(self) -> None:
-        for name in [entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity", "spread_px")]:
+        for name in [
+            entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity", "spread_px")
+        ]:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and 0 < value < np.inf):
                 raise ValueError(f"{name} must be positive; got {value!r}.")
@@ -100,7 +102,7 @@ class Cells(NamedTuple):
 
     xy: Float[Array, "cells 2"]
     """Metres."""
-    index: tuple[Int32[Array, "cells samples"], ...]
+    pixels: tuple[Int32[Array, "cells samples"], ...]
     """Into the reduced image of each camera, flattened; the last entry stands for pixels outside."""
     presence: tuple[Float[Array, "cells samples"], ...]
     """Of a person at the samples."""
@@ -115,7 +117,7 @@ class CameraFrame(NamedTuple):
     """Probability of foreground times 255, as bytes."""
     image: UInt8[Array | np.ndarray, "rows cols 3"]
     """Blue, green, red."""
-    present: Bool[Array | np.ndarray, ""] | bool
+    present: Bool[Array | np.ndarray, ""] | bool | np.bool_
     """False where the camera has nothing new; the images are then not looked at."""
 
 

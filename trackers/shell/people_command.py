@@ -97,8 +97,7 @@ def _place(options: argparse.Namespace) -> Place:
         )
     sources = [open_video(source, fps=options.fps) for source in options.sources]
     files = [
-        open_camera(path, image_size=source.image_size)
-        for path, source in zip(options.camera, sources, strict=True)
+        open_camera(path, image_size=source.image_size) for path, source in zip(options.camera, sources, strict=True)
     ]
     described = open_scene(options.scene)
     cameras = [file.camera for file in files]
@@ -148,7 +147,9 @@ def _follow(place: Place, options: argparse.Namespace, table: TrackTableWriter) 
                 shown = jax.tree.map(np.asarray, outlines(place.scene, people))
                 known, said = (jax.tree.map(np.asarray, tree) for tree in (people, report))
                 previous = moment.time_s
-                keep = [_occupied(outline, known, image.shape[:2]) for outline, image in zip(shown, images, strict=True)]
+                keep = [
+                    _occupied(outline, known, image.shape[:2]) for outline, image in zip(shown, images, strict=True)
+                ]
                 table.append(recorder.add(index, moment.time_s, known, said))
                 if options.video:
                     video = _draw(video, options.out, place, images, shown, known, moment.time_s)

@@ -23,7 +23,7 @@ _TALLEST_PX = 720
 def color_of(identity: int) -> tuple[int, int, int]:
     """Blue, green, red: neighbours in number are far apart in hue."""
     hue = int(180 * (identity * 0.618034 % 1))
-    b, g, r = cv2.cvtColor(np.uint8([[[hue, 200, 235]]]), cv2.COLOR_HSV2BGR)[0, 0]
+    b, g, r = cv2.cvtColor(np.array([[[hue, 200, 235]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
     return int(b), int(g), int(r)
 
 
@@ -38,11 +38,11 @@ def drawn(image: np.ndarray, outlines: Outline, people: People) -> np.ndarray:
 
 def _draw_one(image, center, shape, color, identity):
     values, vectors = np.linalg.eigh(shape)
-    axes = tuple(int(round(axis)) for axis in np.sqrt(np.maximum(values, 0.0)))
+    axes = tuple(round(float(axis)) for axis in np.sqrt(np.maximum(values, 0.0)))
     if max(axes) > 4 * max(image.shape[:2]):
         return
     angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    place = (int(round(float(center[0]))), int(round(float(center[1]))))
+    place = (round(float(center[0])), round(float(center[1])))
     cv2.ellipse(image, place, axes, angle, 0, 360, color, 2, cv2.LINE_AA)
     if identity >= 0:
         top = (place[0] - 8, max(12, place[1] - int(np.sqrt(shape[1, 1])) - 6))
@@ -88,7 +88,9 @@ def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]
     for number, center in enumerate(centers):
         at = tuple(int(v) for v in pixels(center)[0])
         cv2.drawMarker(plan, at, _INK, cv2.MARKER_TRIANGLE_UP, 16, 2, cv2.LINE_AA)
-        cv2.putText(plan, f"camera {number}", (at[0] + 10, at[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)
+        cv2.putText(
+            plan, f"camera {number}", (at[0] + 10, at[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
+        )
     for identity, track in tracks.items():
         way = pixels(np.stack([seen.mean[:2] for seen in sorted(track, key=lambda seen: seen.frame)]))
         cv2.polylines(plan, [way], False, color_of(identity), 2, cv2.LINE_AA)

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any, TextIO
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
@@ -83,7 +84,7 @@ def write_mot(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]],
     """
     lines = []
     for identity, seen in by_frame(tracks):
-        shown = outline(scene.cameras[camera].P, body_of(place_of(np.asarray(seen.mean, np.float32))))
+        shown = outline(scene.cameras[camera].P, body_of(place_of(jnp.asarray(seen.mean, jnp.float32))))
         if int(shown.code) != VISIBLE:
             continue
         left, top, right, bottom = (float(edge) for edge in ellipse_of(shown).box)

@@ -1,0 +1,103 @@
+"""Recorded tracks: who is kept when, and smoothing against the batch solution of the same linear Gaussian model."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.trackers.people.motion import motion
+from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed, spreads
+from jaxfilters.trackers.people.state import FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
+
+CONFIG = PeopleConfig(capacity=2)
+
+
+def _frame(mode, identity, x=0.0, share=1.0, sd_radial=0.1):
+    people = nobody(CONFIG)
+    mean = np.zeros((2, STATE), np.float32)
+    mean[:, 0] = x
+    people = people._replace(
+        belief=Gaussian(jnp.asarray(mean), people.belief.covariance),
+        mode=jnp.array([mode, FREE]),
+        identity=jnp.array([identity, -1]),
+        log_odds=jnp.array([1.0, 0.0]),
+    )
+    n = np.zeros(2)
+    report = Report(people.identity, people.mode, mean[:, :2], n + sd_radial, n, n, n, n + share, n, n)
+    return jax.tree.map(np.asarray, people), report
+
+
+def test_frames_before_the_confirmation_follow_with_the_identity():
+    recorder = Recorder()
+    assert recorder.add(0, 0.0, *_frame(TENTATIVE, -1, 1.0)) == []
+    assert recorder.add(1, 0.1, *_frame(TENTATIVE, -1, 2.0)) == []
+    added = recorder.add(2, 0.2, *_frame(TRACKED, 5, 3.0))
+    assert [(identity, seen.frame, seen.mean[0], seen.mode) for identity, seen in added] == [
+        (5, 0, 1.0, "tentative"),
+        (5, 1, 2.0, "tentative"),
+        (5, 2, 3.0, "tracked"),
+    ]
+
+
+def test_whoever_is_given_up_leaves_nothing():
+    recorder = Recorder()
+    recorder.add(0, 0.0, *_frame(TENTATIVE, -1))
+    recorder.add(1, 0.1, *_frame(FREE, -1))
+    assert [seen.frame for _, seen in recorder.add(2, 0.2, *_frame(TRACKED, 0))] == [2]
+
+
+@pytest.mark.parametrize(("share", "sd", "mode"), [(0.1, 0.1, "hidden"), (0.9, 0.8, "no_depth"), (0.9, 0.1, "tracked")])
+def test_what_cannot_be_measured_is_said(share, sd, mode):
+    ((_, seen),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, sd))
+    assert seen.mode == mode
+
+
+def test_spreads_are_along_and_across_the_line_of_sight():
+    covariance = np.zeros((STATE, STATE))
+    covariance[0, 0], covariance[1, 1] = 0.04, 0.01
+    seen = Sighting(0, 0.0, np.array([3.0, 0, 0, 0, 1.7, 0.4]), covariance, 1.0, "tracked")
+    assert spreads(np.array([[0.0, 0.0]]), seen) == pytest.approx((0.2, 0.1))
+    # The second camera is nearer, and looks along Y.
+    assert spreads(np.array([[0.0, 0.0], [3.0, -1.0]]), seen) == pytest.approx((0.1, 0.2))
+
+
+def test_smoothed_tracks_are_the_batch_solution(x64):
+    """Filtered in NumPy, smoothed here, against the least-squares solution of all frames at once."""
+    rng = np.random.default_rng(0)
+    steps, n = np.array([0.0, 0.1, 0.2, 0.1, 0.1, 0.3]), 6
+    H, R = np.eye(STATE)[[0, 1]], 0.02 * np.eye(2)
+    readings = rng.standard_normal((n, 2))
+    mean, covariance, sightings = np.zeros(STATE), np.eye(STATE), []
+    blocks, rhs = np.zeros((n * STATE, n * STATE)), np.zeros(n * STATE)
+    blocks[:STATE, :STATE] += np.eye(STATE)
+    for t in range(n):
+        now = slice(t * STATE, (t + 1) * STATE)
+        if t:
+            F, Q = (np.asarray(a, float) for a in motion(CONFIG, jnp.asarray(steps[t])))
+            information = np.linalg.inv(Q)
+            mean, covariance = F @ mean, F @ covariance @ F.T + Q
+            before = slice((t - 1) * STATE, t * STATE)
+            blocks[before, before] += F.T @ information @ F
+            blocks[now, now] += information
+            blocks[before, now] -= F.T @ information
+            blocks[now, before] -= information @ F
+        gain = covariance @ H.T @ np.linalg.inv(H @ covariance @ H.T + R)
+        mean, covariance = mean + gain @ (readings[t] - H @ mean), covariance - gain @ H @ covariance
+        blocks[now, now] += H.T @ np.linalg.inv(R) @ H
+        rhs[now] += H.T @ np.linalg.inv(R) @ readings[t]
+        sightings.append(Sighting(t, float(steps[: t + 1].sum()), mean, covariance, 0.0, "tracked"))
+    found = smoothed(CONFIG, {3: sightings})[3]
+    expected = np.linalg.solve(blocks, rhs).reshape(n, STATE)
+    # Beliefs are kept in single precision.
+    np.testing.assert_allclose([seen.mean for seen in found], expected, atol=2e-4)
+    spread = np.linalg.inv(blocks)
+    for t, seen in enumerate(found):
+        now = slice(t * STATE, (t + 1) * STATE)
+        np.testing.assert_allclose(seen.covariance, spread[now, now], atol=2e-4)
+
+
+def test_a_long_gap_parts_a_track():
+    here = [Sighting(f, t, np.full(STATE, t), np.eye(STATE), 0.0, "tracked") for f, t in ((0, 0.0), (1, 20.0))]
+    for seen, kept in zip(smoothed(CONFIG, {0: here})[0], here, strict=True):
+        np.testing.assert_array_equal(seen.mean, kept.mean)
