@@ -17,7 +17,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry
 from jaxfilters.models.rendering.depth import render_capsules
 from jaxfilters.trackers.hand_depth import synthetic_sequence
-from jaxfilters.trackers.shell.draw import color_depth, draw_skeleton
+from jaxfilters.trackers.shell.hand_draw import color_depth, draw_skeleton
 
 FRAMES = (0, 45, 90, 120)
 REACH = 0.115

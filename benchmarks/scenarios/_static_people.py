@@ -84,7 +84,7 @@ def sight_of(calibration: Calibration) -> Sight:
 
 
 def straightened(
-    calibration: Calibration, masks: Bool[Array, "*runs rows cols"]
+    calibration: Calibration, masks: Bool[np.ndarray | Array, "*runs rows cols"]
 ) -> UInt8[np.ndarray, "*runs rows cols"]:
     """Foreground probabilities times 255, without the distortion of the camera."""
     images = np.asarray(masks, np.uint8) * np.uint8(255)

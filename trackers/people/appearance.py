@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
-from jaxfilters.trackers.people.fit import body_of, presence_of
+from jaxfilters.trackers.people.silhouettes import body_of, presence_of
 from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleScene
 
 BINS = 8
@@ -37,31 +37,35 @@ def _in_camera(scene, camera, furniture, frame, places, active):
     outlines = jax.vmap(lambda place: outline(camera.P, body_of(place)))(places)
     image, mask = jnp.asarray(frame.image).reshape(-1, 3), jnp.asarray(frame.foreground).ravel()
 
-    def one(k):
+    order = jnp.argsort(~active)
+    num_active = jnp.sum(active)
+
+    def one(turn, found):
+        k = order[turn]
         seen = jax.tree.map(lambda leaf: leaf[k], outlines)
-        shown = (seen.code == VISIBLE) & active[k]
+        shown = seen.code == VISIBLE
         box = jnp.where(shown, ellipse_of(seen).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
         window = foreground.window(box, camera.shape, GRID)
 
-        def covers(place, other):
-            return presence_of(scene.config, camera, place, window.uv) * (other.depth < seen.depth)
+        def hide(turn, free):
+            other = order[turn]
+            ahead = (outlines.depth[other] < seen.depth) & (other != k)
+            return free * (1 - presence_of(scene.config, camera, places[other], window.uv) * ahead)
 
-        ahead = jax.vmap(covers)(places, outlines) * (active & (jnp.arange(len(places)) != k))[:, None]
-        free = jnp.prod(1 - ahead, axis=0) * (seen.depth < furniture.ravel()[window.pixel])
-        weight = (
-            presence_of(scene.config, camera, places[k], window.uv)
-            * free
-            * window.inside
-            * shown
-            * (mask[window.pixel] / 255)
-        )
-        upper = window.uv[:, 1] < seen.center[1]
-        halves = jnp.stack([weight * upper, weight * ~upper])
-        # Equal steps of the square root: clothes are mostly dark.
-        bins = jax.nn.one_hot((BINS * jnp.sqrt(image[window.pixel] / 256)).astype(jnp.int32), BINS)
-        counts = jnp.einsum("hs,scb->hcb", halves, bins)
-        sizes = jnp.sum(halves, axis=1)
-        histogram = counts / jnp.maximum(sizes, 1e-6)[:, None, None]
-        return histogram.ravel(), jnp.all(sizes > LEAST_PIXELS)
+        free = jax.lax.fori_loop(0, num_active, hide, window.inside * (seen.depth < furniture.ravel()[window.pixel]))
+        mine = presence_of(scene.config, camera, places[k], window.uv) * shown * (mask[window.pixel] / 255)
+        histogram, enough = _histogram(image[window.pixel], mine * free, window.uv[:, 1] < seen.center[1])
+        return found[0].at[k].set(histogram), found[1].at[k].set(enough)
 
-    return jax.vmap(one)(jnp.arange(len(places)))
+    nothing = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)
+    return jax.lax.fori_loop(0, num_active, one, nothing)
+
+
+def _histogram(colors, weight, upper):
+    """Of both halves, and whether both hold enough pixels."""
+    halves = jnp.stack([weight * upper, weight * ~upper])
+    # Equal steps of the square root: clothes are mostly dark.
+    bins = jax.nn.one_hot((BINS * jnp.sqrt(colors / 256)).astype(jnp.int32), BINS)
+    sizes = jnp.sum(halves, axis=1)
+    histogram = jnp.einsum("hs,scb->hcb", halves, bins) / jnp.maximum(sizes, 1e-6)[:, None, None]
+    return histogram.ravel(), jnp.all(sizes > LEAST_PIXELS)

@@ -9,9 +9,17 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
-from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, standing
-from jaxfilters.models.person.foreground import Quadratic, Window, contrast, log_likelihood_ratio, presence
-from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
+from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.silhouettes import (
+    contrasts_of,
+    line_of_sight,
+    log_likelihood,
+    place_of,
+    share_seen,
+    unexplained_of,
+    view_of,
+)
+from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleScene
 
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction somebody is searched for, along each axis."""
@@ -23,28 +31,11 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
 """Inverse square metres: below it a direction counts as not seen at all."""
-MARGIN = 0.3
-"""Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
-LEAST_SIZE_M = 0.1
 PASSES = 2
 NEAR_M = 1.5
 """Two who are nearer may be one."""
 BETWEEN = 5
 """Places from one to the other at which one alone is tried."""
-
-
-class View(NamedTuple):
-    """One person's window in one camera."""
-
-    window: Window
-    foreground: Float[Array, " samples"]
-    """Probability."""
-    depth: Float[Array, " samples"]
-    """Of furniture, metres."""
-    visible: Float[Array, " samples"]
-    """1 where the person would be seen in the image and before the furniture, else 0."""
-    area: Float[Array, ""]
-    """Of the predicted outline, square pixels."""
 
 
 class Fit(NamedTuple):
@@ -63,11 +54,6 @@ class Fit(NamedTuple):
     surplus: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel that somebody explains which the nearest senior could not explain alone, in
     the best place for that; `inf` without a senior near by."""
-
-
-def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
-    """X, Y, height and width of a state."""
-    return mean[..., jnp.array(PLACE)]
 
 
 def fit_people(
@@ -92,7 +78,9 @@ def fit_people(
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
     reach = _reach(predicted, axes)
     views = tuple(
-        jax.vmap(_view, in_axes=(None, None, None, None, 0, 0, 0))(config, camera, furniture, frame, start, axes, reach)
+        jax.vmap(view_of, in_axes=(None, None, None, None, 0, 0, 0))(
+            config, camera, furniture, frame, start, axes, reach
+        )
         for camera, furniture, frame in zip(scene.cameras, scene.furniture, frames, strict=True)
     )
     order = _nearest_first(scene.cameras[0], start, active)
@@ -100,11 +88,11 @@ def fit_people(
     def one_person(turn, places):
         k = order[turn % num_active]
         mine = jax.tree.map(lambda leaf: leaf[k], views)
-        contrasts = _contrasts(scene, places, active.at[k].set(False), mine)
+        contrasts = contrasts_of(mine, unexplained_of(scene, places, active.at[k].set(False), mine))
 
         def best(place, offsets):
             candidates = place + offsets @ axes[k]
-            scores = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
+            scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
             away = candidates - start[k]
             total = scores - jnp.einsum("ci,ij,cj->c", away, prior[k], away) / 2
             # Where candidates are equal, the one that moves least: the middle of the lattice comes first.
@@ -131,16 +119,17 @@ def _curvature(scene, places, active, seniority, views, axes) -> Fit:
 
     def one(k, fits):
         mine = jax.tree.map(lambda leaf: leaf[k], views)
-        contrasts = _contrasts(scene, places, active.at[k].set(False), mine)
+        unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
+        contrasts = contrasts_of(mine, unexplained)
         candidates = places[k] + offsets @ axes[k]
-        values = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
+        values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
         scores = values / scene.config.independent_patches
         fit = Fit(
             places[k],
             axes[k],
             foreground.quadratic_fit(values[:-2], steps),
             scores[middle],
-            _share_seen(scene, places, active.at[k].set(False), mine, k),
+            share_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
             _surplus(scene, places, active, seniority, views, axes, k, scores[middle]),
         )
@@ -169,12 +158,12 @@ def _surplus(scene, places, active, seniority, views, axes, k, score):
     def alone():
         theirs = jax.tree.map(lambda leaf: leaf[senior], views)
         others = active.at[k].set(False).at[senior].set(False)
-        contrasts = _contrasts(scene, places, others, theirs)
+        contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])
         offsets = (foreground.lattice(2) @ jnp.eye(2, 4)) * jnp.array(CURVATURE_STEPS_M) @ axes[senior]
         candidates = places[senior] + (between[:, None] + offsets).reshape(-1, 4)
-        values = jax.vmap(_log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
-        with_k = _log_likelihood(scene, places[senior], theirs, contrasts)
+        values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
+        with_k = log_likelihood(scene, places[senior], theirs, contrasts)
         return score - (jnp.max(values) - with_k) / scene.config.independent_patches
 
     return jax.lax.cond(apart[senior] < NEAR_M, alone, lambda: jnp.full_like(score, jnp.inf))
@@ -201,33 +190,10 @@ def as_measurement(
     return jax.vmap(one)(fit.place, fit.axes, fit.quadratic)
 
 
-def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
-    """The ellipsoid of X, Y, height and width; of a size that an outline can be had of."""
-    return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
-
-
-def presence_of(
-    config: PeopleConfig, camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
-) -> Float[Array, "*pixels"]:
-    """`presence` of X, Y, height and width in a camera."""
-    height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
-    return presence(camera.P, place[:2], height, width, uv, config.spread_px)
-
-
 def _prior(predicted):
     pick = jnp.array(PLACE)
     covariance = predicted.covariance[:, pick[:, None], pick]
     return jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
-
-
-def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
-    """Rows: unit vectors on the floor away from whichever camera is nearest, and at right angles."""
-    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
-    away = xy - centers[jnp.argmin(jnp.sum((xy - centers) ** 2, axis=-1))]
-    distance = jnp.linalg.norm(away)
-    # Straight below the camera any direction is as good.
-    x, y = jnp.where(distance > 0.1, away / jnp.maximum(distance, 0.1), jnp.array([0.0, 1.0]))
-    return jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])])
 
 
 def _axes(scene, place):
@@ -237,65 +203,6 @@ def _axes(scene, place):
 def _reach(predicted, axes):
     along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], predicted.covariance[:, :2, :2], axes[:, :2, :2])
     return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
-
-
-def _view(config: PeopleConfig, camera: FloorCamera, furniture, frame: CameraFrame, place, axes, reach) -> View:
-    corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
-    bodies = jax.vmap(body_of)(place + corners @ axes)
-    seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
-    boxes = jax.vmap(lambda one: ellipse_of(one).box)(seen)
-    box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])
-    margin = MARGIN * (box[2:] - box[:2]) + 1
-    shown = frame.present & jnp.all(seen.code == VISIBLE)
-    box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
-    window = foreground.window(box, camera.shape, config.grid)
-    probability = jnp.asarray(frame.foreground).ravel()[window.pixel].astype(float) / 255
-    depth = furniture.ravel()[window.pixel]
-    body = body_of(place)
-    visible = window.inside * shown * (near_depth(camera.P, body, window.uv) < depth)
-    return View(window, probability, depth, visible, _area(outline(camera.P, body)))
-
-
-def _area(seen: Outline):
-    (a, b), (_, c) = seen.shape
-    return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
-
-
-def _unexplained(scene, camera, places, others: Bool[Array, " slots"], view: View):
-    """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
-
-    def one(place):
-        return presence_of(scene.config, camera, place, view.window.uv) * (
-            outline(camera.P, body_of(place)).depth < view.depth
-        )
-
-    hidden = jax.vmap(one)(places) * others[:, None]
-    return (1 - foreground.CLUTTER) * jnp.prod(1 - hidden, axis=0)
-
-
-def _contrasts(scene, places, others, views):
-    return tuple(
-        contrast(view.foreground, _unexplained(scene, camera, places, others, view)) * view.visible
-        for camera, view in zip(scene.cameras, views, strict=True)
-    )
-
-
-def _log_likelihood(scene, place, views, contrasts):
-    total = jnp.zeros(())
-    for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
-        ratio = log_likelihood_ratio(presence_of(scene.config, camera, place, view.window.uv), b)
-        total += ratio * view.window.area / view.area
-    return scene.config.independent_patches * total
-
-
-def _share_seen(scene, places, others, views, k):
-    """Of the silhouette; the largest over the cameras."""
-    shares = []
-    for camera, view in zip(scene.cameras, views, strict=True):
-        mine = presence_of(scene.config, camera, places[k], view.window.uv)
-        free = _unexplained(scene, camera, places, others, view) * view.visible
-        shares.append(jnp.sum(mine * free) / jnp.maximum(jnp.sum(mine), 1e-6))
-    return jnp.max(jnp.stack(shares))
 
 
 def _nearest_first(camera: FloorCamera, places, active) -> Int32[Array, " slots"]:

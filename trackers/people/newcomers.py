@@ -12,7 +12,7 @@ from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import walkable
-from jaxfilters.trackers.people.fit import body_of, presence_of
+from jaxfilters.trackers.people.silhouettes import body_of, presence_of
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
 
 REDUCED_COLS = 160

@@ -15,9 +15,10 @@ from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.appearance import appearances
 from jaxfilters.trackers.people.exchange import after_meetings
-from jaxfilters.trackers.people.fit import Fit, as_measurement, body_of, fit_people, place_of
+from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.newcomers import cells_of, newcomer
+from jaxfilters.trackers.people.silhouettes import body_of, place_of
 from jaxfilters.trackers.people.state import (
     HEIGHT,
     PLACE,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
-from jaxfilters.trackers.people.fit import body_of, place_of
 from jaxfilters.trackers.people.recorded import Sighting, height_of, spreads
+from jaxfilters.trackers.people.silhouettes import body_of, place_of
 from jaxfilters.trackers.people.state import PeopleScene
 from jaxfilters.trackers.shell.results import OutputError
 

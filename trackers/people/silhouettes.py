@@ -1,0 +1,143 @@
+"""What each camera says of somebody at a place: a window of the image, less what others explain."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.person import foreground
+from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, standing
+from jaxfilters.models.person.foreground import Window, contrast, log_likelihood_ratio, presence
+from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
+
+MARGIN = 0.3
+"""Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
+LEAST_SIZE_M = 0.1
+
+
+class View(NamedTuple):
+    """One person's window in one camera."""
+
+    window: Window
+    foreground: Float[Array, " samples"]
+    """Probability."""
+    depth: Float[Array, " samples"]
+    """Of furniture, metres."""
+    visible: Float[Array, " samples"]
+    """1 where the person would be seen in the image and before the furniture, else 0."""
+    area: Float[Array, ""]
+    """Of the predicted outline, square pixels."""
+
+
+def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
+    """X, Y, height and width of a state."""
+    return mean[..., jnp.array(PLACE)]
+
+
+def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
+    """The ellipsoid of X, Y, height and width; of a size that an outline can be had of."""
+    return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
+
+
+def presence_of(
+    config: PeopleConfig, camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
+) -> Float[Array, "*pixels"]:
+    """`presence` of X, Y, height and width in a camera."""
+    height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
+    return presence(camera.P, place[:2], height, width, uv, config.spread_px)
+
+
+def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+    """Rows: unit vectors on the floor away from whichever camera is nearest, and at right angles."""
+    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
+    away = xy - centers[jnp.argmin(jnp.sum((xy - centers) ** 2, axis=-1))]
+    distance = jnp.linalg.norm(away)
+    # Straight below the camera any direction is as good.
+    x, y = jnp.where(distance > 0.1, away / jnp.maximum(distance, 0.1), jnp.array([0.0, 1.0]))
+    return jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])])
+
+
+def view_of(
+    config: PeopleConfig,
+    camera: FloorCamera,
+    furniture: Float[Array, "rows cols"],
+    frame: CameraFrame,
+    place: Float[Array, " 4"],
+    axes: Float[Array, "4 4"],
+    reach: Float[Array, " 2"],
+) -> View:
+    """The window in which somebody is searched for: as far as `reach` along the first two `axes`, and a margin."""
+    corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
+    bodies = jax.vmap(body_of)(place + corners @ axes)
+    seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
+    boxes = jax.vmap(lambda one: ellipse_of(one).box)(seen)
+    box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])
+    margin = MARGIN * (box[2:] - box[:2]) + 1
+    shown = frame.present & jnp.all(seen.code == VISIBLE)
+    box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
+    window = foreground.window(box, camera.shape, config.grid)
+    probability = jnp.asarray(frame.foreground).ravel()[window.pixel].astype(float) / 255
+    depth = furniture.ravel()[window.pixel]
+    body = body_of(place)
+    visible = window.inside * shown * (near_depth(camera.P, body, window.uv) < depth)
+    return View(window, probability, depth, visible, _area(outline(camera.P, body)))
+
+
+def _area(seen: Outline):
+    (a, b), (_, c) = seen.shape
+    return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
+
+
+def unexplained_of(
+    scene: PeopleScene, places: Float[Array, "slots 4"], others: Bool[Array, " slots"], views: tuple[View, ...]
+) -> tuple[Float[Array, " samples"], ...]:
+    """Probability that neither clutter nor any of the others makes the samples of a window foreground, by camera."""
+    order = jnp.argsort(~others)
+
+    def in_camera(camera, view):
+        def hide(turn, free):
+            place = places[order[turn]]
+            ahead = outline(camera.P, body_of(place)).depth < view.depth
+            return free * (1 - presence_of(scene.config, camera, place, view.window.uv) * ahead)
+
+        free = jnp.full(view.foreground.shape, 1 - foreground.CLUTTER)
+        return jax.lax.fori_loop(0, jnp.sum(others), hide, free)
+
+    return tuple(in_camera(camera, view) for camera, view in zip(scene.cameras, views, strict=True))
+
+
+def contrasts_of(
+    views: tuple[View, ...], unexplained: tuple[Float[Array, " samples"], ...]
+) -> tuple[Float[Array, " samples"], ...]:
+    """What candidates are compared with in each camera; 0 where the person would not be seen."""
+    return tuple(contrast(view.foreground, free) * view.visible for view, free in zip(views, unexplained, strict=True))
+
+
+def log_likelihood(
+    scene: PeopleScene,
+    place: Float[Array, " 4"],
+    views: tuple[View, ...],
+    contrasts: tuple[Float[Array, " samples"], ...],
+) -> Float[Array, ""]:
+    """Log likelihood of somebody at a place over that of nobody, over all cameras, as of independent looks."""
+    total = jnp.zeros(())
+    for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
+        ratio = log_likelihood_ratio(presence_of(scene.config, camera, place, view.window.uv), b)
+        total += ratio * view.window.area / view.area
+    return scene.config.independent_patches * total
+
+
+def share_seen(
+    scene: PeopleScene,
+    place: Float[Array, " 4"],
+    views: tuple[View, ...],
+    unexplained: tuple[Float[Array, " samples"], ...],
+) -> Float[Array, ""]:
+    """Of the silhouette, how much is in the image and hidden by nobody and nothing; the largest over the cameras."""
+    shares = []
+    for camera, view, free in zip(scene.cameras, views, unexplained, strict=True):
+        mine = presence_of(scene.config, camera, place, view.window.uv)
+        shares.append(jnp.sum(mine * free * view.visible) / jnp.maximum(jnp.sum(mine), 1e-6))
+    return jnp.max(jnp.stack(shares))
