@@ -99,8 +99,9 @@ class Rooms:
         number = int.from_bytes(name.encode(), "little") % 2**31
         keys = [jax.random.fold_in(jax.random.key(seed), number) for seed in seeds]
         parts = [static.simulate(key, self.calibration, truth, look, **options) for key in keys]
-        joined = [None if field[0] is None else np.concatenate(field) for field in zip(*parts, strict=True)]
-        return Runs(*joined)
+        truth, starts, masks = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        desks = [part.desks for part in parts if part.desks is not None]
+        return Runs(truth, starts, masks, np.concatenate(desks) if desks else None)
 
 
 def accuracy_metrics(seeds: range, first: Rooms, second: Rooms, looks: tuple[str, ...]) -> dict[str, Metric]:

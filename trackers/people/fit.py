@@ -25,7 +25,7 @@ LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction somebody is searched for, along each axis."""
 HEIGHT_STEP_M = 0.03
 """First step of the search for the height."""
-CURVATURE_STEPS_M = (0.12, 0.06, 0.06, 0.05)
+CURVATURE_STEPS_M = (0.09, 0.045, 0.045, 0.04)
 """Away from the camera, sideways, height, width: over which the score is taken for a parabola."""
 PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""

@@ -1,5 +1,6 @@
 """Tracks as they are kept: collected while the tracker runs, and smoothed when a recording has ended."""
 
+import itertools
 from functools import partial
 from typing import NamedTuple
 
@@ -14,8 +15,6 @@ from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People,
 
 HIDDEN_SHARE = 0.2
 """Somebody of whose silhouette less is seen is `hidden`."""
-NO_DEPTH_SD_M = 0.5
-"""Somebody whose place along the line of sight is known no better has no measurable depth (section 4, E2)."""
 
 
 class Sighting(NamedTuple):
@@ -28,6 +27,8 @@ class Sighting(NamedTuple):
     covariance: np.ndarray
     """(6, 6)."""
     score: float
+    slot: int
+    """Where the tracker kept this person: another one after a change of identities."""
     mode: str
     """`tentative`, `tracked`, `hidden` (nothing to be seen) or `no_depth` (not measurable along the line of sight)."""
 
@@ -63,7 +64,7 @@ def _sighting(frame, time_s, slot, people, report) -> Sighting:
     mode = "tentative" if people.mode[slot] == TENTATIVE else "tracked"
     if mode == "tracked" and report.share_seen[slot] < HIDDEN_SHARE:
         mode = "hidden"
-    elif mode == "tracked" and report.sd_radial[slot] > NO_DEPTH_SD_M:
+    elif mode == "tracked" and not report.has_depth[slot]:
         mode = "no_depth"
     return Sighting(
         frame,
@@ -71,6 +72,7 @@ def _sighting(frame, time_s, slot, people, report) -> Sighting:
         np.array(people.belief.mean[slot], np.float64),
         np.array(people.belief.covariance[slot], np.float64),
         float(report.score[slot]),
+        slot,
         mode,
     )
 
@@ -91,9 +93,9 @@ def spreads(centers: np.ndarray, seen: Sighting) -> tuple[float, float]:
 
 
 def smoothed(config: PeopleConfig, tracks: dict[int, list[Sighting]]) -> dict[int, list[Sighting]]:
-    """The same tracks, every belief given all frames of its track (H. Rauch, F. Tung, C. Striebel 1965).
+    """The same tracks, every belief given all frames of its piece (H. Rauch, F. Tung, C. Striebel 1965).
 
-    A gap longer than `hidden_s` seconds ends one piece and begins another.
+    A gap longer than `hidden_s` seconds ends one piece and begins another, and so does a change of slots.
     """
     return {
         identity: [seen for piece in _pieces(track, config.hidden_s) for seen in _smoothed(config, piece)]
@@ -103,7 +105,8 @@ def smoothed(config: PeopleConfig, tracks: dict[int, list[Sighting]]) -> dict[in
 
 def _pieces(track: list[Sighting], longest_s: float) -> list[list[Sighting]]:
     ordered = sorted(track, key=lambda seen: seen.frame)
-    cuts = [i for i in range(1, len(ordered)) if ordered[i].time_s - ordered[i - 1].time_s > longest_s]
+    pairs = enumerate(itertools.pairwise(ordered), 1)
+    cuts = [i for i, (a, b) in pairs if b.time_s - a.time_s > longest_s or b.slot != a.slot]
     return [ordered[a:b] for a, b in zip([0, *cuts], [*cuts, len(ordered)], strict=True)]
 
 

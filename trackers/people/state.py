@@ -173,6 +173,8 @@ class Report(NamedTuple):
     """Of the silhouette, in an image and hidden by nobody and nothing."""
     flatness: Float[Array, " slots"]
     """How much the score drops 0.3 m nearer or farther along the line of sight: small where depth cannot be seen."""
+    has_depth: Bool[Array, " slots"]
+    """False where the distance from the camera cannot be measured, as with head and feet hidden (section 4, E2)."""
     nis: Float[Array, " slots"]
     """Normalised innovation squared of the update, over its four coordinates."""
 

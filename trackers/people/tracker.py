@@ -37,6 +37,9 @@ from jaxfilters.views import consider
 
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""
+NO_DEPTH = 0.03
+"""Standard deviation along the line of sight, in distances from the camera, from which on depth is not measured: the
+pair of a desk that hides the feet and a border that hides the head gives as much, either alone gives less."""
 CLEAR = 0.5
 """Share of the silhouette from which on clothes are looked at."""
 WHOLE = 0.9
@@ -114,7 +117,7 @@ def step(
     people = after_meetings(people, histograms, good, dt)
     people = lifecycle.named(lifecycle.remembered(people, histograms, good))
     people = lifecycle.admitted(scene.config, people, newcomer(scene, places, active, frames))
-    return people, _report(people, fit, nis)
+    return people, _report(scene, people, fit, nis)
 
 
 @jax.jit
@@ -136,7 +139,7 @@ def _updated(config: PeopleConfig, predicted: Gaussian, fit: Fit) -> tuple[Gauss
     return jax.vmap(one)(predicted, y, H, R, seen, fit.share_seen > WHOLE)
 
 
-def _report(people: People, fit: Fit, nis: Array) -> Report:
+def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
     covariance = people.belief.covariance[:, :2, :2]
     variance = jnp.einsum("kai,kij,kaj->ka", fit.axes[:, :2, :2], covariance, fit.axes[:, :2, :2])
     radial, lateral = jnp.sqrt(jnp.maximum(variance, 0.0)).T
@@ -150,5 +153,12 @@ def _report(people: People, fit: Fit, nis: Array) -> Report:
         fit.score,
         fit.share_seen,
         fit.flatness,
+        radial < NO_DEPTH * _distance(scene, people.belief.mean[:, :2]),
         nis,
     )
+
+
+def _distance(scene: PeopleScene, xy: Array) -> Array:
+    """From whichever camera is nearest, on the floor."""
+    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
+    return jnp.min(jnp.linalg.norm(xy[:, None] - centers, axis=-1), axis=1)

@@ -13,7 +13,7 @@ from jaxfilters.trackers.people.state import FREE, STATE, TENTATIVE, TRACKED, Pe
 CONFIG = PeopleConfig(capacity=2)
 
 
-def _frame(mode, identity, x=0.0, share=1.0, sd_radial=0.1):
+def _frame(mode, identity, x=0.0, share=1.0, has_depth=True):
     people = nobody(CONFIG)
     mean = np.zeros((2, STATE), np.float32)
     mean[:, 0] = x
@@ -24,7 +24,7 @@ def _frame(mode, identity, x=0.0, share=1.0, sd_radial=0.1):
         log_odds=jnp.array([1.0, 0.0]),
     )
     n = np.zeros(2)
-    report = Report(people.identity, people.mode, mean[:, :2], n + sd_radial, n, n, n, n + share, n, n)
+    report = Report(people.identity, people.mode, mean[:, :2], n, n, n, n, n + share, n, np.array([has_depth, True]), n)
     return jax.tree.map(np.asarray, people), report
 
 
@@ -47,16 +47,18 @@ def test_whoever_is_given_up_leaves_nothing():
     assert [seen.frame for _, seen in recorder.add(2, 0.2, *_frame(TRACKED, 0))] == [2]
 
 
-@pytest.mark.parametrize(("share", "sd", "mode"), [(0.1, 0.1, "hidden"), (0.9, 0.8, "no_depth"), (0.9, 0.1, "tracked")])
-def test_what_cannot_be_measured_is_said(share, sd, mode):
-    ((_, seen),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, sd))
+@pytest.mark.parametrize(
+    ("share", "depth", "mode"), [(0.1, True, "hidden"), (0.9, False, "no_depth"), (0.9, True, "tracked")]
+)
+def test_what_cannot_be_measured_is_said(share, depth, mode):
+    ((_, seen),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
     assert seen.mode == mode
 
 
 def test_spreads_are_along_and_across_the_line_of_sight():
     covariance = np.zeros((STATE, STATE))
     covariance[0, 0], covariance[1, 1] = 0.04, 0.01
-    seen = Sighting(0, 0.0, np.array([3.0, 0, 0, 0, 1.7, 0.4]), covariance, 1.0, "tracked")
+    seen = Sighting(0, 0.0, np.array([3.0, 0, 0, 0, 1.7, 0.4]), covariance, 1.0, 0, "tracked")
     assert spreads(np.array([[0.0, 0.0]]), seen) == pytest.approx((0.2, 0.1))
     # The second camera is nearer, and looks along Y.
     assert spreads(np.array([[0.0, 0.0], [3.0, -1.0]]), seen) == pytest.approx((0.1, 0.2))
@@ -86,7 +88,7 @@ def test_smoothed_tracks_are_the_batch_solution(x64):
         mean, covariance = mean + gain @ (readings[t] - H @ mean), covariance - gain @ H @ covariance
         blocks[now, now] += H.T @ np.linalg.inv(R) @ H
         rhs[now] += H.T @ np.linalg.inv(R) @ readings[t]
-        sightings.append(Sighting(t, float(steps[: t + 1].sum()), mean, covariance, 0.0, "tracked"))
+        sightings.append(Sighting(t, float(steps[: t + 1].sum()), mean, covariance, 0.0, 0, "tracked"))
     found = smoothed(CONFIG, {3: sightings})[3]
     expected = np.linalg.solve(blocks, rhs).reshape(n, STATE)
     # Beliefs are kept in single precision.
@@ -97,7 +99,11 @@ def test_smoothed_tracks_are_the_batch_solution(x64):
         np.testing.assert_allclose(seen.covariance, spread[now, now], atol=2e-4)
 
 
-def test_a_long_gap_parts_a_track():
-    here = [Sighting(f, t, np.full(STATE, t), np.eye(STATE), 0.0, "tracked") for f, t in ((0, 0.0), (1, 20.0))]
+@pytest.mark.parametrize(("time", "slot"), [(20.0, 0), (0.1, 1)])
+def test_a_long_gap_and_another_slot_part_a_track(time, slot):
+    here = [
+        Sighting(f, t, np.full(STATE, float(f)), np.eye(STATE), 0.0, at, "tracked")
+        for f, t, at in ((0, 0.0, 0), (1, time, slot))
+    ]
     for seen, kept in zip(smoothed(CONFIG, {0: here})[0], here, strict=True):
         np.testing.assert_array_equal(seen.mean, kept.mean)

@@ -1,0 +1,132 @@
+"""The joint search: people in drawn silhouettes, and readings from parabolas against the Gaussians they are of."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
+from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.tracker import people_scene
+
+PLACES = ((-0.9, 2.2, 1.75, 0.45), (0.2, 1.0, 1.70, 0.45), (0.45, 0.3, 1.65, 0.42))
+"""The second and the third overlap in the image."""
+OFF_M = np.array([(0.12, -0.10), (-0.10, 0.15), (0.08, 0.14)])
+SLOTS = 5
+
+
+def parabolas(seed, n):
+    """Fits whose log likelihoods are exactly those of Gaussian readings of the place: with their means, precisions."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, 4, 4))
+    precision = 400 * (root @ np.swapaxes(root, 1, 2) + 2 * np.eye(4))
+    place, turned = rng.normal(size=(n, 4)), rng.uniform(0, 6, n)
+    axes = np.tile(np.eye(4), (n, 1, 1))
+    axes[:, 0, :2] = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+    axes[:, 1, :2] = np.stack([np.sin(turned), -np.cos(turned)], axis=-1)
+    mean = place + rng.normal(size=(n, 4)) * 0.01
+    gradient = np.einsum("nai,nij,nj->na", axes, precision, mean - place)
+    curvature = np.einsum("nai,nij,nbj->nab", axes, precision, axes)
+    none = jnp.zeros(n)
+    quadratic = Quadratic(none, jnp.asarray(gradient), jnp.asarray(curvature))
+    return Fit(jnp.asarray(place), jnp.asarray(axes), quadratic, none, none, none, none), mean, precision
+
+
+@pytest.mark.usefixtures("x64")
+def test_readings_of_an_exact_parabola_are_its_gaussian():
+    """Information H^T R^-1 H and information times mean, added up over the four readings."""
+    fit, mean, precision = parabolas(0, 20)
+    y, H, R, seen = (np.asarray(leaf) for leaf in as_measurement(fit, 0.0))
+    assert seen.all()
+    weighted = np.einsum("nri,nrs->nis", H, np.linalg.inv(R))
+    np.testing.assert_allclose(np.einsum("nis,nsj->nij", weighted, H), precision, rtol=1e-9, atol=1e-9 * precision.max())
+    found = np.linalg.solve(precision, np.einsum("nis,ns->ni", weighted, y)[..., None])[..., 0]
+    np.testing.assert_allclose(found, mean, atol=1e-10)
+
+
+@pytest.mark.usefixtures("x64")
+def test_shape_and_gait_add_to_every_reading():
+    fit, *_ = parabolas(1, 5)
+    plain, rough = (np.asarray(as_measurement(fit, sd)[2]) for sd in (0.0, 0.05))
+    np.testing.assert_allclose(rough - plain, np.broadcast_to(0.05**2 * np.eye(4), plain.shape), atol=1e-15)
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_moves_nobody_far():
+    fit, *_ = parabolas(2, 1)
+    curvature = jnp.diag(jnp.array([0.0, 500.0, -20.0, 2.0]))[None]
+    fit = fit._replace(quadratic=Quadratic(jnp.zeros(1), jnp.full((1, 4), 1e6), curvature))
+    y, H, R, seen = (np.asarray(leaf)[0] for leaf in as_measurement(fit, 0.0))
+    assert seen.sum() == 2
+    assert np.isfinite(R).all()
+    assert np.abs(y - H @ np.asarray(fit.place)[0]).max() < 0.2
+
+
+@pytest.fixture(scope="module")
+def found(camera, draw, floor):
+    """Three people and two free slots, searched for from places that are off."""
+    scene = people_scene([camera], floor, config=PeopleConfig(capacity=SLOTS, spread_px=0.0))
+    mask, who = draw(camera, PLACES)
+    frame = CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True))
+    search = jax.jit(fit_people)
+
+    def run(order, shown=frame):
+        mean = np.zeros((SLOTS, 6), np.float32)
+        for slot, k in order.items():
+            mean[slot] = [*(PLACES[k][:2] + OFF_M[k]), 0, 0, 1.72, 0.45]
+        sd = np.array([0.15, 0.15, 0.5, 0.5, 0.05, 0.05], np.float32)
+        belief = Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), (SLOTS, 6, 6)))
+        active = jnp.array([slot in order for slot in range(SLOTS)])
+        return jax.tree.map(np.asarray, search(scene, belief, active, -jnp.arange(SLOTS, dtype=float), (shown,)))
+
+    return run, frame, np.bincount(who[who >= 0], minlength=3)
+
+
+def test_everybody_is_found_where_drawn_though_two_overlap(found):
+    """A pixel at the farthest is 0.12 m in depth, 150 px * 3 m / (7.2 m)^2 to the metre, and 0.05 m sideways."""
+    run, _, pixels = found
+    assert pixels.min() > 150
+    fit = run({0: 0, 1: 1, 2: 2})
+    away = np.einsum("kai,ki->ka", fit.axes[:3, :2, :2], fit.place[:3, :2] - np.array(PLACES)[:, :2])
+    assert np.all(np.abs(away) < (0.12, 0.05))
+    off = np.linalg.norm(away, axis=-1)
+    assert np.all(off < np.linalg.norm(OFF_M, axis=-1))
+    assert fit.score[:3].min() > 0.5
+    assert fit.flatness[:3].min() > 0.1
+    assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
+
+
+def test_slots_mean_nothing_to_the_search(found):
+    run, *_ = found
+    plain, moved = run({0: 0, 1: 1, 2: 2}), run({3: 0, 0: 1, 4: 2})
+    for name in ("place", "score", "share_seen", "flatness"):
+        a, b = getattr(plain, name)[[0, 1, 2]], getattr(moved, name)[[3, 0, 4]]
+        np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)
+
+
+def test_depth_is_seen_worse_than_the_side(found):
+    """Axes are away from the camera and sideways; the camera looks 25 degrees down."""
+    run, *_ = found
+    curvature = run({0: 0}).quadratic.curvature[0]
+    assert curvature[0, 0] < curvature[1, 1]
+
+
+def test_two_in_one_silhouette_are_one(found):
+    """The junior of two people with one silhouette explains nothing that the senior would not."""
+    run, *_ = found
+    fit = run({0: 0, 1: 0})
+    assert np.isinf(fit.surplus[0])
+    assert fit.surplus[1] < 0.5
+    assert np.isinf(run({0: 0, 1: 1}).surplus[0])
+
+
+def test_without_an_image_nothing_is_said(found):
+    run, frame, _ = found
+    fit = run({0: 0, 2: 1}, frame._replace(present=np.bool_(False)))
+    assert not fit.score.any()
+    assert not fit.share_seen.any()
+    assert not fit.quadratic.curvature.any()
+    expected = np.stack([np.array(PLACES[k][:2]) + OFF_M[k] for k in (0, 1)])
+    np.testing.assert_allclose(fit.place[[0, 2], :2], expected, atol=1e-6)
