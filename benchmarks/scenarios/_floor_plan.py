@@ -34,10 +34,11 @@ def draw_floor_plan(path: Path, truth: FloorTracks, estimate: FloorTracks, area:
         return np.stack([scaled[..., 0], rows - 1 - scaled[..., 1]], axis=-1).round().astype(np.int32)
 
     for x in np.arange(np.ceil(low[0] / GRID_M), high[0] / GRID_M) * GRID_M:
-        cv2.line(picture, *at([(x, low[1]), (x, high[1])]).tolist(), GRID_COLOR)
+        _line(picture, at([(x, low[1]), (x, high[1])]))
     for y in np.arange(np.ceil(low[1] / GRID_M), high[1] / GRID_M) * GRID_M:
-        cv2.line(picture, *at([(low[0], y), (high[0], y)]).tolist(), GRID_COLOR)
-    cv2.rectangle(picture, *at(area).tolist(), AREA_COLOR)
+        _line(picture, at([(low[0], y), (high[0], y)]))
+    corner, opposite = at(area).tolist()
+    cv2.rectangle(picture, corner, opposite, AREA_COLOR)
     for rows_of_one in _by_identity(truth):
         cv2.polylines(picture, [at(piece) for piece in _pieces(rows_of_one)], False, TRUTH_COLOR, 5, cv2.LINE_AA)
     for rows_of_one in _by_identity(estimate):
@@ -49,6 +50,11 @@ def draw_floor_plan(path: Path, truth: FloorTracks, estimate: FloorTracks, area:
     cv2.putText(picture, caption, (12, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
     if not cv2.imwrite(str(path), picture):
         raise OSError(f"cannot write {path}")
+
+
+def _line(picture: np.ndarray, ends: np.ndarray) -> None:
+    start, end = ends.tolist()
+    cv2.line(picture, start, end, GRID_COLOR)
 
 
 def _by_identity(tracks: FloorTracks) -> list[FloorTracks]:

@@ -62,10 +62,12 @@ def load_pets(folder: Path, config: PeopleConfig) -> Pets:
 def furniture(camera: FloorCamera, outlines: dict[str, Any]) -> np.ndarray:
     """Depth image (rows, cols) in metres of the lamp post with its sign and of the tripod, as thin upright things."""
     post, tripod = np.zeros(camera.shape, np.uint8), np.zeros(camera.shape, np.uint8)
-    cv2.line(post, *outlines["pole_line"], 255, outlines["pole_width_px"])
-    cv2.rectangle(post, *outlines["sign_rect"], 255, cv2.FILLED)
-    for line in outlines["tripod_lines"]:
-        cv2.line(tripod, *line, 255, TRIPOD_LINE_PX)
+    top, foot = outlines["pole_line"]
+    cv2.line(post, top, foot, 255, outlines["pole_width_px"])
+    corner, opposite = outlines["sign_rect"]
+    cv2.rectangle(post, corner, opposite, 255, cv2.FILLED)
+    for start, end in outlines["tripod_lines"]:
+        cv2.line(tripod, start, end, 255, TRIPOD_LINE_PX)
     depths = [
         np.where(mask > 0, np.asarray(upright_depth(camera, jnp.array(outlines[name], float))), np.inf)
         for mask, name in ((post, "pole_ground_xy"), (tripod, "tripod_ground_xy"))

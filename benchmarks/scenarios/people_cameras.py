@@ -132,7 +132,8 @@ def handovers(room: DemoRoom) -> int:
     seen = np.stack([[sees_whole(camera, xy) for camera in room.cameras] for xy in room.routes.xy])
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)
     nearest = np.argmin(np.where(seen, distance, np.inf), axis=1)
-    changed = (np.diff(nearest, axis=0) != 0) & seen.any(axis=1)[1:] & seen.any(axis=1)[:-1]
+    anybody = np.asarray(seen.any(axis=1))
+    changed = (np.diff(nearest, axis=0) != 0) & anybody[1:] & anybody[:-1]
     return int(changed.sum())
 
 

@@ -67,7 +67,7 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     metrics: dict[str, Metric] = {}
     for suffix, rows in (("", positions(kept)), ("_filtered", followed.confirmed)):
         estimate = within(rows, pets, covered)
-        scores = evaluate(annotated, estimate, camera_xy_m=pets.camera.position()[:2])
+        scores = evaluate(annotated, estimate, camera_xy_m=np.asarray(pets.camera.position())[:2])
         metrics |= score_metrics(scores, suffix)
     metrics |= _speed(followed)
     if out is not None:
@@ -97,7 +97,7 @@ def follow(pets: Pets, frames: int | None) -> Followed:
         clock.append(time.perf_counter())
         known, said = jax.device_get((people, report))
         added = recorder.add(i, i / FRAMES_PER_SECOND, known, said)
-        confirmed += [(i, who, *map(float, seen.mean[:2])) for who, seen in added if seen.frame == i]
+        confirmed += [(i, who, float(seen.mean[0]), float(seen.mean[1])) for who, seen in added if seen.frame == i]
         seconds.append(np.diff(clock))
         if i % 100 == 99:
             sys.stderr.write(f"  {i + 1} frames\n")
@@ -128,7 +128,9 @@ def read_truth(path: Path, pets: Pets) -> FloorTracks:
 
 def positions(tracks: dict[int, list[Sighting]]) -> list[tuple[int, int, float, float]]:
     """Frame, identity, X and Y of everybody."""
-    return [(seen.frame, who, *map(float, seen.mean[:2])) for who, track in tracks.items() for seen in track]
+    return [
+        (seen.frame, who, float(seen.mean[0]), float(seen.mean[1])) for who, track in tracks.items() for seen in track
+    ]
 
 
 def within(rows: list[tuple[int, int, float, float]], pets: Pets, frames: tuple[int, int]) -> FloorTracks:

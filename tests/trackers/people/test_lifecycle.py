@@ -1,0 +1,169 @@
+"""Who is there: confirmed by evidence, lost without it, remembered for a while, known again by clothes and place."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people.fit import Fit
+from jaxfilters.trackers.people.newcomers import Newcomer
+from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, PeopleConfig, nobody
+from jaxfilters.trackers.people.tracker import people_scene
+
+SLOTS = 4
+CONFIG = PeopleConfig(capacity=SLOTS, cell_m=2.0)
+RED, BLUE = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3))
+judge, name = jax.jit(lifecycle.judged), jax.jit(lifecycle.named)
+
+
+@pytest.fixture(scope="module")
+def scene(camera, floor):
+    return people_scene([camera], floor, config=CONFIG)
+
+
+def people_of(*modes, **fields):
+    """Slots of some modes at known places on the floor, 0.5 m apart."""
+    people = nobody(CONFIG)
+    mode = jnp.array([*modes, *[FREE] * (SLOTS - len(modes))], jnp.int32)
+    mean = jnp.zeros_like(people.belief.mean).at[:, 0].set(0.5 * jnp.arange(SLOTS)).at[:, 4].set(1.7)
+    people = people._replace(belief=Gaussian(mean, 0.01 * people.belief.covariance), mode=mode)
+    return people._replace(**{key: jnp.asarray(value) for key, value in fields.items()})
+
+
+def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
+    full = lambda value: jnp.broadcast_to(jnp.asarray(value, float), (SLOTS,))
+    blank = Quadratic(full(0), jnp.zeros((SLOTS, 4)), jnp.zeros((SLOTS, 4, 4)))
+    axes = jnp.zeros((SLOTS, 4, 4))
+    return Fit(jnp.zeros((SLOTS, 4)), axes, blank, full(score), full(share_seen), full(0), full(surplus))
+
+
+def judged(scene, people, fit, *, dt=0.1, looked=True, frames=1):
+    for _ in range(frames):
+        people = judge(scene, people, fit, jnp.asarray(dt), jnp.asarray(looked))
+    return people
+
+
+def test_evidence_confirms_somebody(scene):
+    """Four units of log odds, at most one a frame however good the score."""
+    people = people_of(TENTATIVE)
+    assert judged(scene, people, fit_of(3.0), frames=4).mode[0] == TENTATIVE
+    assert judged(scene, people, fit_of(3.0), frames=5).mode[0] == TRACKED
+    assert judged(scene, people, fit_of(0.1), frames=30).mode[0] == TENTATIVE
+
+
+def test_what_is_nobody_is_given_up_and_somebody_is_remembered(scene):
+    people = people_of(TENTATIVE, TRACKED, log_odds=[0.0, 0.0, 0.0, 0.0])
+    after = judged(scene, people, fit_of(-1.5))
+    assert after.mode.tolist() == [FREE, DORMANT, FREE, FREE]
+    long_known = people_of(TENTATIVE, TRACKED, log_odds=[0.0, 8.0, 0.0, 0.0])
+    assert judged(scene, long_known, fit_of(-1.5)).mode[1] == TRACKED
+
+
+def test_somebody_hidden_is_believed_in_for_a_while_then_remembered_then_forgotten(scene):
+    """Seconds: 3 hidden, 5 more remembered."""
+    people, hidden = people_of(TRACKED, log_odds=[8.0, 0, 0, 0]), fit_of(0.0, share_seen=0.05)
+    assert judged(scene, people, hidden, frames=29).mode[0] == TRACKED
+    assert judged(scene, people, hidden, frames=31).mode[0] == DORMANT
+    assert judged(scene, people, hidden, frames=79).mode[0] == DORMANT
+    assert judged(scene, people, hidden, frames=81).mode[0] == FREE
+
+
+def test_without_an_image_nothing_is_learnt_but_time_passes(scene):
+    people = people_of(TENTATIVE, TRACKED, log_odds=[2.0, 5.0, 0, 0])
+    after = judged(scene, people, fit_of(-2.0), looked=False)
+    assert after.log_odds.tolist() == [2, 5, 0, 0]
+    assert after.mode.tolist()[:2] == [TENTATIVE, TRACKED]
+    np.testing.assert_allclose(after.unseen_s[:2], 0.1, rtol=1e-6)
+
+
+def test_whom_another_explains_as_well_is_given_up(scene):
+    people = people_of(TRACKED, TRACKED, TENTATIVE, log_odds=[8.0, 8.0, 1.0, 0])
+    fit = fit_of(1.0, surplus=[np.inf, 0.2, 0.2, np.inf])
+    after = judged(scene, people, fit)
+    np.testing.assert_allclose(after.log_odds[:3], [8.0, 7.8, 0.7], rtol=1e-5)
+
+
+def test_nobody_is_followed_off_the_floor_or_without_a_place(scene):
+    off = people_of(TRACKED, TRACKED, log_odds=[8.0, 8.0, 0, 0])
+    off = off._replace(belief=Gaussian(off.belief.mean.at[0, 1].set(9.0), off.belief.covariance.at[1, 0, 0].set(2.0)))
+    assert judged(scene, off, fit_of(1.0)).mode.tolist()[:2] == [DORMANT, DORMANT]
+
+
+def test_time_that_stands_still_changes_nothing_of_the_hidden(scene):
+    people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0])
+    after = judged(scene, people, fit_of(0.0, share_seen=0.0), dt=0.0)
+    assert after.log_odds[0] == 8
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+
+
+def test_the_tracked_are_senior_by_identity_and_to_all_who_are_not():
+    people = people_of(TRACKED, TENTATIVE, TRACKED, TENTATIVE, identity=[7, -1, 3, -1], log_odds=[1.0, 3.0, 0.0, 3.0])
+    assert np.argsort(-np.asarray(lifecycle.seniority(people))).tolist() == [2, 0, 1, 3]
+
+
+def test_new_identities_differ_and_are_never_used_again():
+    people = name(people_of(TRACKED, TRACKED, TENTATIVE, next_identity=5))
+    assert people.identity.tolist() == [5, 6, -1, -1]
+    assert name(people._replace(mode=people.mode.at[2].set(TRACKED))).identity.tolist() == [5, 6, 7, -1]
+    freed = name(people._replace(mode=people.mode.at[0].set(FREE)))
+    assert freed.identity.tolist() == [-1, 6, -1, -1]
+
+
+@pytest.mark.parametrize(
+    ("clothes", "at", "unseen_s", "expected"),
+    [(RED, 0.8, 0.0, 2), (RED, 3.0, 0.0, 9), (RED, 3.0, 2.0, 2), (BLUE, 0.8, 0.0, 9)],
+    ids=["same clothes near by", "too far", "far after a while", "other clothes"],
+)
+def test_somebody_who_comes_back_is_known_by_clothes_and_place(clothes, at, unseen_s, expected):
+    people = people_of(TRACKED, DORMANT, identity=[-1, 2, -1, -1], unseen_s=[0, unseen_s, 0, 0], next_identity=9)
+    people = people._replace(
+        appearance=people.appearance.at[0].set(clothes).at[1].set(RED),
+        belief=Gaussian(people.belief.mean.at[0, 0].set(0.5 + at), people.belief.covariance),
+    )
+    after = name(people)
+    back = expected == 2
+    assert after.identity[0] == expected
+    assert after.mode[1] == (FREE if back else DORMANT)
+    assert after.identity[1] == (-1 if back else 2)
+    assert after.next_identity == (9 if back else 10)
+
+
+def test_two_who_come_at_once_are_not_the_same_old_one():
+    people = people_of(TRACKED, DORMANT, TRACKED, identity=[-1, 2, -1, -1], next_identity=9)
+    people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
+    assert name(people).identity.tolist() == [2, -1, 9, -1]
+
+
+def test_clothes_are_taken_at_first_and_then_followed_slowly():
+    people, good = people_of(TRACKED, TRACKED), jnp.array([True, False, False, False])
+    first = lifecycle.remembered(people, jnp.tile(RED, (SLOTS, 1)), good)
+    np.testing.assert_array_equal(first.appearance[0], RED)
+    np.testing.assert_array_equal(first.appearance[1], people.appearance[1])
+    later = lifecycle.remembered(first, jnp.tile(BLUE, (SLOTS, 1)), good)
+    np.testing.assert_allclose(later.appearance[0], 0.9 * RED + 0.1 * BLUE, atol=1e-6)
+    open_ = first.meetings._replace(is_open=first.meetings.is_open.at[0, 1].set(True).at[1, 0].set(True))
+    during = lifecycle.remembered(first._replace(meetings=open_), jnp.tile(BLUE, (SLOTS, 1)), good)
+    np.testing.assert_array_equal(during.appearance[0], RED)
+
+
+def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
+    people = people_of(TRACKED, FREE, TRACKED, FREE, identity=[4, -1, 5, -1], log_odds=[8.0, 3.0, 8.0, 0.0])
+    people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
+    found = Newcomer(jnp.array([1.5, 2.5]), jnp.array(True))
+    after = lifecycle.admitted(CONFIG, people, found)
+    assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
+    np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m])
+    assert after.log_odds.tolist() == [8, 0, 8, 0]
+    np.testing.assert_allclose(after.appearance[1], 1 / 8)
+    np.testing.assert_array_equal(after.belief.mean[2], people.belief.mean[2])
+    unchanged = lifecycle.admitted(CONFIG, people, found._replace(found=jnp.array(False)))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(unchanged), jax.tree.leaves(people), strict=True))
+
+
+def test_a_full_house_admits_nobody():
+    full = people_of(TRACKED, TENTATIVE, DORMANT, TRACKED)
+    after = lifecycle.admitted(CONFIG, full, Newcomer(jnp.array([1.5, 2.5]), jnp.array(True)))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))
