@@ -1,10 +1,11 @@
 """People handed over between four cameras of one room, also with cameras of different rates and one that stops.
 
 The room and its walkers are synthetic, so that places and identities are known; foreground is from the median
-background, as for any video. Names without a suffix are of four cameras that all deliver every frame; `_rates` has
-cameras of which some deliver every second or third frame only; in `_stopped` the first camera delivers nothing in the
-second half; `_one_camera` is the first camera alone, judged on what it sees. `handovers` counts how often another
-camera became the nearest of those that see somebody whole.
+background, as for any video. Names without a suffix are of four cameras that all deliver every frame. In `_narrow` each
+has the middle two fifths of its image only, so that people leave one view for the next and are often in one alone;
+`_rates` has cameras of which some deliver every second or third frame; in `_stopped` the first camera delivers nothing
+in the second half; `_one_camera` is the first camera alone, judged on what it sees. `handovers` counts how often, with
+narrow views, another camera became the nearest of those that see somebody whole.
 
 Where JAXFILTERS_DATA names a folder with `pom_lab_2cam`, two real cameras follow, by their silhouettes. There is no
 truth for them: `pom_agreement` is the share of the people that a published method found (Fleuret et al. 2008, on a grid
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import cv2
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, evaluate, floor_tracks
@@ -37,6 +39,8 @@ PRIME_IMAGES = 24
 WHOLE_M = (0.1, 1.5)
 """Heights that a camera must have in its image to see somebody whole."""
 CAPACITY = 12
+NARROW = 0.4
+"""Of the columns."""
 
 
 class Setup(NamedTuple):
@@ -47,15 +51,23 @@ class Setup(NamedTuple):
     """Frames of which each camera of the room delivers one."""
     first_stops: bool = False
     """Whether the first camera delivers nothing in the second half."""
+    width: float = 1.0
+    """Share of its columns, in the middle, that each camera has; nothing is seen beside them."""
 
     def delivers(self, camera: int, frame: int, frames: int) -> bool:
         """Whether a camera delivers a frame of a recording of some frames."""
         return frame % self.every[camera] == 0 and not (self.first_stops and camera == 0 and frame >= frames // 2)
 
+    def is_seen(self, shape: tuple[int, int]) -> Bool[np.ndarray, " cols"]:
+        """Which columns of an image (rows, cols) a camera has."""
+        middle = (shape[1] - 1) / 2
+        return np.abs(np.arange(shape[1]) - middle) <= self.width * middle
+
 
 ALL = tuple(range(NUM_CAMERAS))
 SETUPS = {
     "": Setup(ALL),
+    "_narrow": Setup(ALL, width=NARROW),
     "_rates": Setup(ALL, every=(1, 2, 3, 2)),
     "_stopped": Setup(ALL, first_stops=True),
     "_one_camera": Setup((0,)),
@@ -72,7 +84,8 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     for suffix in SETUPS:
         truths, estimates = zip(*(tracks[suffix] for tracks in found), strict=True)
         metrics |= _scores(joined(truths), joined(estimates), suffix)
-    changes = [handovers(demo_room(one, cameras=NUM_CAMERAS, frames=frames)) for one in range(seed, seed + len(found))]
+    rooms = [demo_room(one, cameras=NUM_CAMERAS, frames=frames) for one in range(seed, seed + len(found))]
+    changes = [handovers(room, NARROW) for room in rooms]
     metrics["handovers"] = Metric(float(sum(changes)), "", "higher")
     try:
         folder = recording_folder("pom_lab_2cam")
@@ -86,8 +99,8 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
     """Truth and estimate of every setup, by suffix; all setups see the same images."""
     room = demo_room(seed, cameras=NUM_CAMERAS, frames=frames)
     subtractions = [_primed(room, camera) for camera in range(NUM_CAMERAS)]
-    scenes = {setup.cameras: _scene(room, setup.cameras) for setup in SETUPS.values()}
-    people = {suffix: start(scenes[setup.cameras]) for suffix, setup in SETUPS.items()}
+    scenes = {suffix: _scene(room, setup) for suffix, setup in SETUPS.items()}
+    people = {suffix: start(scene) for suffix, scene in scenes.items()}
     rows: dict[str, list[tuple]] = {suffix: [] for suffix in SETUPS}
     for i in range(frames):
         images = [room.image(camera, i) for camera in range(NUM_CAMERAS)]
@@ -96,9 +109,14 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
         ]
         for suffix, setup in SETUPS.items():
             shown = tuple(
-                CameraFrame(seen[c], images[c], np.bool_(setup.delivers(c, i, frames))) for c in setup.cameras
+                CameraFrame(
+                    np.where(setup.is_seen(room.cameras[c].shape), seen[c], np.uint8(0)),
+                    images[c],
+                    np.bool_(setup.delivers(c, i, frames)),
+                )
+                for c in setup.cameras
             )
-            people[suffix], _ = step(scenes[setup.cameras], people[suffix], shown, np.float32(1 / room.fps))
+            people[suffix], _ = step(scenes[suffix], people[suffix], shown, np.float32(1 / room.fps))
             rows[suffix] += confirmed(i, people[suffix])
     sys.stderr.write(f"  seed {seed}: {frames} frames of {NUM_CAMERAS} cameras\n")
     return {suffix: (truth(room, setup), _tracks(rows[suffix])) for suffix, setup in SETUPS.items()}
@@ -110,30 +128,30 @@ def truth(room: DemoRoom, setup: Setup) -> FloorTracks:
     rows = []
     for i in range(frames):
         running = [c for c in setup.cameras if any(setup.delivers(c, j, frames) for j in range(i, frames))]
-        seen = np.any([sees_whole(room.cameras[c], room.routes.xy[i]) for c in running], axis=0)
+        seen = np.any([sees_whole(room.cameras[c], room.routes.xy[i], setup.width) for c in running], axis=0)
         there = seen & room.present(i) & np.asarray(walkable(jnp.asarray(room.floor), jnp.asarray(room.routes.xy[i])))
         rows += [(i, who, *room.routes.xy[i, who]) for who in np.flatnonzero(there)]
     return _tracks(rows)
 
 
-def sees_whole(camera: FloorCamera, xy: np.ndarray) -> np.ndarray:
-    """(people,) who at places (people, 2) is in the image from the feet to the head."""
+def sees_whole(camera: FloorCamera, xy: np.ndarray, width: float = 1.0) -> np.ndarray:
+    """(people,) who at places (people, 2) is in this share of the columns, in the middle, from the feet to the head."""
     rows, cols = camera.shape
     inside = np.ones(len(xy), bool)
     for height in WHOLE_M:
         uv, depth = (np.asarray(a) for a in camera.project(jnp.asarray(np.insert(xy, 2, height, axis=1))))
-        inside &= (depth > 0) & np.all((uv > 0) & (uv < (cols - 1, rows - 1)), axis=-1)
+        away = np.abs(uv - (np.array([cols, rows]) - 1) / 2)
+        inside &= (depth > 0) & np.all(away < np.array([width * (cols - 1), rows - 1]) / 2, axis=-1)
     return inside
 
 
-def handovers(room: DemoRoom) -> int:
+def handovers(room: DemoRoom, width: float) -> int:
     """How often the nearest camera that sees somebody whole became another one."""
     centers = np.stack([np.asarray(camera.position())[:2] for camera in room.cameras])
-    seen = np.stack([[sees_whole(camera, xy) for camera in room.cameras] for xy in room.routes.xy])
+    seen = np.stack([[sees_whole(camera, xy, width) for camera in room.cameras] for xy in room.routes.xy])
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)
     nearest = np.argmin(np.where(seen, distance, np.inf), axis=1)
-    anybody = np.asarray(seen.any(axis=1))
-    changed = (np.diff(nearest, axis=0) != 0) & anybody[1:] & anybody[:-1]
+    changed = (np.diff(nearest, axis=0) != 0) & seen.any(axis=1)[1:] & seen.any(axis=1)[:-1]
     return int(changed.sum())
 
 
@@ -159,10 +177,11 @@ def _primed(room: DemoRoom, camera: int) -> Background:
     return subtraction
 
 
-def _scene(room: DemoRoom, cameras: tuple[int, ...]) -> PeopleScene:
-    furniture = [room.furniture[c] for c in cameras]
+def _scene(room: DemoRoom, setup: Setup) -> PeopleScene:
+    """What a camera does not have is as if something stood right before it."""
+    furniture = [jnp.where(setup.is_seen(room.cameras[c].shape), room.furniture[c], 0.0) for c in setup.cameras]
     config = PeopleConfig(capacity=CAPACITY)
-    return people_scene([room.cameras[c] for c in cameras], room.floor, furniture=furniture, config=config)
+    return people_scene([room.cameras[c] for c in setup.cameras], room.floor, furniture=furniture, config=config)
 
 
 def _tracks(rows: list[tuple]) -> FloorTracks:

@@ -118,7 +118,7 @@ def test_the_plan_shows_truth_and_tracks(tmp_path):
 
 def test_tracks_are_written_by_frame(tmp_path):
     mean = np.array([1.0, 2.0, 0.1, 0.2, 1.75, 0.45])
-    first, later = (Sighting(i, i / 7, mean, np.eye(6), 1.5, "tracked") for i in (3, 4))
+    first, later = (Sighting(i, i / 7, mean, np.eye(6), 1.5, 0, "tracked") for i in (3, 4))
     people_pets.write_tracks(tmp_path / "tracks.csv", {5: [first, later], 2: [later]})
     lines = (tmp_path / "tracks.csv").read_text().splitlines()
     assert lines[0] == "frame,id,x_m,y_m,height_m,score,mode"

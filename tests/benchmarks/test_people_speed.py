@@ -23,7 +23,6 @@ def test_people_in_the_crowd_keep_apart():
 def test_every_metric_is_there_and_everybody_is_followed(monkeypatch):
     monkeypatch.setattr(people_speed, "QUICK_SHAPES", ("160x120",))
     monkeypatch.setattr(people_speed, "QUICK_COUNTS", (1, 8))
-    monkeypatch.setattr(people_speed, "CAPACITY", 9)
     monkeypatch.setattr(people_speed, "QUICK_ROUNDS", 1)
     metrics = people_speed.run(quick=True, seed=0, out=None)
     kinds = ("fps", "tracking_fps", "candidates_per_second", "followed")
