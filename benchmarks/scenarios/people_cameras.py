@@ -151,7 +151,8 @@ def handovers(room: DemoRoom, width: float) -> int:
     seen = np.stack([[sees_whole(camera, xy, width) for camera in room.cameras] for xy in room.routes.xy])
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)
     nearest = np.argmin(np.where(seen, distance, np.inf), axis=1)
-    changed = (np.diff(nearest, axis=0) != 0) & seen.any(axis=1)[1:] & seen.any(axis=1)[:-1]
+    somewhere = np.asarray(seen.any(axis=1))
+    changed = (np.diff(nearest, axis=0) != 0) & somewhere[1:] & somewhere[:-1]
     return int(changed.sum())
 
 

@@ -79,7 +79,7 @@ def speed_metrics(name: str, recordings: dict[int, Recording], rounds: int) -> d
     seconds = interleaved(functions, rounds)
     metrics = {f"{key}_{name}": Metric(1 / value, "frames/s", "higher") for key, value in seconds.items()}
     for count, one in recordings.items():
-        followed = float(jnp.sum(one.people.mode == TRACKED))
+        followed = int(jnp.sum(one.people.mode == TRACKED))
         metrics[f"followed_{count}_people_{name}"] = Metric(float(followed), "", "higher")
         rate = CANDIDATES * count / seconds[f"tracking_fps_{count}_people"]
         metrics[f"candidates_per_second_{count}_people_{name}"] = Metric(rate, "1/s", "higher")
