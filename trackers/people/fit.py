@@ -25,8 +25,12 @@ LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction somebody is searched for, along each axis."""
 HEIGHT_STEP_M = 0.03
 """First step of the search for the height."""
-CURVATURE_STEPS_M = (0.09, 0.045, 0.045, 0.04)
-"""Away from the camera, sideways, height, width: over which the score is taken for a parabola."""
+CURVATURE_PX = 1.85
+"""Pixels sideways over which the score is taken for a parabola: noise is finer than that, shapes are not."""
+LEAST_STEP_M, MOST_STEP_M = 0.045, 0.08
+"""Bounds on what these pixels come to in metres."""
+STEP_SHARES = (2.0, 1.0, 1.0, 0.9)
+"""Steps away from the camera, sideways, in height and in width, in steps sideways."""
 PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
@@ -45,6 +49,8 @@ class Fit(NamedTuple):
     """X, Y, height, width: metres; where the likelihood of the images times the prediction is largest."""
     axes: Float[Array, "slots 4 4"]
     """Rows: unit vectors away from the camera, sideways, along the height and the width."""
+    steps: Float[Array, "slots 4"]
+    """Metres along `axes` over which the score was taken for a parabola."""
     quadratic: Quadratic
     """The log likelihood around `place`, along `axes`."""
     score: Float[Array, " slots"]
@@ -108,30 +114,30 @@ def fit_people(
 
     num_active = jnp.sum(active)
     places = jax.lax.fori_loop(0, PASSES * num_active, one_person, start)
-    return _curvature(scene, places, active, seniority, views, axes)
+    return _curvature(scene, places, active, seniority, views, axes, _steps(scene, start))
 
 
-def _curvature(scene, places, active, seniority, views, axes) -> Fit:
-    steps = jnp.array(CURVATURE_STEPS_M)
+def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
+    around = foreground.lattice(4)
     away = PROFILE_M * jnp.eye(1, 4)
-    offsets = jnp.concatenate([foreground.lattice(4) * steps, -away, away])
-    middle = len(offsets) // 2 - 1
+    middle = len(around) // 2
 
     def one(k, fits):
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        candidates = places[k] + offsets @ axes[k]
+        candidates = places[k] + jnp.concatenate([around * steps[k], -away, away]) @ axes[k]
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
         scores = values / scene.config.independent_patches
         fit = Fit(
             places[k],
             axes[k],
-            foreground.quadratic_fit(values[:-2], steps),
+            steps[k],
+            foreground.quadratic_fit(values[:-2], steps[k]),
             scores[middle],
             share_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
-            _surplus(scene, places, active, seniority, views, axes, k, scores[middle]),
+            _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
@@ -139,6 +145,7 @@ def _curvature(scene, places, active, seniority, views, axes) -> Fit:
     empty = Fit(
         places,
         axes,
+        steps,
         Quadratic(jnp.zeros(n), jnp.zeros((n, 4)), jnp.zeros((n, 4, 4))),
         jnp.zeros(n),
         jnp.zeros(n),
@@ -149,7 +156,7 @@ def _curvature(scene, places, active, seniority, views, axes) -> Fit:
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
 
 
-def _surplus(scene, places, active, seniority, views, axes, k, score):
+def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
     """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best."""
     apart = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
     apart = jnp.where(active & (seniority > seniority[k]), apart, jnp.inf)
@@ -160,7 +167,7 @@ def _surplus(scene, places, active, seniority, views, axes, k, score):
         others = active.at[k].set(False).at[senior].set(False)
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])
-        offsets = (foreground.lattice(2) @ jnp.eye(2, 4)) * jnp.array(CURVATURE_STEPS_M) @ axes[senior]
+        offsets = (foreground.lattice(2) @ jnp.eye(2, 4)) * steps[senior] @ axes[senior]
         candidates = places[senior] + (between[:, None] + offsets).reshape(-1, 4)
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
@@ -178,16 +185,16 @@ def as_measurement(
     directions of the eigenvectors of J each reading stands alone, and those without curvature drop out.
     """
 
-    def one(place, axes, quadratic):
+    def one(place, axes, steps, quadratic):
         eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
         seen = eigenvalues > LEAST_CURVATURE
         curvature = jnp.where(seen, eigenvalues, 1.0)
-        limit = jnp.linalg.norm(jnp.array(CURVATURE_STEPS_M))
+        limit = jnp.linalg.norm(steps)
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
         return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen
 
-    return jax.vmap(one)(fit.place, fit.axes, fit.quadratic)
+    return jax.vmap(one)(fit.place, fit.axes, fit.steps, fit.quadratic)
 
 
 def _prior(predicted):
@@ -198,6 +205,19 @@ def _prior(predicted):
 
 def _axes(scene, place):
     return jnp.eye(4).at[:2, :2].set(line_of_sight(scene, place[:2]))
+
+
+def _steps(scene, places):
+    """From the size of a pixel of the camera that sees each person finest."""
+
+    def pixel_m(camera):
+        first, second, third = camera.P[:, :3]
+        focal = jnp.sqrt(jnp.linalg.norm(jnp.cross(first, third)) * jnp.linalg.norm(jnp.cross(second, third)))
+        depth = camera.project(jnp.insert(places[:, :2], 2, 1.0, axis=1))[1]
+        return jnp.where(depth > 0, depth, jnp.inf) / focal
+
+    finest = jnp.min(jnp.stack([pixel_m(camera) for camera in scene.cameras]), axis=0)
+    return jnp.clip(CURVATURE_PX * finest, LEAST_STEP_M, MOST_STEP_M)[:, None] * jnp.array(STEP_SHARES)
 
 
 def _reach(predicted, axes):

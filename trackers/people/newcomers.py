@@ -12,7 +12,7 @@ from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import walkable
-from jaxfilters.trackers.people.silhouettes import body_of, presence_of
+from jaxfilters.trackers.people.silhouettes import area_of, body_of, presence_of
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
 
 REDUCED_COLS = 160
@@ -54,6 +54,7 @@ def cells_of(
         tuple(look.pixels[kept] for look in looks),
         tuple(look.presence[kept] for look in looks),
         tuple(look.share[kept] for look in looks),
+        tuple(look.area[kept] for look in looks),
     )
 
 
@@ -73,6 +74,7 @@ class _Look(NamedTuple):
     pixels: Int32[Array, "cells samples"]
     presence: Float[Array, "cells samples"]
     share: Float[Array, " cells"]
+    area: Float[Array, " cells"]
 
 
 def _look(camera, furniture, config, xy, offsets):
@@ -90,7 +92,7 @@ def _look(camera, furniture, config, xy, offsets):
         free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > seen.depth)
         weight = presence(camera.P, xy, config.height_m, config.width_m, uv, config.spread_px)
         index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
-        return _Look(index, weight, jnp.sum(weight * free) / weight.sum())
+        return _Look(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(seen) / step**2)
 
     return jax.jit(jax.vmap(one))(xy)
 
@@ -98,24 +100,27 @@ def _look(camera, furniture, config, xy, offsets):
 def newcomer(
     scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
 ) -> Newcomer:
-    """The floor point with most unexplained evidence, if it is enough.
+    """The floor point whose person explains most, of those with enough evidence a pixel.
 
-    One a frame: whoever stands beside is found in the next, once it is known what the first explains.
+    The mean over a silhouette says whether somebody is there, but not where: somebody small and far away fits into any
+    large silhouette. The sum, which is the log likelihood, says where. One newcomer a frame: whoever stands beside is
+    found in the next, once it is known what the first explains.
     """
     config, cells = scene.config, scene.cells
-    total, shares = jnp.zeros(len(cells.xy)), jnp.zeros(len(cells.xy))
-    for camera, depth, frame, index, weight, share in zip(
-        scene.cameras, scene.furniture, frames, cells.pixels, cells.presence, cells.share, strict=True
+    total = shares = explained = jnp.zeros(len(cells.xy))
+    for camera, depth, frame, index, weight, share, area in zip(
+        scene.cameras, scene.furniture, frames, cells.pixels, cells.presence, cells.share, cells.area, strict=True
     ):
         b = jnp.append(_reduced_contrast(scene, camera, depth, places, active, frame).ravel(), 0.0)
         ratio = jax.vmap(log_likelihood_ratio)(weight, b[index])
         seen = frame.present * (share >= LEAST_SHARE)
-        total, shares = total + seen * ratio, shares + seen * share
+        total, shares, explained = total + seen * ratio, shares + seen * share, explained + seen * ratio * area
     # One sample stands for this share of the ellipse's area.
     per_area = (2 * MARGIN) ** 2 / (jnp.pi * SAMPLES[0] * SAMPLES[1])
     evidence = total * per_area / jnp.maximum(shares, 1e-6)
-    best = jnp.argmax(evidence)
-    return Newcomer(cells.xy[best], evidence[best] > config.newcomer_evidence)
+    found = evidence > config.newcomer_evidence
+    best = jnp.argmax(jnp.where(found, explained, -jnp.inf))
+    return Newcomer(cells.xy[best], found[best])
 
 
 def _reduced_contrast(scene, camera, furniture, places, active, frame):

@@ -82,10 +82,11 @@ def view_of(
     depth = furniture.ravel()[window.pixel]
     body = body_of(place)
     visible = window.inside * shown * (near_depth(camera.P, body, window.uv) < depth)
-    return View(window, probability, depth, visible, _area(outline(camera.P, body)))
+    return View(window, probability, depth, visible, area_of(outline(camera.P, body)))
 
 
-def _area(seen: Outline):
+def area_of(seen: Outline) -> Float[Array, ""]:
+    """Of an outline, square pixels; one at least."""
     (a, b), (_, c) = seen.shape
     return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
 

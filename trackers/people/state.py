@@ -108,6 +108,8 @@ class Cells(NamedTuple):
     """Of a person at the samples."""
     share: tuple[Float[Array, " cells"], ...]
     """Of the samples that lie in each image and in front of furniture."""
+    area: tuple[Float[Array, " cells"], ...]
+    """Of a person's outline, in pixels of the reduced images."""
 
 
 class CameraFrame(NamedTuple):
@@ -170,7 +172,7 @@ class Report(NamedTuple):
     score: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel, against nobody being there."""
     share_seen: Float[Array, " slots"]
-    """Of the silhouette, in an image and hidden by nobody and nothing."""
+    """Of the silhouette, in an image, not behind furniture, and not shared with anybody before or behind."""
     flatness: Float[Array, " slots"]
     """How much the score drops 0.3 m nearer or farther along the line of sight: small where depth cannot be seen."""
     has_depth: Bool[Array, " slots"]

@@ -31,7 +31,8 @@ def parabolas(seed, n):
     curvature = np.einsum("nai,nij,nbj->nab", axes, precision, axes)
     none = jnp.zeros(n)
     quadratic = Quadratic(none, jnp.asarray(gradient), jnp.asarray(curvature))
-    return Fit(jnp.asarray(place), jnp.asarray(axes), quadratic, none, none, none, none), mean, precision
+    steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
+    return Fit(jnp.asarray(place), jnp.asarray(axes), steps, quadratic, none, none, none, none), mean, precision
 
 
 @pytest.mark.usefixtures("x64")

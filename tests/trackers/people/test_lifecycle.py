@@ -37,7 +37,16 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
     full = lambda value: jnp.broadcast_to(jnp.asarray(value, float), (SLOTS,))
     blank = Quadratic(full(0), jnp.zeros((SLOTS, 4)), jnp.zeros((SLOTS, 4, 4)))
     axes = jnp.zeros((SLOTS, 4, 4))
-    return Fit(jnp.zeros((SLOTS, 4)), axes, blank, full(score), full(share_seen), full(0), full(surplus))
+    return Fit(
+        jnp.zeros((SLOTS, 4)),
+        axes,
+        jnp.full((SLOTS, 4), 0.1),
+        blank,
+        full(score),
+        full(share_seen),
+        full(0),
+        full(surplus),
+    )
 
 
 def judged(scene, people, fit, *, dt=0.1, looked=True, frames=1):

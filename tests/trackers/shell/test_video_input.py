@@ -66,7 +66,7 @@ def test_a_folder_of_images_is_read_in_order_and_must_be_of_one_size(tmp_path):
     assert [(t, int(image[0, 0, 0])) for t, image in source.images()] == [(0.0, 0), (0.2, 10), (0.4, 20)]
     cv2.imwrite(str(tmp_path / "999.png"), np.zeros((5, 6, 3), np.uint8))
     with pytest.raises(InputError, match=r"999\.png"):
-        list(source.images())
+        list(open_video(str(tmp_path)).images())
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(InputError, match="no images"):
