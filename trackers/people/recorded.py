@@ -10,11 +10,9 @@ import numpy as np
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.kalman import joseph
+from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
 from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, Report
-
-HIDDEN_SHARE = 0.2
-"""Somebody of whose silhouette less is seen is `hidden`."""
 
 
 class Sighting(NamedTuple):

@@ -51,7 +51,7 @@ def presence_of(
 
 def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
     """Rows: unit vectors on the floor away from whichever camera is nearest, and at right angles."""
-    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
+    centers = scene.centers()
     away = xy - centers[jnp.argmin(jnp.sum((xy - centers) ** 2, axis=-1))]
     distance = jnp.linalg.norm(away)
     # Straight below the camera any direction is as good.

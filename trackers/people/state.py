@@ -96,6 +96,10 @@ class PeopleScene:
     cells: "Cells"
     config: PeopleConfig = field(metadata=dict(static=True))
 
+    def centers(self) -> Float[Array, "cameras 2"]:
+        """Where the cameras are above the floor, metres."""
+        return jnp.stack([camera.position()[:2] for camera in self.cameras])
+
 
 class Cells(NamedTuple):
     """Floor points at which newcomers are looked for, and the pixels to look at for each camera."""

@@ -160,5 +160,4 @@ def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
 
 def _distance(scene: PeopleScene, xy: Array) -> Array:
     """From whichever camera is nearest, on the floor."""
-    centers = jnp.stack([camera.position()[:2] for camera in scene.cameras])
-    return jnp.min(jnp.linalg.norm(xy[:, None] - centers, axis=-1), axis=1)
+    return jnp.min(jnp.linalg.norm(xy[:, None] - scene.centers(), axis=-1), axis=1)

@@ -13,6 +13,7 @@ import cv2
 import jax
 import numpy as np
 
+from jaxfilters.models.person.ellipsoid import VISIBLE
 from jaxfilters.trackers.background import Background, background
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
@@ -199,7 +200,7 @@ def _frames(moment, images, backgrounds, keep) -> tuple[CameraFrame, ...]:
 def _occupied(seen: Any, people: People, shape: tuple[int, int]) -> np.ndarray:
     """Non-zero where people stand."""
     mask = np.zeros(shape, np.uint8)
-    for slot in np.flatnonzero(((people.mode == TRACKED) | (people.mode == TENTATIVE)) & (seen.code == 0)):
+    for slot in np.flatnonzero(((people.mode == TRACKED) | (people.mode == TENTATIVE)) & (seen.code == VISIBLE)):
         reach = KEPT_BEYOND * np.sqrt(np.diagonal(seen.shape[slot]))
         low, high = seen.center[slot] - reach, seen.center[slot] + reach
         u, v = np.clip(np.round([low[0], high[0]]), 0, shape[1]), np.clip(np.round([low[1], high[1]]), 0, shape[0])

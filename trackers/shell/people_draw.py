@@ -8,7 +8,6 @@ import numpy as np
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, People, PeopleScene
-from jaxfilters.trackers.shell.people_files import centers_of
 from jaxfilters.trackers.shell.results import OutputError
 from jaxfilters.trackers.shell.video import caption
 
@@ -71,7 +70,7 @@ def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]
         OutputError: it cannot be written.
     """
     floor = np.asarray(scene.floor, float)
-    centers = centers_of(scene)
+    centers = np.asarray(scene.centers())
     everything = np.concatenate([floor, centers])
     low, high = everything.min(axis=0) - 0.3, everything.max(axis=0) + 0.3
     scale = (_PLAN_PX - 2 * _MARGIN_PX) / max(high - low)

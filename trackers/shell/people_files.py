@@ -26,7 +26,7 @@ class TrackTableWriter:
         Raises:
             OutputError: the folder cannot be written, or holds tracks already.
         """
-        self.path, self._centers = folder / "tracks.csv", centers_of(scene)
+        self.path, self._centers = folder / "tracks.csv", np.asarray(scene.centers())
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if self.path.exists() and not overwrite:
@@ -67,7 +67,7 @@ def replace_tracks(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighti
         with partial.open("w", newline="") as file:
             rows = csv.writer(file)
             rows.writerow(COLUMNS)
-            centers = centers_of(scene)
+            centers = np.asarray(scene.centers())
             rows.writerows(_row(centers, identity, seen) for identity, seen in by_frame(tracks))
         partial.replace(path)
     except OSError as error:
@@ -114,11 +114,6 @@ def by_frame(tracks: dict[int, list[Sighting]]) -> list[tuple[int, Sighting]]:
     """All sightings with their identities, by frame and identity."""
     everything = [(identity, seen) for identity, track in tracks.items() for seen in track]
     return sorted(everything, key=lambda item: (item[1].frame, item[0]))
-
-
-def centers_of(scene: PeopleScene) -> np.ndarray:
-    """(cameras, 2) where the cameras are above the floor, metres."""
-    return np.stack([np.asarray(camera.position())[:2] for camera in scene.cameras])
 
 
 def _row(centers: np.ndarray, identity: int, seen: Sighting) -> list[Any]:
