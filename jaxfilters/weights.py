@@ -61,6 +61,26 @@ def mean(particles: PyTree[Shaped[Array, "..."]], log_weights: Float[Array, " n"
     return jax.tree.map(lambda leaf: jnp.sum(jnp.where(w > 0, leaf, 0) * w, axis=-1), particles)
 
 
+def mean_around_mode(
+    x: Float[Array, "d n"],
+    log_weights: Float[Array, " n"],
+    scale: Float[Array, " d"],
+    *,
+    distance: float | Num[Array, ""] = 2.0,
+) -> Float[Array, " d"]:
+    """Weighted mean of the particles near the heaviest one: where the highest peak of several is.
+
+    Near means a Euclidean distance below `distance` once every coordinate is divided by its `scale`, positive and in
+    the coordinate's own unit (K. Oka, Y. Sato et al. 2006, equations 18-19). Of equally heavy particles the first
+    counts as the heaviest; which particles are near is a constant to differentiation.
+    """
+    heaviest = jnp.argmax(linear(log_weights))
+    apart = jax.lax.stop_gradient((x - x[:, heaviest, None]) / scale[:, None])
+    near = jnp.sum(jnp.square(apart), axis=0) < distance**2
+    near = near | (jnp.arange(log_weights.shape[0]) == heaviest)
+    return mean(x, jnp.where(near, _below_peak(log_weights)[0], -jnp.inf))
+
+
 def covariance(x: Float[Array, "d n"], log_weights: Float[Array, " n"]) -> Float[Array, "d d"]:
     """Weighted covariance `sum_i w_i (x_i - mean)(x_i - mean)^T`, without a small-sample correction."""
     w = linear(log_weights)

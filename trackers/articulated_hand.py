@@ -35,15 +35,13 @@ from jaxfilters.models.articulated.filters import (
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
-from jaxfilters.models.articulated.motion import about_ease
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated_start import NUM_STARTS, Starts, starts_from_points
 from jaxfilters.trackers.feature_sequence import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
 from jaxfilters.trackers.tracker import SequenceTracker
 
 SEARCHING, TRACKING, LOST = range(3)
-FRAME_INTERVAL = 1 / 30
-"""Seconds: what the process noise takes for a frame."""
 LOST_NIS = 25.0
 """Normalised innovation squared, per measured row, above which the hand counts as not there: 5 deviations each."""
 HAND_DIAGONAL = 0.19

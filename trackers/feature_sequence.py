@@ -1,6 +1,7 @@
 """Features of an articulated hand over time: what was measured in each frame, how well, and the truth where known."""
 
 import hashlib
+import math
 import re
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -9,16 +10,19 @@ import numpy as np
 
 from jaxfilters.models.articulated.features import BLOCKS, KEYPOINTS, FeatureSet
 from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, MOVEMENT_TIME
 from jaxfilters.trackers.recording import InputError, check_times
 
 NUM_KEYPOINTS = 21
 """Of one hand: wrist, thumb 1-4, index, middle, ring, little finger, base to tip."""
 LEAST_CONFIDENCE = 0.2
 """Keypoints below it count as not seen; it is what OpenPose draws hands from."""
-NOISE_SHARE = 0.03
-"""Noise of a keypoint's coordinate as a share of the hand's diagonal in the image, where nobody says better. Detectors
-look at a crop around the hand, so that their error grows with it; of 15 networks on two sets of depth images it was 1
-to 7 % (root mean square), and 1 to 5 % without the outliers."""
+NOISE_SHARE = 0.05
+"""Noise of a keypoint's coordinate in one frame as a share of the hand's diagonal in the image, where nobody says
+better. Detectors look at a crop around the hand, so that their error grows with it. That of MediaPipe's network is
+13.4 % of the palm's size (F. Zhang et al., MediaPipe Hands: on-device real-time hand tracking, 2020, table 1; which
+distances it takes is not said). With the palm as long as from wrist to knuckles, half of the diagonal of an average
+hand, that is 6.7 % of the diagonal, and as a root mean square of distances 4.7 % in each coordinate."""
 
 _PATTERNS = {
     "wrist": "wrist_[xy]",
@@ -116,15 +120,15 @@ def from_keypoints(
 ) -> FeatureSequence:
     """Keypoints of a hand with five fingers as features: rows wrist, bases, joints.
 
-    A keypoint of confidence c has the standard deviation `noise_px / min(c, 1)` in each coordinate, and was not seen
-    where c < `LEAST_CONFIDENCE` or one of its coordinates is NaN.
+    A keypoint of confidence c is off by `noise_px / min(c, 1)` in each coordinate (standard deviation), and was not
+    seen where c < `LEAST_CONFIDENCE` or one of its coordinates is NaN. The filter is told that times `persistence`.
 
     Args:
         times_s: (frames,) seconds.
         points: (frames, 21, 2) pixels, in the order of `NUM_KEYPOINTS`, NaN where nothing was seen.
         name: For messages and reports.
         confidence: (frames, 21), 0 or more; 1 for all unless given.
-        noise_px: Standard deviation of a coordinate at full confidence; `keypoint_noise` unless given.
+        noise_px: Standard deviation of a coordinate in one frame at full confidence; `keypoint_noise` unless given.
         image_shape: Rows and columns of the camera's image.
 
     Raises:
@@ -151,7 +155,8 @@ def from_keypoints(
     noise_px = keypoint_noise(points) if noise_px is None else noise_px
     if not 0 < noise_px < np.inf:
         raise InputError(f"{name}: noise must be positive, in pixels; got {noise_px}.")
-    std = np.where(seen, noise_px / np.clip(confidence, LEAST_CONFIDENCE, 1.0), 1.0)
+    check_times(times_s, name)
+    std = np.where(seen, persistence(times_s) * noise_px / np.clip(confidence, LEAST_CONFIDENCE, 1.0), 1.0)
     return FeatureSequence(
         num_fingers=(NUM_KEYPOINTS - 1) // 4,
         features=KEYPOINTS,
@@ -175,6 +180,19 @@ def keypoint_noise(points: np.ndarray) -> float:
     high = np.where(seen[..., None], points, -np.inf)[whole].max(axis=1)
     # A single keypoint has no extent; a pixel is better than certainty.
     return NOISE_SHARE * float(np.median(np.linalg.norm(high - low, axis=-1))) or 1.0
+
+
+def persistence(times_s: np.ndarray) -> float:
+    """By which a filter of white noise has to raise the noise of a detector that looks at times (frames,), seconds.
+
+    A detector errs by what it sees: its errors last as long as a pose. Errors with the correlation exp(-t / T), where
+    T is `MOVEMENT_TIME`, have a mean over many frames dt apart whose variance is coth(dt / 2 T) times that of white
+    errors; at 30 frames/s the standard deviation is raised by 4.5. The median of the steps counts.
+    """
+    if len(times_s) < 2:
+        return 1.0
+    step = float(np.median(np.diff(times_s))) / (FRAME_INTERVAL * MOVEMENT_TIME)
+    return 1 / math.sqrt(math.tanh(0.5 * step))
 
 
 def features_named(names: list[str], recording: str) -> tuple[int, FeatureSet, list[int]]:

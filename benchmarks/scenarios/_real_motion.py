@@ -7,7 +7,6 @@ What limits it: a hand of 90 pixels that faces the camera (ICVL) is flatter, 22 
 be read from detections that are 4 pixels off; there the plane at the depth of the root is nearer to the truth.
 """
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,17 +24,13 @@ from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
-from jaxfilters.models.articulated.motion import MOVEMENT_TIME, about_ease
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated_hand import TRACKING, ArticulatedConfig, tracker_of
 from jaxfilters.trackers.articulated_start import starts_from_points
-from jaxfilters.trackers.feature_sequence import FeatureFrame, keypoint_noise
+from jaxfilters.trackers.feature_sequence import FeatureFrame, keypoint_noise, persistence
 
-FRAME_INTERVAL = 1 / 30
-PERSISTENCE = math.sqrt(2 * MOVEMENT_TIME)
-"""By which a filter of white noise has to raise the noise of a detection. A network errs by what it sees: its errors
-last as long as a pose. Errors with the correlation exp(-t / time) tell in 2 time frames what white ones tell in one."""
 HYPOTHESES = 4
 QUICK_FRAMES = 240
 VARIANTS = ("backprojection", "limits_only", "filter_only", "recommended")
@@ -179,12 +174,12 @@ def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
     """The tracker in one of its modes, started by itself."""
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
-        detections = detections._replace(noise=PERSISTENCE * detections.noise)
+        times = FRAME_INTERVAL * np.arange(len(detections.pixels))
+        detections = detections._replace(noise=persistence(times) * detections.noise)
         hand, limits = hand_of(chosen, detections)
         frames = _frames(detections)
         tracker = tracker_of(hand, limits, None, ArticulatedConfig(mode=mode, hypotheses=HYPOTHESES))
         state = tracker.start(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
-        times = FRAME_INTERVAL * np.arange(len(detections.pixels))
         jax.block_until_ready(tracker.advance(state, frames, times))
         start = time.perf_counter()
         _, track = jax.block_until_ready(tracker.advance(state, frames, times))

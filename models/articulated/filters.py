@@ -45,6 +45,9 @@ LOG_RATIO = 12.0
 BRANCHES = 4
 
 
+_State = ViewState | ConstrainedState | Gaussian
+
+
 class Inequalities(NamedTuple):
     """Limits as a filter takes them: arrays, with the names static."""
 
@@ -117,7 +120,7 @@ def one_by_one(belief: Any, constraints: LinearConstraints) -> tuple[Any, Trunca
     return cut.sequential_halfspaces(belief, constraints, skip=SKIP)
 
 
-def belief_of(state: ViewState | ConstrainedState | Gaussian) -> Gaussian:
+def belief_of(state: _State) -> Gaussian:
     """The belief in the state of any of the filters above."""
     state = state.inner if isinstance(state, ViewState) else state
     return state.belief if isinstance(state, ConstrainedState) else state
@@ -251,7 +254,7 @@ def laplace_log_evidence(
     return jnp.where(jnp.isneginf(info.log_evidence), -jnp.inf, value)
 
 
-def _branches(hand: ArticulatedHand, state: ViewState, look: Look) -> tuple[Look, Bool[Array, " b"]]:
+def _branches(hand: ArticulatedHand, state: _State, look: Look) -> tuple[Look, Bool[Array, " b"]]:
     belief = belief_of(state)
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance), 0.0))
     doubtful = mirror_trigger(belief.mean, std, hand)
@@ -269,12 +272,12 @@ def _branches(hand: ArticulatedHand, state: ViewState, look: Look) -> tuple[Look
     return spread._replace(at=at, reversed=mirrored), tried
 
 
-def _margin(state: ViewState | ConstrainedState | Gaussian, info) -> Float[Array, ""]:
+def _margin(state: _State, info) -> Float[Array, ""]:
     del state
     return report_of(info).least_distance - REJECT
 
 
-def _same(hand: ArticulatedHand, heavier: ViewState, lighter: ViewState) -> Bool[Array, ""]:
+def _same(hand: ArticulatedHand, heavier: _State, lighter: _State) -> Bool[Array, ""]:
     """Whether all joint angles agree within half their deviations and half a degree, and palms within 10 degrees."""
     a, b = belief_of(heavier), belief_of(lighter)
     layout = hand.layout

@@ -16,9 +16,12 @@ from jaxtyping import Array, Float
 from jaxfilters.linalg import safe_sqrt
 from jaxfilters.models.articulated.layout import Layout, white_acceleration_root
 
+FRAME_INTERVAL = 1 / 30
+"""Seconds: what is called a frame here, whatever the camera's rate."""
 MOVEMENT_TIME = 10.0
-"""Frames of a thirtieth of a second: a third of a second is what a movement of the hand takes to run down; reaching and
-grasping last about twice that (M. Jeannerod, The timing of natural prehension movements, 1984)."""
+"""Frames: a third of a second, in which a movement of the hand runs down; a reach takes about twice that. One number
+serves movements of any size: the duration of natural reaches hardly changes with their distance, their speed does
+(M. Jeannerod, The timing of natural prehension movements, Journal of Motor Behavior 16, 1984, 235-254)."""
 ANGLE_SPREAD = math.radians(20.0)
 """Standard deviation of a finger's angle about that at ease. Nine in ten postures of daily activities lie within 26, 32
 and 27 degrees of the middle of their range, from the base of a finger out (G. I. Bain et al., The functional range of

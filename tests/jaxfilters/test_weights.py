@@ -82,3 +82,29 @@ def test_tempering_copes_with_huge_and_impossible_likelihoods():
     assert exponent.dtype == jnp.float32
     one_left = jnp.where(jnp.arange(100) == 7, 0.0, -INF)
     assert 0 < weights.temper_exponent(jnp.zeros(100), one_left, 20.0) <= 1
+
+
+def test_the_mean_around_the_mode_is_that_of_the_particles_near_the_heaviest(x64):
+    rng = np.random.default_rng(2)
+    scale, log_weights = np.array([5.0, 0.1]), rng.normal(size=300)
+    x = scale[:, None] * 3 * rng.normal(size=(2, 300))
+    x, log_weights = np.insert(x, 7, [np.nan, INF], axis=1), np.insert(log_weights, 7, -INF)
+    heaviest = np.argmax(log_weights)
+    near = np.hypot(*((x - x[:, [heaviest]]) / scale[:, None])) < 1.5
+    expected = np.average(x[:, near], axis=1, weights=np.exp(log_weights[near]))
+    arguments = (jnp.asarray(x), jnp.asarray(log_weights) - 1e4, jnp.asarray(scale))
+    assert 1 < np.sum(near) < 100
+    np.testing.assert_allclose(weights.mean_around_mode(*arguments, distance=1.5), expected, rtol=1e-12)
+    np.testing.assert_allclose(weights.mean_around_mode(*arguments, distance=1e-9), x[:, heaviest], rtol=1e-12)
+    everywhere = weights.mean_around_mode(*arguments, distance=1e9)
+    np.testing.assert_allclose(everywhere, weights.mean(*arguments[:2]), rtol=1e-12)
+
+
+def test_of_two_peaks_the_higher_one_is_the_estimate():
+    x = jnp.array([[0.0, 0.1, 0.2, 10.0, 10.1]])
+    log_weights = jnp.log(jnp.array([0.25, 0.2, 0.15, 0.3, 0.1]))
+    estimate = weights.mean_around_mode(x, log_weights, jnp.ones(1))
+    np.testing.assert_allclose(estimate, 10.025, rtol=1e-6)
+    assert np.isfinite(weights.mean_around_mode(x, jnp.full(5, -INF), jnp.ones(1))).all()
+    gradient = jax.grad(lambda x: weights.mean_around_mode(x, log_weights, jnp.ones(1)).sum())(x)
+    np.testing.assert_allclose(gradient, [[0, 0, 0, 0.75, 0.25]], rtol=1e-6)

@@ -14,6 +14,7 @@ from jaxfilters.trackers.feature_sequence import (
     features_named,
     from_keypoints,
     keypoint_noise,
+    persistence,
 )
 from jaxfilters.trackers.recording import InputError
 
@@ -161,7 +162,7 @@ def test_keypoints_become_what_the_model_observes(hand, keypoints):
     sequence = from_keypoints(np.arange(2.0), np.stack([points, points + 1]), "a", noise_px=2.0, image_shape=(48, 64))
     assert sequence.features.names(sequence.num_fingers) == hand.feature_names
     np.testing.assert_allclose(sequence.y, [y, y + 1], rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(sequence.std, 2.0)
+    np.testing.assert_array_equal(sequence.std, 2.0 * persistence(np.arange(2.0)))
     assert sequence.image_shape == (48, 64)
 
 
@@ -175,11 +176,12 @@ def test_noise_grows_as_confidence_falls_and_doubtful_keypoints_are_missing(keyp
     thumb = [names.index(f"p_1{joint}_x") for joint in range(4)]
     assert not sequence[0].mask[names.index("wrist_x")]
     np.testing.assert_array_equal(sequence[0].mask[thumb], [False, True, True, True])
-    np.testing.assert_allclose(sequence[0].std[thumb][1:], [15.0, 3.0, 3.0])
+    raised = persistence(np.arange(2.0))
+    np.testing.assert_allclose(sequence[0].std[thumb][1:], np.array([15.0, 3.0, 3.0]) * raised, rtol=1e-6)
     little = [names.index("p_53_x"), names.index("p_53_y")]
     assert not sequence[1].mask[little].any()
     assert sequence[1].mask.sum() == 40
-    assert (sequence[1].std[sequence[1].mask] == 6.0).all()
+    np.testing.assert_allclose(sequence[1].std[sequence[1].mask], 6.0 * raised, rtol=1e-6)
 
 
 def test_default_noise_is_a_share_of_the_hand_in_the_image():
@@ -190,8 +192,24 @@ def test_default_noise_is_a_share_of_the_hand_in_the_image():
     points[1, 5:] = np.nan
     points[1, 4] = 110, 60  # a fingertip and the wrist alone say little of the size
     points[2] = np.nan
-    assert keypoint_noise(points) == pytest.approx(0.03 * 500)
+    assert keypoint_noise(points) == pytest.approx(0.05 * 500)
     assert keypoint_noise(np.where(np.arange(NUM_KEYPOINTS)[None, :, None] == 3, points, np.nan)) == 1.0
+
+
+@pytest.mark.parametrize("interval", [1 / 120, 1 / 30, 0.2, 1.0])
+def test_errors_that_last_are_raised_to_what_their_mean_is_off_by(interval):
+    # The variance of a mean of n errors with correlation exp(-3 |i - j| dt), times n, from the sum over all pairs.
+    n = 20_000
+    correlation = np.exp(-3 * interval * np.arange(1, n))
+    of_the_mean = 1 + 2 * np.sum((1 - np.arange(1, n) / n) * correlation)
+    assert persistence(interval * np.arange(50.0)) == pytest.approx(np.sqrt(of_the_mean), rel=0.005)
+
+
+def test_persistence_is_that_of_most_steps_and_nothing_for_one_frame():
+    steady = np.arange(40) / 30
+    assert persistence(steady) == pytest.approx(4.47, abs=0.01)
+    assert persistence(np.delete(steady, slice(10, 19))) == pytest.approx(persistence(steady))
+    assert persistence(np.zeros(1)) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,10 @@
-"""`jaxfilters calibrate`: where a fixed camera stands, from points, from pictures of a board, or from Tsai's XML."""
+"""`jaxfilters calibrate`: where fixed cameras stand, from points, from pictures of a board, or from Tsai's XML."""
 
 import argparse
 import csv
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from jaxfilters.models.calibration import (
@@ -26,7 +25,9 @@ from jaxfilters.models.calibration_board import (
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.tsai import calibration_of_tsai
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.calibrate_stereo import calibrate_rig
 from jaxfilters.trackers.shell.camera_files import open_intrinsics, read_tsai, write_calibration, write_camera
+from jaxfilters.trackers.shell.image_files import read_image
 from jaxfilters.trackers.shell.track_command import refusing
 
 _COLUMNS = ("x_m", "y_m", "z_m", "u", "v")
@@ -45,6 +46,7 @@ def calibrate(options: argparse.Namespace) -> str:
         "points": _from_points,
         "charuco": _from_boards,
         "tsai": _from_tsai,
+        "stereo": calibrate_rig,
     }
     return sources[options.source](options)
 
@@ -116,7 +118,7 @@ def _from_boards(options: argparse.Namespace) -> str:
         lambda: charuco_board(options.squares, options.square_m, options.marker_m, dictionary=options.dictionary)
     )
     files = list(dict.fromkeys([*options.images, *([options.floor] if options.floor else [])]))
-    images = {file: _read_image(file) for file in files}
+    images = {file: read_image(file) for file in files}
     sizes = {file: (image.shape[1], image.shape[0]) for file, image in images.items()}
     size = sizes[files[0]]
     if other := [file for file in files if sizes[file] != size]:
@@ -140,17 +142,6 @@ def _from_boards(options: argparse.Namespace) -> str:
     return "\n".join(
         [*told, _written(calibration, options, "the pose over the board on the floor", points_m, view.pixels)]
     )
-
-
-def _read_image(path: Path) -> np.ndarray:
-    try:
-        encoded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-    image = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
-    if image is None:
-        raise InputError(f"{path}: not a complete image.")
-    return image
 
 
 def _from_tsai(options: argparse.Namespace) -> str:

@@ -10,11 +10,12 @@ Pair = tuple[int, int]
 
 def add_calibrate(commands: Any, pair: Callable[[str], Pair]) -> None:
     """Add the command to the parser's `commands`; `pair` reads texts such as 640x480."""
-    calibrate = commands.add_parser("calibrate", help="find out where a fixed camera stands and how it images")
+    calibrate = commands.add_parser("calibrate", help="find out where fixed cameras stand and how they image")
     sources = calibrate.add_subparsers(dest="source", required=True, metavar="SOURCE")
     _add_points(sources, pair)
     _add_charuco(sources, pair)
     _add_tsai(sources, pair)
+    _add_stereo(sources, pair)
 
 
 def _add_points(sources: Any, pair: Callable[[str], Pair]) -> None:
@@ -37,12 +38,7 @@ def _add_points(sources: Any, pair: Callable[[str], Pair]) -> None:
 def _add_charuco(sources: Any, pair: Callable[[str], Pair]) -> None:
     charuco = sources.add_parser("charuco", help="from pictures of a ChArUco board")
     charuco.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="the board held in all places and ways")
-    charuco.add_argument("--squares", type=pair, required=True, metavar="COLUMNSxROWS", help="of the board, as in 7x5")
-    charuco.add_argument("--square-m", type=float, required=True, metavar="METRES", help="side of a square")
-    charuco.add_argument("--marker-m", type=float, required=True, metavar="METRES", help="side of a marker")
-    charuco.add_argument(
-        "--dictionary", default="DICT_4X4_50", metavar="NAME", help="of the markers (default: %(default)s)"
-    )
+    _add_board(charuco, pair)
     charuco.add_argument(
         "--floor",
         type=Path,
@@ -51,6 +47,28 @@ def _add_charuco(sources: Any, pair: Callable[[str], Pair]) -> None:
         "without it, the file holds the intrinsics only",
     )
     _add_out(charuco)
+
+
+def _add_stereo(sources: Any, pair: Callable[[str], Pair]) -> None:
+    stereo = sources.add_parser("stereo", help="two cameras relative to each other, from pictures of a ChArUco board")
+    for side in ("left", "right"):
+        stereo.add_argument(
+            side,
+            type=Path,
+            metavar=side.upper(),
+            help=f"folder of the {side} camera's pictures; both cameras take one at each moment, names sort alike",
+        )
+    _add_board(stereo, pair)
+    stereo.add_argument("--out", type=Path, required=True, metavar="RIG.json", help="the file to write")
+
+
+def _add_board(parser: argparse.ArgumentParser, pair: Callable[[str], Pair]) -> None:
+    parser.add_argument("--squares", type=pair, required=True, metavar="COLUMNSxROWS", help="of the board, as in 7x5")
+    parser.add_argument("--square-m", type=float, required=True, metavar="METRES", help="side of a square")
+    parser.add_argument("--marker-m", type=float, required=True, metavar="METRES", help="side of a marker")
+    parser.add_argument(
+        "--dictionary", default="DICT_4X4_50", metavar="NAME", help="of the markers (default: %(default)s)"
+    )
 
 
 def _add_tsai(sources: Any, pair: Callable[[str], Pair]) -> None:

@@ -1,6 +1,5 @@
 """Fixed cameras on disk: `camera.json`, and Tsai's parameters as XML."""
 
-import json
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +10,15 @@ from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.tsai import TsaiCamera
 from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.results import OutputError
+from jaxfilters.trackers.shell.json_files import (
+    check_intrinsics,
+    image_size_of,
+    numbers_of,
+    one_entry_a_line,
+    read_json,
+    refuse_unknown,
+    write_json,
+)
 from jaxfilters.trackers.undistortion import Undistortion
 
 _KEYS = {"name", "note", "image_size", "P", "K", "R", "t", "distortion"}
@@ -44,17 +51,18 @@ def open_camera(path: str | Path, *, image_size: tuple[int, int] | None = None) 
             ones, a camera that stands below the floor or sees none of it, or images of another size.
     """
     path = Path(path)
-    settings = _read_json(path)
-    cols, rows = _image_size(settings, path)
+    settings = read_json(path, _WANTED)
+    refuse_unknown(settings, _KEYS, path)
+    cols, rows = image_size_of(settings, path)
     if image_size is not None and (cols, rows) != tuple(image_size):
         raise InputError(
             f"{path}: calibrated for images of {cols}x{rows}; got images of {image_size[0]}x{image_size[1]}. "
             "Calibrate for this size, or record at that one."
         )
-    K = _matrix(settings, "K", (3, 3), path)
+    K = numbers_of(settings, "K", (3, 3), path)
     if K is not None:
-        _check_intrinsics(K, path)
-    distortion = _matrix(settings, "distortion", (5,), path)
+        check_intrinsics(K, path)
+    distortion = numbers_of(settings, "distortion", (5,), path)
     if distortion is not None and K is None:
         raise InputError(f"{path}: distortion needs K, the intrinsics of the image with distortion.")
     try:
@@ -74,12 +82,13 @@ def open_intrinsics(path: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[int
         InputError: as `open_camera`, or without K.
     """
     path = Path(path)
-    settings = _read_json(path)
-    image_size = _image_size(settings, path)
-    K, distortion = _matrix(settings, "K", (3, 3), path), _matrix(settings, "distortion", (5,), path)
+    settings = read_json(path, _WANTED)
+    refuse_unknown(settings, _KEYS, path)
+    image_size = image_size_of(settings, path)
+    K, distortion = numbers_of(settings, "K", (3, 3), path), numbers_of(settings, "distortion", (5,), path)
     if K is None:
         raise InputError(f"{path}: K missing, the intrinsics of the camera.")
-    _check_intrinsics(K, path)
+    check_intrinsics(K, path)
     return K, np.zeros(5) if distortion is None else distortion, image_size
 
 
@@ -112,12 +121,7 @@ def write_camera(
     settings |= {"image_size": [int(size) for size in image_size]}
     settings |= {key: np.asarray(value, float).tolist() for key, value in arrays.items() if value is not None}
     settings |= {} if note is None else {"note": note}
-    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in settings.items())
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text("{\n" + lines + "\n}\n")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}.") from None
+    write_json(path, one_entry_a_line(settings) + "\n")
 
 
 def write_calibration(path: str | Path, calibration: Calibration, image_size: tuple[int, int], *, name: str) -> None:
@@ -177,42 +181,9 @@ def read_tsai(path: str | Path) -> TsaiCamera:
     )
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        settings = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {_WANTED}.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not JSON ({error}); {_WANTED}.") from None
-    if not isinstance(settings, dict):
-        raise InputError(f"{path}: {_WANTED}; got a {type(settings).__name__}.")
-    if unknown := set(settings) - _KEYS:
-        raise InputError(f"{path}: unknown entries {sorted(unknown)}; known are {sorted(_KEYS)}.")
-    return settings
-
-
-def _image_size(settings: dict[str, Any], path: Path) -> tuple[int, int]:
-    size = settings.get("image_size")
-    if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
-        raise InputError(f"{path}: image_size must be [columns, rows], two positive integers; got {size!r}.")
-    return size[0], size[1]
-
-
-def _matrix(settings: dict[str, Any], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray | None:
-    if key not in settings:
-        return None
-    try:
-        value = np.asarray(settings[key], float)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: {key} must be numbers of shape {shape}; got {settings[key]!r}.") from None
-    if value.shape != shape or not np.isfinite(value).all():
-        raise InputError(f"{path}: {key} must be finite numbers of shape {shape}; got shape {value.shape}.")
-    return value
-
-
 def _projection(settings: dict[str, Any], K: np.ndarray | None, path: Path) -> np.ndarray:
-    P = _matrix(settings, "P", (3, 4), path)
-    R, t = _matrix(settings, "R", (3, 3), path), _matrix(settings, "t", (3,), path)
+    P = numbers_of(settings, "P", (3, 4), path)
+    R, t = numbers_of(settings, "R", (3, 3), path), numbers_of(settings, "t", (3,), path)
     if R is not None and (np.abs(R @ R.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0):
         kind = "mirrored" if np.linalg.det(R) < 0 else "not orthonormal"
         raise InputError(f"{path}: R must be a rotation; it is {kind}, det R = {np.linalg.det(R):.4g}.")
@@ -224,8 +195,3 @@ def _projection(settings: dict[str, Any], K: np.ndarray | None, path: Path) -> n
         missing = [key for key in ("K", "R", "t") if key not in settings]
         raise InputError(f"{path}: P missing (or {', '.join(missing)}); {_WANTED}.")
     return K @ np.column_stack([R, t])
-
-
-def _check_intrinsics(K: np.ndarray, path: Path) -> None:
-    if np.any(K[2] != (0, 0, 1)) or K[1, 0] != 0 or K[0, 1] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise InputError(f"{path}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; got {K.tolist()}.")

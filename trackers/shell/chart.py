@@ -1,5 +1,6 @@
 """Line charts drawn with OpenCV, so that a bare installation has its pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,6 +26,15 @@ class Curve:
     """(points,) half the height of the band around the line."""
 
 
+@dataclass(frozen=True)
+class Shade:
+    """A stretch of the horizontal axis on paper of another colour."""
+
+    start: float
+    end: float
+    color: Color
+
+
 def draw_chart(
     size: tuple[int, int],
     title: str,
@@ -33,12 +43,15 @@ def draw_chart(
     x_label: str = "",
     *,
     from_zero: bool = False,
+    shades: Sequence[Shade] = (),
 ) -> np.ndarray:
     """(rows, cols, 3) uint8 image of `size` (rows, cols): the curves over `x` (points,), with axes and a legend.
 
-    `from_zero` puts the bottom of the axis at zero. Bands may be cut; lines never are.
+    `from_zero` puts the bottom of the axis at zero. Bands may be cut; lines never are. `shades` lie under everything.
     """
     axes = _Axes(size, (float(x[0]), float(x[-1])), _span(curves, from_zero))
+    for shade in shades:
+        axes.shade(shade)
     axes.frame(title, x_label)
     for curve in curves:
         axes.band(x, curve)
@@ -58,7 +71,7 @@ def ticks(low: float, high: float, most: int = 5) -> np.ndarray:
 
 
 def _span(curves: list[Curve], from_zero: bool) -> tuple[float, float]:
-    lines = np.concatenate([curve.values for curve in curves])
+    lines = np.concatenate([np.zeros(0), *(curve.values for curve in curves)])
     lines = lines[np.isfinite(lines)]
     if not lines.size:
         return 0.0, 1.0
@@ -81,6 +94,12 @@ class _Axes:
         self._x_span = x_span if x_span[1] > x_span[0] else (x_span[0] - 0.5, x_span[0] + 0.5)
         self._y_span = y_span
         self._box = np.asarray((_LEFT, _TOP, size[1] - _RIGHT, size[0] - _BOTTOM)) * _OVERSAMPLE
+
+    def shade(self, shade: Shade) -> None:
+        ends = np.clip(np.asarray([shade.start, shade.end]), *self._x_span)
+        (u0, _), (u1, _) = self._points(ends, np.zeros(2)).tolist()
+        top, bottom = int(self._box[1]), int(self._box[3])
+        cv2.rectangle(self._sheet, (u0, top), (u1, bottom), shade.color, cv2.FILLED)
 
     def frame(self, title: str, x_label: str) -> None:
         left, top, right, bottom = (int(edge) for edge in self._box)

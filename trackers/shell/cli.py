@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.devices import use_all_cores
+from jaxfilters.trackers.shell.head_options import add_head
 from jaxfilters.trackers.shell.people_options import add_people
 
 FAILURE, INTERRUPTED = 2, 130
@@ -38,6 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             from jaxfilters.trackers.shell.people_command import track_people
 
             track_people(options)
+        elif getattr(options, "what", None) == "head-stereo":
+            from jaxfilters.trackers.shell.head_command import track_head
+
+            print(track_head(options))
         else:
             track(_job(options), options)
     except (InputError, OutputError, CheckpointError) as error:
@@ -90,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_articulated_options(articulated)
 
     add_people(what, _seed)
+    add_head(what, _seed)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")

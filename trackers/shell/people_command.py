@@ -1,11 +1,9 @@
 """`jaxfilters track people`."""
 
 import argparse
-import platform
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,12 +19,13 @@ from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, Pe
 from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.camera_files import open_camera
-from jaxfilters.trackers.shell.people_draw import drawn, side_by_side, write_plan
+from jaxfilters.trackers.shell.people_draw import drawn, write_plan
 from jaxfilters.trackers.shell.people_files import TrackTableWriter, replace_tracks, write_mot, write_report
 from jaxfilters.trackers.shell.progress import ProgressLine
-from jaxfilters.trackers.shell.results import OutputError
+from jaxfilters.trackers.shell.results import versions
 from jaxfilters.trackers.shell.scene_files import furniture_of, open_scene
 from jaxfilters.trackers.shell.track_command import refusing
+from jaxfilters.trackers.shell.video import OverlayVideo, side_by_side
 from jaxfilters.trackers.shell.video_input import PRIMING_IMAGES, LiveCamera, Moment, open_video, together
 from jaxfilters.trackers.undistortion import Undistortion
 
@@ -163,7 +162,7 @@ def _follow(place: Place, options: argparse.Namespace, table: TrackTableWriter) 
         interrupted = True
     finally:
         if video is not None:
-            video.release()
+            video.close()
     rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else float("nan")
     return Followed(recorder, index + 1, rate, interrupted)
 
@@ -208,15 +207,10 @@ def _occupied(seen: Any, people: People, shape: tuple[int, int]) -> np.ndarray:
     return mask
 
 
-def _draw(video, out: Path, place: Place, images, shown, people: People, time_s: float) -> cv2.VideoWriter:
+def _draw(video, out: Path, place: Place, images, shown, people: People, time_s: float) -> OverlayVideo:
     picture = side_by_side([drawn(image, seen, people) for image, seen in zip(images, shown, strict=True)], time_s)
     if video is None:
-        fps = max(source.fps for source in place.sources)
-        video = cv2.VideoWriter(
-            str(out / "overlay.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), fps, (picture.shape[1], picture.shape[0])
-        )
-        if not video.isOpened():
-            raise OutputError(f"cannot write {out / 'overlay.mp4'}: the video could not be opened for writing.")
+        video = OverlayVideo(out / "overlay.mp4", max(source.fps for source in place.sources), picture.shape)
     video.write(picture)
     return video
 
@@ -242,12 +236,7 @@ def _report(
         "mean_error_m": None if place.demo is None else _demo_error(place.demo, tracks),
         "background": options.background,
         "config": {name: getattr(place.scene.config, name) for name in place.scene.config.__dataclass_fields__},
-        "versions": {
-            "jaxfilters": version("jaxfilters"),
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
 
 

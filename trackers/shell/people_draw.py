@@ -9,14 +9,11 @@ from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, People, PeopleScene
 from jaxfilters.trackers.shell.results import OutputError
-from jaxfilters.trackers.shell.video import caption
 
 _PLAN_PX = 900
 _MARGIN_PX = 50
 _PAPER, _INK, _FLOOR = (255, 255, 255), (70, 70, 70), (236, 240, 242)
 _UNSURE = (170, 170, 170)
-_TALLEST_PX = 720
-"""Images side by side are shrunk to this height."""
 
 
 def color_of(identity: int) -> tuple[int, int, int]:
@@ -47,20 +44,6 @@ def _draw_one(image, center, shape, color, identity):
         top = (place[0] - 8, max(12, place[1] - int(np.sqrt(shape[1, 1])) - 6))
         cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
         cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 2, cv2.LINE_AA)
-
-
-def side_by_side(images: list[np.ndarray], time_s: float) -> np.ndarray:
-    """The images of all cameras in one, with the time."""
-    height = min(_TALLEST_PX, max(image.shape[0] for image in images))
-    scaled = [
-        image if image.shape[0] == height else cv2.resize(image, (round(image.shape[1] * height / len(image)), height))
-        for image in images
-    ]
-    whole = np.concatenate(scaled, axis=1)
-    # Video coders want even sizes.
-    whole = np.ascontiguousarray(whole[: len(whole) // 2 * 2, : whole.shape[1] // 2 * 2])
-    caption(whole, f"{time_s:.1f} s", 0)
-    return whole
 
 
 def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:

@@ -3,8 +3,10 @@
 import csv
 import errno
 import json
+import platform
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +32,8 @@ class TrackTable(NamedTuple):
     empty: Callable[[int], Any]
     """`frames -> track`: a named tuple of arrays, frames first, that begins with `times_s` and ends with `status`,
     zeros of the right shapes and types. Between these two are the fields of what the tracker returns, in order."""
+    status_names: tuple[str, ...] = STATUS_NAMES
+    """Words for the integers in `status`."""
 
 
 class TrackWriter:
@@ -68,10 +72,10 @@ class TrackWriter:
             checkpoint.save(_checkpoint_path(self._folder), {"state": state, "done": self.results}, meta)
         self.frames_saved = self.frames
 
-    def finish(self, report: dict[str, Any]) -> None:
-        """Write `track.npz` and `report.json`."""
+    def finish(self, report: dict[str, Any], **learnt: np.ndarray) -> None:
+        """Write `track.npz`, with what was `learnt` beside the track, and `report.json`."""
         with self._explained(self._folder / "track.npz"):
-            checkpoint.write_npz(self._folder / "track.npz", self.results._asdict())
+            checkpoint.write_npz(self._folder / "track.npz", self.results._asdict() | learnt)
         with self._explained(self._folder / "report.json"):
             (self._folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
 
@@ -87,7 +91,7 @@ class TrackWriter:
     def _rows(self, first: int, part: Any) -> Iterator[tuple[Any, ...]]:
         for i, time_s in enumerate(part.times_s):
             numbers = (f"{x:.9g}" for x in self._table.numbers(part, i))
-            yield (first + i, f"{time_s:.6f}", *numbers, STATUS_NAMES[int(part.status[i])])
+            yield (first + i, f"{time_s:.6f}", *numbers, self._table.status_names[int(part.status[i])])
 
     def _write_rows(self, rows: Iterable[tuple[Any, ...]], mode: str) -> None:
         with self._explained(path := self._folder / "track.csv"), path.open(mode, newline="") as file:
@@ -142,6 +146,16 @@ def resume(folder: Path, run: dict[str, Any], table: TrackTable, state: Any) -> 
         raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
     saved, _ = checkpoint.load(path, {"state": state, "done": table.empty(meta["frames"])})
     return TrackWriter(folder, run, table, saved["done"]), saved["state"]
+
+
+def versions() -> dict[str, str]:
+    """What a run was made with, for its report."""
+    return {
+        "jaxfilters": version("jaxfilters"),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def can_resume(folder: Path) -> bool:

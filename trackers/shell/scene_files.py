@@ -1,6 +1,5 @@
 """`scene.json`: where people can walk, and what stands in front of them."""
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ import trimesh
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import mesh_depth, patch_depth, upright_depth
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.json_files import read_json
 
 _KEYS = {"floor", "patches", "meshes", "outlines", "note"}
 _WANTED = (
@@ -39,13 +39,8 @@ def open_scene(path: str | Path) -> SceneFile:
         InputError: an unreadable file, unknown entries, or values of a wrong shape.
     """
     path = Path(path)
-    try:
-        settings = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {_WANTED}.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not JSON ({error}); {_WANTED}.") from None
-    if not isinstance(settings, dict) or "floor" not in settings:
+    settings = read_json(path, _WANTED)
+    if "floor" not in settings:
         raise InputError(f"{path}: {_WANTED}.")
     if unknown := set(settings) - _KEYS:
         raise InputError(f"{path}: unknown entries {sorted(unknown)}; {_WANTED}.")

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import math
-import platform
 import sys
 import time
 from collections import Counter
@@ -16,7 +15,7 @@ import numpy as np
 
 from jaxfilters.trackers.recording import InputError, Recording
 from jaxfilters.trackers.shell.progress import ProgressLine
-from jaxfilters.trackers.shell.results import OutputError, TrackTable, TrackWriter, begin, can_resume, resume
+from jaxfilters.trackers.shell.results import OutputError, TrackTable, TrackWriter, begin, can_resume, resume, versions
 from jaxfilters.trackers.shell.session import Progress, follow
 from jaxfilters.trackers.tracker import STATUS_NAMES, SequenceTracker
 
@@ -139,12 +138,7 @@ def _report(job: Job, results: Any, errors: dict[str, float | None], rate: float
         "log_evidence": evidence if math.isfinite(evidence) else None,
         **errors,
         "config": dataclasses.asdict(job.config),
-        "versions": {
-            "jaxfilters": version("jaxfilters"),
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
 
 

@@ -1,5 +1,6 @@
 """Where images come from: video files, folders of images, and live cameras; several of them on one clock."""
 
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -10,8 +11,8 @@ import cv2
 import numpy as np
 
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.image_files import images_in, read_image
 
-_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 DEFAULT_FPS = 30.0
 PRIMING_IMAGES = 40
 """Images from which the empty room is learnt before a recording is followed."""
@@ -32,7 +33,10 @@ class VideoSource(Protocol):
         """Up to `most` images spread over the recording; none of a live camera."""
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
-        """Seconds from the start and the image (rows, cols, 3); None where a live camera has nothing new."""
+        """Seconds and the image (rows, cols, 3); None where a live camera has nothing new.
+
+        Recordings begin at 0; live cameras share a clock, which began some time before.
+        """
 
     def trouble(self) -> str | None:
         """What went wrong while it was read, for a person; None if nothing did."""
@@ -62,7 +66,7 @@ class VideoFile:
     """A video that OpenCV can decode."""
 
     def __init__(self, path: Path, fps: float | None = None):
-        self.name, self._path = str(path), path
+        self.name, self._path, self._is_stamped = str(path), path, fps is None
         capture = self._open()
         self.image_size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         self.fps = fps or float(capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
@@ -83,12 +87,14 @@ class VideoFile:
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         capture, done = self._open(), 0
+        stamps = _Stamps(1 / self.fps)
         try:
             while True:
                 there, image = capture.read()
                 if not there:
                     break
-                yield done / self.fps, image
+                said_s = stamps.next(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+                yield (said_s if self._is_stamped else done / self.fps), image
                 done += 1
         finally:
             capture.release()
@@ -101,30 +107,45 @@ class VideoFile:
         return self._trouble
 
 
+class _Stamps:
+    """Times of the frames of a video as its file says them, from the first one.
+
+    Where it says nothing of use, a frame is one period after the one before.
+    """
+
+    def __init__(self, period_s: float):
+        self._period_s, self._first_s, self._last_s = period_s, 0.0, -period_s
+
+    def next(self, said_s: float) -> float:
+        if self._last_s < 0:
+            self._first_s = said_s
+        said_s -= self._first_s
+        is_later = np.isfinite(said_s) and said_s > self._last_s
+        self._last_s = said_s if is_later else self._last_s + self._period_s
+        return self._last_s
+
+
 class ImageFolder:
     """Images of one size in a folder, in the order of their names."""
 
     def __init__(self, path: Path, fps: float):
         self.name, self.fps = str(path), fps
-        self._files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES)
-        if not self._files:
-            raise InputError(f"{path}: no images in it ({', '.join(sorted(_IMAGES))}).")
-        rows, cols = self._read(self._files[0]).shape[:2]
-        self.image_size = (cols, rows)
+        self._files = images_in(path)
+        rows, cols = read_image(self._files[0]).shape[:2]
+        self.image_size, self.frames = (cols, rows), len(self._files)
 
-    def _read(self, file: Path) -> np.ndarray:
-        encoded = np.fromfile(file, np.uint8)
-        image = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
-        if image is None:
-            raise InputError(f"{file}: not an image that can be decoded.")
-        return image
+    def numbers(self) -> np.ndarray | None:
+        """The numbers with which the names end, counters or time stamps; None unless all have one and they grow."""
+        ends = [re.search(r"(\d+)$", file.stem) for file in self._files]
+        found = np.asarray([int(end[0]) for end in ends if end is not None], float)
+        return found if len(found) == len(ends) and (np.diff(found) > 0).all() else None
 
     def sample(self, most: int) -> list[np.ndarray]:
-        return [self._read(file) for file in self._files[:: max(1, len(self._files) // most)]][:most]
+        return [read_image(file) for file in self._files[:: max(1, len(self._files) // most)]][:most]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         for i, file in enumerate(self._files):
-            image = self._read(file)
+            image = read_image(file)
             if image.shape[1::-1] != self.image_size:
                 raise InputError(f"{file}: {image.shape[1]}x{image.shape[0]} pixels; the first has {self.image_size}.")
             yield i / self.fps, image
@@ -145,9 +166,9 @@ class LiveCamera:
             raise InputError(f"{self.name}: cannot be opened, or delivers no image.")
         self.image_size = (image.shape[1], image.shape[0])
         self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
-        self._newest: np.ndarray | None = None
+        self._newest: tuple[float, np.ndarray] | None = None
         self._trouble: str | None = None
-        self._lock, self._arrived = threading.Lock(), threading.Event()
+        self._lock, self._arrived, self._over = threading.Lock(), threading.Event(), threading.Event()
 
     def sample(self, most: int) -> list[np.ndarray]:  # noqa: ARG002
         return []
@@ -155,25 +176,28 @@ class LiveCamera:
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         threading.Thread(target=self._follow, daemon=True).start()
         began = heard = time.monotonic()
-        while True:
-            self._arrived.wait(1 / self.fps)
-            with self._lock:
-                image, self._newest = self._newest, None
-                self._arrived.clear()
-            now = time.monotonic()
-            heard = now if image is not None else heard
-            if now - heard > SILENT_S and self._trouble is None:
-                self._trouble = f"{self.name}: no image since {heard - began:.0f} s after the start"
-            yield now - began, image
+        try:
+            while True:
+                self._arrived.wait(1 / self.fps)
+                with self._lock:
+                    newest, self._newest = self._newest, None
+                    self._arrived.clear()
+                now = time.monotonic()
+                heard = now if newest is not None else heard
+                if now - heard > SILENT_S and self._trouble is None:
+                    self._trouble = f"{self.name}: no image since {heard - began:.0f} s after the start"
+                yield (now, None) if newest is None else newest
+        finally:
+            self._over.set()
 
     def _follow(self) -> None:
-        while True:
+        while not self._over.is_set():
             there, image = self._capture.read()
             if not there:
                 time.sleep(0.05)
                 continue
             with self._lock:
-                self._newest = image
+                self._newest = (time.monotonic(), image)
             self._arrived.set()
 
     def trouble(self) -> str | None:
@@ -184,6 +208,7 @@ class Moment(NamedTuple):
     """What all sources have at one time."""
 
     time_s: float
+    """From the first one."""
     images: tuple[np.ndarray | None, ...]
     """None where a source has nothing new."""
 
@@ -196,6 +221,7 @@ def together(sources: list[VideoSource]) -> Iterator[Moment]:
     streams = [source.images() for source in sources]
     waiting = [next(stream, None) for stream in streams]
     half = 0.5 / max(source.fps for source in sources)
+    began = min((item[0] for item in waiting if item is not None), default=0.0)
     while any(item is not None for item in waiting):
         now = min(item[0] for item in waiting if item is not None)
         images: list[np.ndarray | None] = []
@@ -204,4 +230,4 @@ def together(sources: list[VideoSource]) -> Iterator[Moment]:
             images.append(item[1] if due and item is not None else None)
             if due:
                 waiting[i] = next(streams[i], None)
-        yield Moment(now, tuple(images))
+        yield Moment(now - began, tuple(images))

@@ -232,3 +232,106 @@ def build_fake_articulated(sequence, config):
 
     advance = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
     return SequenceTracker(start, advance)
+
+
+@pytest.fixture(scope="session")
+def face_model():
+    """A face with room for five modes, of which two are learnt: mouth corners outwards, and brows with the mouth."""
+    from jaxfilters.models.face.landmarks import BROWS, MEAN_SHAPE, MOUTH
+    from jaxfilters.models.face.shape_model import FaceModel
+
+    smile, brows = np.zeros((10, 3)), np.zeros((10, 3))
+    smile[list(MOUTH)] = [[-1, -0.3, 0.3], [1, -0.3, 0.3]]
+    brows[list(BROWS)] = [[0, -1, 0.2]] * 2
+    brows[list(MOUTH)] = [[0.2, 1, 0.2], [-0.2, 1, 0.2]]
+    basis = np.zeros((30, 5), np.float32)
+    basis[:, :2] = np.stack([mode.ravel() / np.linalg.norm(mode) for mode in (smile, brows)], axis=1)
+    templates = np.random.default_rng(0).uniform(0, 255, (2, 10, 16, 16)).astype(np.float32)
+    deviation = np.array([5.0, 3, 0, 0, 0])
+    return FaceModel(*(jnp.asarray(array, jnp.float32) for array in (MEAN_SHAPE, basis, deviation, templates)))
+
+
+@pytest.fixture(scope="session")
+def face_track(face_model):
+    """`(track, truth)` of FRAMES frames before the nominal rig: two initialise, frame 20 is skipped, 30 to 32 lost."""
+    from jaxfilters.models.face.rig import nominal, project_shape
+    from jaxfilters.models.face.shape_model import shape
+    from jaxfilters.models.synthetic.face_motion import motion
+    from jaxfilters.trackers.shell.head_report import HeadTruth
+    from jaxfilters.trackers.shell.head_table import TimedHeadTrack
+
+    rng = np.random.default_rng(1)
+    poses = motion("mix", FRAMES, 1)
+    a = np.zeros((FRAMES, 5), np.float32)
+    a[15:, :2] = 5 * np.sin(np.arange(FRAMES - 15) / 4)[:, None] * [1, 0.5]
+    shapes = jax.vmap(shape, in_axes=(None, 0))(face_model, jnp.asarray(a))
+    project = jax.vmap(partial(project_shape, nominal()))
+    std = np.array([0.5, 0.5, 2.0, 0.01, 0.02, 0.02])
+    pose = (poses + rng.normal(0, std, poses.shape)).astype(np.float32)
+    status = np.repeat([0, 1, 2, 4, 2, 3, 2], [2, 13, 5, 1, 9, 3, FRAMES - 33]).astype(np.int32)
+    tracked = (status == 1) | (status == 2)
+
+    def known(values, where=tracked):
+        values = np.asarray(values, np.float32)
+        return np.where(where.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
+
+    track = TimedHeadTrack(
+        times_s=np.arange(FRAMES) / 30,
+        pose=known(pose),
+        pose_std=known(np.tile(std, (FRAMES, 1))),
+        deformation=known(a),
+        shape=known(shapes),
+        image_points=known(project(shapes, jnp.asarray(pose))[0]),
+        score=known(0.85 - 0.1 * rng.random(FRAMES), status != 4),
+        effective_sample_size=known(np.full(FRAMES, 300.0), status != 4),
+        status=status,
+    )
+    return track, HeadTruth(poses, np.asarray(project(shapes, jnp.asarray(poses, jnp.float32))[0]))
+
+
+@pytest.fixture
+def fake_head(monkeypatch, face_model):
+    """Puts something quick in the place of the head tracker; what it was made with and fed is in the list returned.
+
+    A pose tells of its images: x is the mean grey of the first camera and y that of the last, z the time in
+    milliseconds. The first two frames initialise; a frame darker than 10 is lost, with a pose that nobody should see.
+    """
+    from jaxfilters.trackers.head.state import HeadTrack
+    from jaxfilters.trackers.shell import head_command
+
+    made = []
+
+    class FakeSession(head_command.HeadSession):
+        model, contribution, events = None, 0.0, ()
+
+        def __init__(self, rig, options, points):
+            self.rig, self.options, self.points, self.frames = rig, options, points, 0
+            self.events, self.sizes = [], []
+            made.append(self)
+
+        def process(self, images, times):
+            assert images.dtype == np.uint8
+            assert images.shape[1:] == (self.rig.num_cameras, *self.rig.shape)
+            b = len(images)
+            means = images.mean(axis=(2, 3))
+            index = self.frames + np.arange(b)
+            self.frames += b
+            self.sizes.append(b)
+            status = np.where(index < 2, 0, np.where(means[:, 0] < 10, 3, np.where(index < 6, 1, 2))).astype(np.int32)
+            if self.frames > 2 and self.model is None:
+                self.model, self.contribution = face_model, 0.75
+                self.events += [(2, "registered"), (12, "learnt")]
+            zero = np.zeros(b)
+            return HeadTrack(
+                pose=np.stack([means[:, 0], means[:, -1], 1000 * times, zero + 0.1, zero + 0.2, zero + 0.3], axis=-1),
+                pose_std=np.full((b, 6), 0.5),
+                deformation=np.ones((b, 2)),
+                shape=np.tile(face_model.mean, (b, 1, 1)),
+                image_points=np.full((b, self.rig.num_cameras, 10, 2), 5.0),
+                score=np.full(b, 0.75),
+                effective_sample_size=np.full(b, 100.0),
+                status=status,
+            )
+
+    monkeypatch.setattr(head_command, "HeadSession", FakeSession)
+    return made

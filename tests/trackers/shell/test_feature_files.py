@@ -3,6 +3,7 @@ import pytest
 
 from jaxfilters.models.articulated.features import FULL, KEYPOINTS
 from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.trackers.feature_sequence import NOISE_SHARE, persistence
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.feature_files import open_features
 
@@ -20,6 +21,7 @@ FEATURES = {
     "truth_states": RNG.normal(size=(FRAMES, N)),
 }
 KEYPOINT_ARRAYS = {"keypoints": RNG.uniform(0, 500, (FRAMES, 21, 2)), "noise_px": np.asarray(3.0)}
+RAISED = persistence(np.arange(FRAMES) / 30)
 
 
 @pytest.fixture
@@ -81,12 +83,12 @@ def test_keypoints_have_the_noise_of_the_option_of_the_file_or_of_their_size(npz
     sequence = open_features(file)
     assert (sequence.num_fingers, sequence.features, sequence.image_shape) == (5, KEYPOINTS, (480, 640))
     assert sequence.start is None
-    np.testing.assert_array_equal(sequence.std, 3.0)
-    np.testing.assert_array_equal(open_features(file, noise_px=5.0).std, 5.0)
+    np.testing.assert_allclose(sequence.std, 3.0 * RAISED)
+    np.testing.assert_allclose(open_features(file, noise_px=5.0).std, 5.0 * RAISED)
     assert open_features(file, image_size=(320, 240)).image_shape == (240, 320)
     extents = np.ptp(KEYPOINT_ARRAYS["keypoints"], axis=1)
-    expected = 0.03 * np.median(np.hypot(*extents.T))
-    np.testing.assert_allclose(open_features(npz(KEYPOINT_ARRAYS, noise_px=None)).std, expected)
+    expected = NOISE_SHARE * np.median(np.hypot(*extents.T))
+    np.testing.assert_allclose(open_features(npz(KEYPOINT_ARRAYS, noise_px=None)).std, expected * RAISED)
 
 
 def test_keypoints_may_have_confidences_a_start_and_a_truth(npz):
@@ -96,7 +98,7 @@ def test_keypoints_may_have_confidences_a_start_and_a_truth(npz):
     start = {"start_mean": np.ones(n), "start_covariance": np.eye(n), "truth_states": np.zeros((FRAMES, n))}
     sequence = open_features(npz(KEYPOINT_ARRAYS, confidence=confidence, **start))
     assert not sequence[0].mask[:2].any()
-    np.testing.assert_allclose(sequence.std[:, 2:], 5.0)
+    np.testing.assert_allclose(sequence.std[:, 2:], 5.0 * RAISED)
     assert sequence.start.mean.shape == (n,)
     assert sequence.truth.shape == (FRAMES, n)
 

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.feature_sequence import persistence
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.feature_files import open_features
 from jaxfilters.trackers.shell.keypoint_files import looks_normalized, read
@@ -67,7 +68,7 @@ def test_openpose_has_a_file_a_frame(openpose):
     sequence = open_features(openpose, noise_px=2.0)
     assert not sequence[1].mask.any()
     assert sequence[2].mask.sum() == 40
-    np.testing.assert_allclose(sequence.std[0, :2], 2 / CONFIDENCE[0, 0])
+    np.testing.assert_allclose(sequence.std[0, :2], 2 / CONFIDENCE[0, 0] * persistence(sequence.times_s))
 
 
 def test_the_hand_that_is_asked_for_is_read(openpose):
@@ -173,8 +174,8 @@ def test_mediapipe_frames_are_scaled_to_pixels(mediapipe, form):
     np.testing.assert_allclose(sequence.y[3, names.index("p_20_x")], POINTS[3, 5, 0])
     assert not sequence[1].mask.any()
     assert sequence[0].mask.all()
-    np.testing.assert_array_equal(sequence.std[0], 2.0)
     np.testing.assert_allclose(sequence.times_s, np.arange(FRAMES) / 10)
+    np.testing.assert_allclose(sequence.std[0], 2.0 * persistence(sequence.times_s))
     assert sequence.image_shape == (480, 640)
 
 

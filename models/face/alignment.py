@@ -1,0 +1,157 @@
+"""Where each landmark is in each image, to a fraction of a pixel: its patch of the first images, turned with the head.
+
+A few Gauss-Newton steps in the inverse compositional form (S. Baker, I. Matthews, "Lucas-Kanade 20 years on", 2004),
+free of gain and offset, find the shift that the predicted pose leaves. What the turned plane does not explain stays in
+the residual, and the covariance is that of the shift under such a residual: part of it white, part of it as smooth as
+the residual itself turns out to be. The same residual says how the plane is inclined.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.models.face.patches import SIZE, SMOOTHNESS_PX, Patches, Slopes, stretch
+from jaxfilters.models.face.rig import CameraRig, jacobian
+
+ITERATIONS = 6
+MOST_STEP_PX = 2.0
+"""A patch is no wider than that for a linear step to be trusted further."""
+LEAST_FACING = 0.2
+"""Cosine of the angle between a patch's normal and the line of sight from which on it is looked at."""
+LEAST_TEACHING_SCORE = 0.7
+"""Normalised correlation from which on a residual is taken for a matter of the slopes."""
+
+
+class Alignment(NamedTuple):
+    """Where the landmarks were found."""
+
+    uv: Float[Array, "C K 2"]
+    """Pixels."""
+    covariance: Float[Array, "C K 2 2"]
+    """Pixels squared."""
+    score: Float[Array, "C K"]
+    """Normalised correlation there, -1 to 1."""
+    seen: Bool[Array, "C K"]
+    """Whether the patch faces the camera and lies inside the image."""
+    by_slope: Float[Array, "C K 2 2"]
+    """How far the place would move, in pixels, with the slopes of the patch."""
+    slope_information: Float[Array, "K 2 2"]
+    slope_score: Float[Array, "K 2"]
+    """What the residual says of the slopes, as `learn_slopes` takes it."""
+
+
+def align(
+    patches: Patches,
+    slopes: Slopes,
+    images: Float[Array, "C rows cols"],
+    uv: Float[Array, "C K 2"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+) -> Alignment:
+    """Landmarks in the images, searched from `uv`, for a head of `shape` that is near `pose`."""
+    by_shape, _ = jacobian(rig, shape, pose)
+    affine = stretch(patches, slopes, by_shape)
+    is_facing = facing(patches, by_shape)
+    affine = jnp.where(is_facing[..., None, None], affine, jnp.eye(2))
+    by_shape = jnp.where(is_facing[..., None, None], by_shape, 0.0)
+    reach = jnp.arange(SIZE) - (SIZE - 1) / 2
+    grid = jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
+    offsets = jnp.einsum("ckij,pj->ckpi", affine, grid)
+
+    def iterate(_: int, uv: Array) -> Array:
+        shift = _look(patches, images, uv[:, :, None] + offsets)[0]
+        step = -jnp.einsum("ckij,ckj->cki", affine, shift)
+        length = jnp.linalg.norm(step, axis=-1, keepdims=True)
+        return uv + step * jnp.minimum(1.0, MOST_STEP_PX / jnp.maximum(length, 1e-6))
+
+    found = jax.lax.fori_loop(0, ITERATIONS, iterate, jnp.where(jnp.isfinite(uv), uv, 0.0))
+    _, residual, score = _look(patches, images, found[:, :, None] + offsets)
+    seen = is_facing & _inside(images.shape[1:], found, affine) & jnp.isfinite(score)
+    covariance, variance = _covariance(patches, residual, affine)
+    teaching = seen & (score > LEAST_TEACHING_SCORE)
+    by_slope, information, slope_score = _slopes(patches, grid, residual, variance, affine, by_shape, teaching)
+    return Alignment(found, covariance, score, seen, by_slope, information, slope_score)
+
+
+def _look(patches: Patches, images: Array, points: Array) -> tuple[Array, Array, Array]:
+    """The shift that is left, in pixels of the template; the residual, in its grey levels; the correlation."""
+    window = _sample(images, points)
+    window -= jnp.mean(window, axis=2, keepdims=True)
+    template = patches.template
+    energy = jnp.maximum(jnp.sum(template * template, axis=2), 1e-6)
+    product = jnp.sum(window * template, axis=2)
+    gain = jnp.maximum(product / energy, 1e-3)
+    residual = window / gain[..., None] - template
+    shift = jnp.einsum("ckij,ckpj,ckp->cki", patches.inverse, patches.gradient, residual)
+    score = product / jnp.sqrt(jnp.maximum(energy * jnp.sum(window * window, axis=2), 1e-6))
+    return shift, residual, score
+
+
+def _covariance(patches: Patches, residual: Array, affine: Array) -> tuple[Array, Array]:
+    """Of the shift; and the variance of a white residual that would say as little, grey levels squared."""
+    C, K = residual.shape[:2]
+    square = residual.reshape(C, K, SIZE, SIZE)
+    variance = jnp.maximum(jnp.mean(square * square, axis=(2, 3)), 1e-6)
+    across = jnp.mean(square[:, :, :, 1:] * square[:, :, :, :-1], axis=(2, 3))
+    down = jnp.mean(square[:, :, 1:] * square[:, :, :-1], axis=(2, 3))
+    of_neighbours = float(np.exp(-0.5 / SMOOTHNESS_PX**2))
+    share = jnp.clip(0.5 * (across + down) / (variance * of_neighbours), 0.0, 1.0)
+    white = jnp.linalg.inv(patches.inverse)
+    mixed = (1 - share)[..., None, None] * white + share[..., None, None] * patches.smooth
+    turned = jnp.einsum("ckij,ckjl->ckil", affine, patches.inverse)
+    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", turned, variance[..., None, None] * mixed, turned)
+    pixels_a_number = 1 + share * (2 * np.pi * SMOOTHNESS_PX**2 - 1)
+    return covariance, variance * pixels_a_number
+
+
+def _slopes(
+    patches: Patches, grid: Array, residual: Array, variance: Array, affine: Array, by_shape: Array, teaching: Array
+) -> tuple[Array, Array, Array]:
+    """Effect of the slopes on the place, and what the residual says of them once the shift has had its part."""
+    rising = jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)
+    rising = jnp.linalg.solve(affine, rising[..., None])[..., 0]
+    along = jnp.einsum("ckpi,cki->ckp", patches.gradient, rising)
+    columns = -along[..., None] * jnp.einsum("ckij,pj->ckpi", patches.plan, grid)
+    shift = jnp.einsum("ckij,ckpj,ckps->ckis", patches.inverse, patches.gradient, columns)
+    left = columns - jnp.einsum("ckpi,ckis->ckps", patches.gradient, shift)
+    per_variance = jnp.where(teaching, 1 / variance, 0.0)
+    information = jnp.einsum("ck,ckps,ckpr->ksr", per_variance, left, left)
+    score = jnp.einsum("ck,ckps,ckp->ks", per_variance, left, residual)
+    return -jnp.einsum("ckij,ckjs->ckis", affine, shift), information, score
+
+
+def facing(patches: Patches, by_shape: Float[Array, "C K 2 3"]) -> Bool[Array, "C K"]:
+    """Whether the outside of a patch is turned to the camera, before which it lies.
+
+    Args:
+        patches: Patches.
+        by_shape: Derivatives of the pixels by the model points, NaN behind the camera.
+    """
+    # The rows of the derivative span the plane across the line of sight; they are NaN behind the camera.
+    sight = jnp.cross(by_shape[:, :, 0], by_shape[:, :, 1])
+    sight /= jnp.maximum(jnp.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
+    return -jnp.sum(sight * patches.normals, axis=-1) > LEAST_FACING
+
+
+def _inside(shape: tuple[int, ...], uv: Array, affine: Array) -> Array:
+    reach = jnp.sum(jnp.abs(affine), axis=-1) * SIZE / 2
+    last = jnp.array([shape[1] - 1, shape[0] - 1], uv.dtype)
+    return jnp.all((uv >= reach) & (uv <= last - reach), axis=-1)
+
+
+def _sample(images: Array, points: Array) -> Array:
+    """Grey values at pixels (C, K, n, 2), bilinear; the border goes on beyond the image."""
+    rows, cols = images.shape[1:]
+    u = jnp.clip(points[..., 0], 0.0, cols - 1.001)
+    v = jnp.clip(points[..., 1], 0.0, rows - 1.001)
+    column, row = jnp.floor(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
+    a, b = u - column, v - row
+    camera = jnp.arange(images.shape[0])[:, None, None]
+    at = lambda down, right: images[camera, row + down, column + right]
+    upper = at(0, 0) * (1 - a) + at(0, 1) * a
+    lower = at(1, 0) * (1 - a) + at(1, 1) * a
+    return upper * (1 - b) + lower * b

@@ -1,0 +1,46 @@
+"""The ten landmarks of a face: names, mean places, which of them move with expressions.
+
+Left and right are the subject's: right is at negative x, left in the image. The order is that of the specification,
+section 4.
+"""
+
+import numpy as np
+
+NAMES = (
+    "right eye outer",
+    "right eye inner",
+    "left eye inner",
+    "left eye outer",
+    "right mouth",
+    "left mouth",
+    "right nostril",
+    "left nostril",
+    "right brow inner",
+    "left brow inner",
+)
+NUM_LANDMARKS = len(NAMES)
+MIRROR = (3, 2, 1, 0, 5, 4, 7, 6, 9, 8)
+"""The landmark on the other side of the face."""
+EYES, MOUTH, NOSTRILS, BROWS = (0, 1, 2, 3), (4, 5), (6, 7), (8, 9)
+FROM_68 = (36, 39, 42, 45, 48, 54, 32, 34, 21, 22)
+"""Where the landmarks are among the 68 of iBUG, counted from 0."""
+
+_TABLE = np.array(
+    [
+        (-45.0, 0.0, 9.0),
+        (-17.0, 2.0, 0.0),
+        (17.0, 2.0, 0.0),
+        (45.0, 0.0, 9.0),
+        (-25.0, 71.0, -3.0),
+        (25.0, 71.0, -3.0),
+        (-9.0, 47.0, -16.0),
+        (9.0, 47.0, -16.0),
+        (-13.0, -19.0, -8.0),
+        (13.0, -19.0, -8.0),
+    ]
+)
+MEAN_SHAPE = _TABLE - _TABLE.mean(axis=0)
+"""(10, 3) millimetres about the centroid: x to the image's right, y down, z away from a camera that the face faces."""
+
+RIGID_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 0.1, 0.1])
+"""(10,) how far each landmark speaks for the motion of the skull (specification, section 2.10)."""

@@ -1,0 +1,169 @@
+"""Patches of skin as the cameras saw them at registration, and how their pictures change when the head turns.
+
+A patch is taken for a small plane. From the pose follows how its picture is stretched and turned, an affine map for
+each camera and landmark. How the plane is inclined is known only roughly at first, from an average head; what a turned
+head shows of it is learnt (`Slopes`).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+from jaxfilters.models.face.correlation import cut
+from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+
+SKIN_NORMALS = np.array(
+    [
+        *((-0.54, 0.23, -0.81), (-0.35, -0.08, -0.93), (0.35, -0.08, -0.93), (0.54, 0.23, -0.81)),
+        *((-0.50, 0.15, -0.86), (0.50, 0.15, -0.86), (-0.51, -0.14, -0.85), (0.51, -0.14, -0.85)),
+        *((-0.09, -0.02, -1.0), (0.09, -0.02, -1.0)),
+    ]
+)
+"""Outward normals of the skin within 9 mm of each landmark, on the mean head of the ICT face model (light-stage scans;
+R. Li et al., "Learning formation of physically-based face attributes", 2020)."""
+SIZE, WIDE_SIZE = 16, 24
+"""Pixels of a window; of what is kept of the first image, so that a window is still full when its picture shrinks."""
+SMOOTHNESS_PX = 2.0
+"""Standard deviation of the Gaussian correlation that the smooth part of a residual is given."""
+SLOPE_STD = 0.35
+"""Of the slopes before the head has turned: skin is within some 20 degrees of where it is on the mean head."""
+LEAST_SLOPE_STD = 0.03
+"""Skin is no plane."""
+STEEPEST = 1.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+class Patches:
+    """What was seen at registration; C cameras, K landmarks, windows of T x T pixels in TT numbers."""
+
+    wide: Float[Array, "C K W W"]
+    """Grey levels of a larger window."""
+    template: Float[Array, "C K TT"]
+    """Grey levels of the window without their mean."""
+    gradient: Float[Array, "C K TT 2"]
+    """Of the template along (u, v), without what gain and offset could explain."""
+    inverse: Float[Array, "C K 2 2"]
+    """Inverse of the gradient's second moments: shift for each unit of correlation with the gradient."""
+    smooth: Float[Array, "C K 2 2"]
+    """Second moments of the gradient under a residual of unit variance that is correlated over neighbouring pixels."""
+    tangents: Float[Array, "C K 3 2"]
+    """Millimetres on the skin, in the model frame, for each pixel of the template."""
+    lift: Float[Array, "C K 3"]
+    """Along the line of sight at registration, in the model frame: as far as takes a point 1 mm out of the plane."""
+    plan: Float[Array, "C K 2 2"]
+    """Millimetres along two directions within the plane for each pixel of the template."""
+    normals: Float[Array, "K 3"]
+    """Outward, in the model frame."""
+
+
+class Slopes(NamedTuple):
+    """How the skin is inclined to the plane that was assumed for it, learnt while the head turns."""
+
+    mean: Float[Array, "K 2"]
+    """Millimetres out of the plane for each millimetre along the two directions within it."""
+    covariance: Float[Array, "K 2 2"]
+
+
+def patches(
+    images: Num[Array, "C rows cols"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+    normals: Float[Array, "K 3"],
+) -> Patches:
+    """Patches about the images of a posed shape.
+
+    Args:
+        images: Grey levels at registration.
+        shape: Landmarks in the model frame, millimetres.
+        pose: Of the head in these images.
+        rig: Cameras.
+        normals: Outward normals of the skin at the landmarks, model frame, of any length.
+    """
+    uv, _ = project_shape(rig, shape, pose)
+    wide = jax.vmap(lambda image, points: cut(image, points, WIDE_SIZE))(images, uv)
+    border = (WIDE_SIZE - SIZE) // 2
+    window = wide[:, :, border:-border, border:-border]
+    dv, du = jnp.gradient(wide, axis=(2, 3))
+    gradient = jnp.stack([du, dv], axis=-1)[:, :, border:-border, border:-border]
+    template, gradient, inverse, smooth = _moments(window, gradient)
+    by_shape, _ = jacobian(rig, shape, pose)
+    unit = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*uv.shape[:2], 1, 3))], axis=2)
+    # Two columns keep within the plane; the third, of no pixels, goes along the line of sight.
+    columns = jnp.linalg.inv(frame)
+    plan = jnp.einsum("kxi,ckxj->ckij", _within(unit), columns[..., :2])
+    return Patches(wide, template, gradient, inverse, smooth, columns[..., :2], columns[..., 2], plan, unit)
+
+
+def unknown_slopes(num_landmarks: int) -> Slopes:
+    """Slopes before the head has turned."""
+    return Slopes(jnp.zeros((num_landmarks, 2)), jnp.tile(SLOPE_STD**2 * jnp.eye(2), (num_landmarks, 1, 1)))
+
+
+def learn_slopes(slopes: Slopes, information: Float[Array, "K 2 2"], score: Float[Array, "K 2"]) -> Slopes:
+    """Slopes after another view, by Bayes' rule.
+
+    Args:
+        slopes: Before.
+        information: Of the view, about the slopes.
+        score: That information times how much they differ from what was assumed.
+    """
+    eye = jnp.eye(2, dtype=information.dtype)
+    covariance = jnp.linalg.inv(jnp.linalg.inv(slopes.covariance) + information)
+    mean = slopes.mean + jnp.einsum("kij,kj->ki", covariance, score)
+    lacking = jnp.maximum(LEAST_SLOPE_STD**2 - jnp.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    return Slopes(jnp.clip(mean, -STEEPEST, STEEPEST), covariance + lacking[..., None] * eye)
+
+
+def stretch(patches: Patches, slopes: Slopes, by_shape: Float[Array, "C K 2 3"]) -> Float[Array, "C K 2 2"]:
+    """Pixels of an image for each pixel of the template, for a head whose pixels have the derivatives `by_shape`."""
+    rise = jnp.einsum("ki,ckij->ckj", slopes.mean, patches.plan)
+    tangents = patches.tangents + patches.lift[..., None] * rise[:, :, None]
+    return jnp.einsum("ckix,ckxj->ckij", by_shape, tangents)
+
+
+def turned(patches: Patches, affine: Float[Array, "C K 2 2"]) -> Float[Array, "C K T T"]:
+    """Templates as a head would show them that stretches them by `affine`, at most half a window beyond its border."""
+    reach = jnp.arange(SIZE) - (SIZE - 1) / 2
+    grid = jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
+    usable = jnp.abs(jnp.linalg.det(affine)) > 0.05
+    inverse = jnp.linalg.inv(jnp.where(usable[..., None, None], affine, jnp.eye(2)))
+    middle = (WIDE_SIZE - 1) / 2
+    points = jnp.clip(jnp.einsum("ckij,pj->ckpi", inverse, grid) + middle, 0.0, WIDE_SIZE - 1.001)
+    corner = jnp.floor(points)
+    a, b = points[..., 0] - corner[..., 0], points[..., 1] - corner[..., 1]
+    flat = patches.wide.reshape(*patches.wide.shape[:2], -1)
+    index = (corner[..., 1] * WIDE_SIZE + corner[..., 0]).astype(jnp.int32)
+    at = lambda offset: jnp.take_along_axis(flat, index + offset, axis=-1)
+    upper, lower = (at(o) * (1 - a) + at(o + 1) * a for o in (0, WIDE_SIZE))
+    return (upper * (1 - b) + lower * b).reshape(*affine.shape[:2], SIZE, SIZE)
+
+
+def _moments(window: Array, gradient: Array) -> tuple[Array, Array, Array, Array]:
+    """Template, gradient free of gain and offset, inverse of its moments, and moments under a smooth residual."""
+    C, K, size = window.shape[:3]
+    flat = (window - jnp.mean(window, axis=(2, 3), keepdims=True)).reshape(C, K, size * size)
+    columns = gradient.reshape(C, K, size * size, 2)
+    columns -= jnp.mean(columns, axis=2, keepdims=True)
+    energy = jnp.maximum(jnp.sum(flat * flat, axis=2), 1e-6)
+    columns -= flat[..., None] * (jnp.einsum("ckp,ckpi->cki", flat, columns) / energy[..., None])[:, :, None]
+    inverse = jnp.linalg.inv(jnp.einsum("ckpi,ckpj->ckij", columns, columns) + 1e-3 * jnp.eye(2))
+    distance = jnp.arange(size)[:, None] - jnp.arange(size)
+    correlation = jnp.exp(-0.5 * (distance / SMOOTHNESS_PX) ** 2)
+    square = columns.reshape(C, K, size, size, 2)
+    blurred = jnp.einsum("rs,ckstd,tu->ckrud", correlation, square, correlation).reshape(columns.shape)
+    return flat, columns, inverse, jnp.einsum("ckpi,ckpj->ckij", columns, blurred)
+
+
+def _within(normals: Array) -> Array:
+    """Two unit vectors across each normal, as columns."""
+    first = jnp.cross(normals, jnp.array([0.0, 1.0, 0.0], normals.dtype))
+    first /= jnp.linalg.norm(first, axis=1, keepdims=True)
+    return jnp.stack([first, jnp.cross(normals, first)], axis=-1)

@@ -1,0 +1,174 @@
+"""Pose and deformation that fit the aligned landmarks best, with an honest covariance.
+
+Each landmark is where the model puts it, moved by a small unknown amount in space (what registration got wrong, and
+deformations that no mode describes), seen with the error that its alignment reports. One landmark's pictures in all
+cameras share that unknown, so they are weighed together. Heavy tails (Student's t by iterated reweighting) keep a
+hidden or mistaken landmark from pulling the head along.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Float
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.face.alignment import Alignment
+from jaxfilters.models.face.patches import Slopes
+from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+from jaxfilters.models.face.shape_model import FaceModel, shape
+
+ITERATIONS = 5
+DEGREES_OF_FREEDOM = 4.0
+LEAST_SCORE = 0.5
+"""Normalised correlation from which on an aligned patch counts as the landmark."""
+PIXEL_FLOOR = 0.01
+"""Standard deviation, pixels, that no alignment is better than: the grid on which grey values were sampled."""
+MOST_DISTANCE = 9.0
+"""Squared deviations a row beyond which a landmark is mistaken, and says nothing more about the noise."""
+UNSEEN = 1e4
+"""Standard deviation, pixels, of a landmark that was not seen."""
+
+
+class Refined(NamedTuple):
+    """The fit to one frame."""
+
+    belief: Gaussian
+    """Of pose (mm, rad) and mode coefficients (mm): (6 + B,)."""
+    log_evidence: Float[Array, ""]
+    """log p of the aligned landmarks under the model, by Laplace's approximation."""
+    excess: Float[Array, " K"]
+    """Squared residual beyond what the alignment's error explains, mm^2 on each axis; may be negative."""
+    trust: Float[Array, " K"]
+    """Weight in the last iteration: about 1 for a landmark that fits, towards 0 for one that does not."""
+    misfit: Float[Array, ""]
+    """Squared residuals over what their covariances lead to expect; 1 in the mean if those are right."""
+    num_seen: Float[Array, ""]
+    """Landmarks that at least one camera sees."""
+
+
+def refine(
+    prior: Gaussian,
+    found: Alignment,
+    slopes: Slopes,
+    model: FaceModel,
+    looseness: Float[Array, "K 3 3"],
+    rig: CameraRig,
+    start: Float[Array, " n"],
+) -> Refined:
+    """Posterior mode and its covariance.
+
+    Args:
+        prior: Of pose and mode coefficients before the frame.
+        found: Landmarks in the images.
+        slopes: How the skin around them is inclined.
+        model: Shape and modes.
+        looseness: Covariance of each landmark about the model, model frame, mm^2.
+        rig: Cameras.
+        start: Where the iteration begins.
+    """
+    seen = found.seen & (found.score > LEAST_SCORE)
+    precision = jnp.linalg.inv(prior.covariance)
+    per_landmark = 2.0 * jnp.sum(seen, axis=0)
+
+    def pieces(x):
+        M = shape(model, x[6:])
+        residual, H, S, by_shape = _rows(x, M, found, slopes, seen, model, looseness, rig)
+        distance = jnp.einsum("ki,ki->k", residual, _solve(S, residual))
+        trust = (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + distance)
+        return residual, H, S, by_shape, distance, trust
+
+    def iterate(_, x):
+        residual, H, S, _, _, trust = pieces(x)
+        SH = _solve(S, H)
+        information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
+        gradient = jnp.einsum("k,kia,ki->a", trust, SH, residual) + precision @ (prior.mean - x)
+        return x + jnp.linalg.solve(information, gradient)
+
+    x = jax.lax.fori_loop(0, ITERATIONS, iterate, start)
+    residual, H, S, by_shape, distance, trust = pieces(x)
+    information = precision + jnp.einsum("k,kia,kib->ab", trust, _solve(S, H), H)
+    covariance = jnp.linalg.inv(information)
+    off = x - prior.mean
+    log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + 0.5 * (
+        jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off
+    )
+    count = jnp.sum(seen)
+    dof = jnp.maximum(2.0 * count / jnp.maximum(2.0 * count - x.size, 2.0), 1.0)
+    squares = jnp.minimum(jnp.sum(residual**2, axis=1), MOST_DISTANCE * jnp.trace(S, axis1=1, axis2=2))
+    own = jnp.sum(jnp.where(seen[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
+    reach = jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3))
+    excess = (dof * squares - own) / jnp.maximum(reach, 1e-6)
+    return Refined(
+        belief=Gaussian(x, 0.5 * (covariance + covariance.T)),
+        log_evidence=log_evidence,
+        excess=jnp.where(per_landmark > 0, excess, 0.0),
+        trust=trust,
+        misfit=jnp.sum(jnp.minimum(distance, MOST_DISTANCE * per_landmark)) / jnp.maximum(2.0 * count - x.size, 2.0),
+        num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
+    )
+
+
+def displaced(
+    x: Float[Array, " n"],
+    found: Alignment,
+    slopes: Slopes,
+    model: FaceModel,
+    looseness: Float[Array, "K 3 3"],
+    rig: CameraRig,
+) -> Float[Array, "K 3"]:
+    """Shape of which every landmark has moved from the model towards where it was found, as far as `looseness` allows.
+
+    The posterior mean of each landmark's place in the model frame, millimetres, for a pose and mode coefficients `x`.
+    """
+    seen = found.seen & (found.score > LEAST_SCORE)
+    M = shape(model, x[6:])
+    residual, _, S, by_shape = _rows(x, M, found, slopes, seen, model, looseness, rig)
+    stacked = jnp.moveaxis(by_shape, 1, 0).reshape(len(M), -1, 3)
+    return M + jnp.einsum("kxy,kiy,ki->kx", looseness, stacked, _solve(S, residual))
+
+
+def _rows(x, M, found, slopes, seen, model, looseness, rig):
+    """Residuals (K, 2C), their derivatives by the state, their covariances, and the derivative by the shape."""
+    C, K = seen.shape
+    uv, _ = project_shape(rig, M, x[:6])
+    by_shape, by_pose = jacobian(rig, M, x[:6])
+    modes = model.basis.reshape(K, 3, -1)
+    by_state = jnp.concatenate([by_pose, jnp.einsum("ckix,kxb->ckib", by_shape, modes)], axis=-1)
+    mask = seen[..., None, None]
+    by_state, by_shape = (jnp.where(mask, J, 0.0) for J in (by_state, by_shape))
+    residual = jnp.where(seen[..., None], found.uv - uv, 0.0)
+    noise = jnp.where(mask, found.covariance + PIXEL_FLOOR**2 * jnp.eye(2), UNSEEN**2 * jnp.eye(2))
+    stacked = jnp.moveaxis(by_shape, 1, 0).reshape(K, 2 * C, 3)
+    S = jnp.einsum("kix,kxy,kjy->kij", stacked, looseness, stacked)
+    inclined = jnp.moveaxis(jnp.where(mask, found.by_slope, 0.0), 1, 0).reshape(K, 2 * C, 2)
+    S += jnp.einsum("kix,kxy,kjy->kij", inclined, slopes.covariance, inclined)
+    for camera in range(C):
+        rows = slice(2 * camera, 2 * camera + 2)
+        S = S.at[:, rows, rows].add(noise[camera])
+    return (
+        jnp.moveaxis(residual, 1, 0).reshape(K, 2 * C),
+        jnp.moveaxis(by_state, 1, 0).reshape(K, 2 * C, -1),
+        S,
+        by_shape,
+    )
+
+
+def _solve(S, b):
+    return jnp.linalg.solve(S, b if b.ndim == 3 else b[..., None]).reshape(b.shape)
+
+
+def _log_t(distance, size, S, seen):
+    """Log density of Student's t over the seen rows; unseen rows have a constant share of the determinant."""
+    nu = DEGREES_OF_FREEDOM
+    unseen_rows = 2.0 * jnp.sum(~seen, axis=0)
+    log_det = jnp.linalg.slogdet(S)[1] - unseen_rows * 2 * math.log(UNSEEN)
+    return (
+        gammaln((nu + size) / 2)
+        - gammaln(nu / 2)
+        - 0.5 * size * math.log(nu * math.pi)
+        - 0.5 * log_det
+        - 0.5 * (nu + size) * jnp.log1p(distance / nu)
+    )

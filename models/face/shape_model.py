@@ -1,0 +1,41 @@
+"""A face of one person: mean shape, linear deformations, and what its landmarks look like."""
+
+from dataclasses import dataclass
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfilters import linalg
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+class FaceModel:
+    """K landmarks with B modes of deformation, seen by C cameras; B may be 0."""
+
+    mean: Float[Array, "K 3"]
+    """Mean shape in the model frame, millimetres about the centroid of the registered landmarks."""
+    basis: Float[Array, "3*K B"]
+    """Modes as orthonormal columns for shapes flattened landmark by landmark; zero columns are modes not yet learnt."""
+    deviation: Float[Array, " B"]
+    """Standard deviations mu of the mode coefficients, millimetres; 0 for modes not yet learnt."""
+    templates: Float[Array, "C K T T"]
+    """Grey levels around the landmarks at registration."""
+
+    @property
+    def num_modes(self) -> int:
+        """B."""
+        return self.basis.shape[-1]
+
+
+def rigid(mean: Float[Array, "K 3"], templates: Float[Array, "C K T T"], *, num_modes: int = 0) -> FaceModel:
+    """A face that does not deform, with room for modes to be learnt."""
+    return FaceModel(mean, jnp.zeros((mean.size, num_modes), mean.dtype), jnp.zeros(num_modes, mean.dtype), templates)
+
+
+def shape(model: FaceModel, a: Float[Array, " B"]) -> Float[Array, "K 3"]:
+    """Landmarks in the model frame, millimetres: `mean + basis a` ([P14], [S3.1])."""
+    return model.mean + linalg.matmul(model.basis, a[:, None]).reshape(model.mean.shape)

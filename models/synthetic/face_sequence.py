@@ -1,0 +1,174 @@
+"""Video of a face with known truth, rendered frame by frame as it is asked for."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxfilters.models.face.landmarks import MOUTH, NOSTRILS
+from jaxfilters.models.face.pose import place
+from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
+from jaxfilters.models.synthetic.face import Identity, face_shape, make_identity
+from jaxfilters.models.synthetic.face_motion import (
+    FPS,
+    deformation_schedule,
+    gain_schedule,
+    motion,
+    occlusion_schedule,
+)
+from jaxfilters.models.synthetic.face_render import Occluder, render_face
+from jaxfilters.models.synthetic.face_texture import FaceScene, make_scene
+from jaxfilters.typing import AnyKey
+
+OCCLUDER_MARGIN_MM, OCCLUDER_NEARER_MM, OCCLUDER_GREY = (20.0, 14.0), 15.0, 120.0
+"""Beyond mouth and nostrils to both sides and up and down, enough for their templates; before them; grey level."""
+
+
+@dataclass(frozen=True)
+class FaceSequence:
+    """A video and its truth; the images are made anew whenever they are asked for, alike each time."""
+
+    key: AnyKey
+    """Of the noise."""
+    identity: Identity
+    scene: FaceScene
+    rig: CameraRig
+    times: Float[np.ndarray, " frames"]
+    """Seconds."""
+    poses: Float[np.ndarray, "frames 6"]
+    """Millimetres and radians."""
+    expressions: Float[np.ndarray, "frames 2"]
+    shapes: Float[np.ndarray, "frames 10 3"]
+    """Landmarks in the model frame, millimetres about the centroid of the neutral face."""
+    uv: Float[np.ndarray, "frames C 10 2"]
+    """Their pixels."""
+    covered: Bool[np.ndarray, " frames"]
+    """Whether a rectangle is before mouth and nostrils."""
+    gain: Float[np.ndarray, " frames"]
+    """Factor of the light."""
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def frames(self, start: int, stop: int) -> UInt8[np.ndarray, "frames C rows cols"]:
+        """Images of the frames from `start` up to `stop`.
+
+        Raises:
+            ValueError: if these are not frames of the sequence.
+        """
+        if not 0 <= start <= stop <= len(self):
+            raise ValueError(f"start and stop must be within 0..{len(self)}, in order; got {start} and {stop}.")
+        images = np.empty((stop - start, self.rig.num_cameras, *self.rig.shape), np.uint8)
+        for index in range(start, stop):
+            images[index - start] = self._image(index)
+        return images
+
+    def chunks(self, size: int = 60) -> Iterator[tuple[int, UInt8[np.ndarray, "frames C rows cols"]]]:
+        """First frame and images of successive pieces of at most `size` frames."""
+        for start in range(0, len(self), size):
+            yield start, self.frames(start, min(start + size, len(self)))
+
+    def _image(self, index):
+        shape, pose = jnp.asarray(self.shapes[index], float), jnp.asarray(self.poses[index], float)
+        key = jax.random.fold_in(self.key, index)
+        # Opacity 0 rather than no occluder: one compiled program for all frames.
+        occluder = _before_mouth(shape, pose, jnp.asarray(self.covered[index], float))
+        return render_face(
+            key, self.scene, self.rig, pose, shape, gain=jnp.asarray(self.gain[index], float), occluder=occluder
+        )
+
+
+def sequence(
+    key: AnyKey,
+    kind: str,
+    num_frames: int,
+    seed: int,
+    *,
+    rig: CameraRig | None = None,
+    deform: bool = False,
+    occlusion: bool = False,
+) -> FaceSequence:
+    """A random person who moves: section 4 of the specification, disturbed as in section 5 if asked for.
+
+    Args:
+        key: Of person, texture, backgrounds and noise.
+        kind: `slow`, `fast` or `mix`.
+        num_frames: How many.
+        seed: Of the motion.
+        rig: Cameras; the two of the specification if none.
+        deform: Whether the face has the expressions of section 5.2.
+        occlusion: Whether mouth and nostrils are covered for a while and the light goes down later (section 5.1).
+
+    Raises:
+        ValueError: as `motion`.
+    """
+    return face_sequence(
+        key,
+        motion(kind, num_frames, seed),
+        rig=rig,
+        expressions=deformation_schedule(num_frames) if deform else None,
+        covered=occlusion_schedule(num_frames) if occlusion else None,
+        gain=gain_schedule(num_frames) if occlusion else None,
+    )
+
+
+def face_sequence(
+    key: AnyKey,
+    poses: Float[np.ndarray, "frames 6"],
+    *,
+    rig: CameraRig | None = None,
+    expressions: Float[np.ndarray, "frames 2"] | None = None,
+    covered: Bool[np.ndarray, " frames"] | None = None,
+    gain: Float[np.ndarray, " frames"] | None = None,
+) -> FaceSequence:
+    """A random person along a course of poses, millimetres and radians, at 30 frames a second.
+
+    Args:
+        key: Of person, texture, backgrounds and noise.
+        poses: Of the head.
+        rig: Cameras; the two of the specification if none.
+        expressions: (e1, e2) of each frame; neutral if none.
+        covered: Whether mouth and nostrils are behind a rectangle; never if none.
+        gain: Factor of the light; 1 if none.
+    """
+    rig = nominal() if rig is None else rig
+    who, looks, noise = jax.random.split(key, 3)
+    identity, num_frames = make_identity(who), len(poses)
+    expressions = np.zeros((num_frames, 2)) if expressions is None else expressions
+    shapes, uv = _truth(identity, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
+    return FaceSequence(
+        key=noise,
+        identity=identity,
+        scene=make_scene(looks, rig.shape, num_cameras=rig.num_cameras),
+        rig=rig,
+        times=np.arange(num_frames) / FPS,
+        poses=poses,
+        expressions=expressions,
+        shapes=np.asarray(shapes),
+        uv=np.asarray(uv),
+        covered=np.zeros(num_frames, bool) if covered is None else covered,
+        gain=np.ones(num_frames) if gain is None else gain,
+    )
+
+
+@jax.jit
+def _truth(identity, rig, poses, expressions):
+    shapes = jax.vmap(face_shape, in_axes=(None, 0, 0))(identity, expressions[:, 0], expressions[:, 1])
+    return shapes, jax.vmap(project_shape, in_axes=(None, 0, 0))(rig, shapes, poses)[0]
+
+
+@jax.jit
+def _before_mouth(shape, pose, opacity):
+    """An occluder between the cameras and the mouth and nostrils, wherever the head is."""
+    points = place(shape, pose)[jnp.asarray((*MOUTH, *NOSTRILS))]
+    low, high = jnp.min(points, axis=0), jnp.max(points, axis=0)
+    dtype = shape.dtype
+    return Occluder(
+        center=(low + high) / 2 - jnp.asarray([0.0, 0.0, OCCLUDER_NEARER_MM], dtype),
+        half_size=(high - low)[:2] / 2 + jnp.asarray(OCCLUDER_MARGIN_MM, dtype),
+        grey=jnp.asarray(OCCLUDER_GREY, dtype),
+        opacity=opacity,
+    )

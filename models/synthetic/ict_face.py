@@ -1,0 +1,103 @@
+"""People and expressions of a statistical face model, in millimetres and the frame of the trackers.
+
+The files `ict_landmarks68.npz` and `ict_face9409.npz` hold a mean face, 100 modes of identity that are scaled to unit
+variance, and 57 expressions with ARKit's names, all additive:
+`X = neutral + sum a_i identity_i + sum w_j expression_j`. They are in centimetres with y up and z out of the face;
+here x is to the image's right, y down, z away from the camera.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxfilters.models.face.landmarks import FROM_68
+from jaxfilters.typing import AnyKey
+
+_LANDMARKS, _SURFACE = "ict_landmarks68.npz", "ict_face9409.npz"
+_TO_OURS = np.array([10.0, -10.0, -10.0])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+class IctModel:
+    """V vertices of the skin, of which 68 are landmarks; eyes, teeth and the inner mouth are not part of it."""
+
+    neutral: Float[Array, "V 3"]
+    """Mean face, millimetres, about the origin of the files, which lies within the head."""
+    identity: Float[Array, "modes V 3"]
+    """Displacements for one standard deviation of each mode."""
+    expression: Float[Array, "expressions V 3"]
+    """Displacements for expressions of strength 1."""
+    landmarks: Int[Array, " 68"]
+    """Vertices of the landmarks in iBUG's order."""
+    faces: Int[Array, "F 3"]
+    """Triangles."""
+    names: tuple[str, ...] = field(metadata=dict(static=True))
+    """Of the expressions."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+class IctPerson:
+    """The face of one person, without expression."""
+
+    neutral: Float[Array, "V 3"]
+    """Millimetres about the centroid of the ten tracked landmarks."""
+
+
+def read_ict(folder: Path) -> IctModel:
+    """The face model in a folder.
+
+    Raises:
+        ValueError: if the folder lacks one of the two files, or one of them lacks an array.
+    """
+    points, surface = _arrays(folder / _LANDMARKS, "vertex_ids"), _arrays(folder / _SURFACE, "neutral", "quads")
+    surface |= _arrays(folder / _SURFACE, "identity", "expression", "expression_names")
+    quads = surface["quads"]
+    # The files wind their quads counter-clockwise from outside; turning y and z over keeps that.
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    neutral, identity, expression = (
+        jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float)
+        for name in ("neutral", "identity", "expression")
+    )
+    landmarks = np.asarray(points["vertex_ids"])
+    if landmarks.shape != (68,) or landmarks.max() >= len(neutral):
+        raise ValueError(f"vertex_ids of {folder / _LANDMARKS} must name 68 of {len(neutral)} vertices.")
+    names = tuple(str(name) for name in surface["expression_names"])
+    return IctModel(neutral, identity, expression, jnp.asarray(landmarks), jnp.asarray(faces, jnp.int32), names)
+
+
+@jax.jit
+def make_ict_person(key: AnyKey, model: IctModel) -> IctPerson:
+    """A random person: standard normal weights of all modes of identity."""
+    weights = jax.random.normal(key, (model.identity.shape[0],), model.neutral.dtype)
+    neutral = model.neutral + jnp.tensordot(weights, model.identity, 1)
+    return IctPerson(neutral - jnp.mean(ten_landmarks(model, neutral), axis=0))
+
+
+@jax.jit
+def deformed(model: IctModel, person: IctPerson, weights: Float[Array, " expressions"]) -> Float[Array, "V 3"]:
+    """Vertices of a person with an expression, millimetres about the centroid of the ten *neutral* landmarks."""
+    return person.neutral + jnp.tensordot(weights, model.expression, 1)
+
+
+def ten_landmarks(model: IctModel, vertices: Float[Array, "V 3"]) -> Float[Array, "10 3"]:
+    """The tracked landmarks among the vertices, in the trackers' order."""
+    return vertices[model.landmarks[jnp.asarray(FROM_68)]]
+
+
+def _arrays(path: Path, *names: str) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise ValueError(f"folder must hold {path.name}; {path.parent} does not.")
+    with np.load(path) as file:
+        missing = [name for name in names if name not in file]
+        if missing:
+            raise ValueError(f"{path} must hold {', '.join(names)}; it lacks {', '.join(missing)}.")
+        return {name: file[name] for name in names}

@@ -1,0 +1,126 @@
+"""Video of a modelled face with known truth, rendered frame by frame as it is asked for."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
+from jaxfilters.models.synthetic.face_motion import FPS
+from jaxfilters.models.synthetic.face_texture import make_background
+from jaxfilters.models.synthetic.ict_face import IctModel, IctPerson, deformed, make_ict_person, ten_landmarks
+from jaxfilters.models.synthetic.ict_render import IctHead, make_ict_head, render_ict
+from jaxfilters.models.synthetic.ict_skin import Skin, paint_skin
+from jaxfilters.typing import AnyKey
+
+
+@dataclass(frozen=True)
+class IctSequence:
+    """A video and its truth, as `FaceSequence`; the images are made anew whenever they are asked for."""
+
+    key: AnyKey
+    """Of the noise."""
+    model: IctModel
+    person: IctPerson
+    head: IctHead
+    skin: Skin
+    background: Float[Array, "C rows cols"]
+    rig: CameraRig
+    times: Float[np.ndarray, " frames"]
+    """Seconds."""
+    poses: Float[np.ndarray, "frames 6"]
+    """Millimetres and radians."""
+    expressions: Float[np.ndarray, "frames expressions"]
+    """Strengths, in the order of `model.names`."""
+    shapes: Float[np.ndarray, "frames 10 3"]
+    """Landmarks in the model frame, millimetres about the centroid of the neutral face."""
+    uv: Float[np.ndarray, "frames C 10 2"]
+    """Their pixels, whether they are seen or behind the nose."""
+    gain: Float[np.ndarray, " frames"]
+    """Factor of the light."""
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def frames(self, start: int, stop: int) -> UInt8[np.ndarray, "frames C rows cols"]:
+        """Images of the frames from `start` up to `stop`.
+
+        Raises:
+            ValueError: if these are not frames of the sequence.
+        """
+        if not 0 <= start <= stop <= len(self):
+            raise ValueError(f"start and stop must be within 0..{len(self)}, in order; got {start} and {stop}.")
+        images = np.empty((stop - start, self.rig.num_cameras, *self.rig.shape), np.uint8)
+        for index in range(start, stop):
+            images[index - start] = render_ict(
+                jax.random.fold_in(self.key, index),
+                self.model,
+                self.person,
+                self.head,
+                self.skin,
+                self.background,
+                self.rig,
+                jnp.asarray(self.poses[index], float),
+                jnp.asarray(self.expressions[index], float),
+                gain=jnp.asarray(self.gain[index], float),
+            )
+        return images
+
+    def chunks(self, size: int = 60) -> Iterator[tuple[int, UInt8[np.ndarray, "frames C rows cols"]]]:
+        """First frame and images of successive pieces of at most `size` frames."""
+        for start in range(0, len(self), size):
+            yield start, self.frames(start, min(start + size, len(self)))
+
+
+def ict_sequence(
+    key: AnyKey,
+    model: IctModel,
+    poses: Float[np.ndarray, "frames 6"],
+    *,
+    rig: CameraRig | None = None,
+    expressions: Float[np.ndarray, "frames expressions"] | None = None,
+    gain: Float[np.ndarray, " frames"] | None = None,
+) -> IctSequence:
+    """A random person along a course of poses, millimetres and radians, at 30 frames a second.
+
+    Args:
+        key: Of person, skin, backgrounds and noise.
+        model: Of all people.
+        poses: Of the head.
+        rig: Cameras; the two of the specification if none.
+        expressions: Strengths in the order of `model.names`; neutral if none.
+        gain: Factor of the light; 1 if none.
+    """
+    rig = nominal() if rig is None else rig
+    who, looks, walls, noise = jax.random.split(key, 4)
+    person, num_frames = make_ict_person(who, model), len(poses)
+    expressions = np.zeros((num_frames, len(model.names))) if expressions is None else expressions
+    shapes, uv = _truth(model, person, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
+    return IctSequence(
+        key=noise,
+        model=model,
+        person=person,
+        head=make_ict_head(model, person),
+        skin=paint_skin(looks, model),
+        background=jnp.stack([make_background(wall, rig.shape) for wall in jax.random.split(walls, rig.num_cameras)]),
+        rig=rig,
+        times=np.arange(num_frames) / FPS,
+        poses=poses,
+        expressions=expressions,
+        shapes=np.asarray(shapes),
+        uv=np.asarray(uv),
+        gain=np.ones(num_frames) if gain is None else gain,
+    )
+
+
+@jax.jit
+def _truth(model, person, rig, poses, expressions):
+    def of_frame(frame):
+        pose, weights = frame
+        shape = ten_landmarks(model, deformed(model, person, weights))
+        return shape, project_shape(rig, shape, pose)[0]
+
+    return jax.lax.map(of_frame, (poses, expressions))

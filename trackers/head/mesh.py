@@ -1,0 +1,37 @@
+"""The ten landmarks by MediaPipe's face mesh, for those who have installed it; nothing else here needs it."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+VERTICES = ((33,), (133,), (362,), (263,), (61,), (291,), (79,), (309,), (55, 107), (285, 336))
+"""Of the mesh of 468 for each landmark: brows end between their upper and lower edge."""
+
+
+class MeshDetector:
+    """Landmarks of the most evident face, image by image."""
+
+    def __init__(self) -> None:
+        """Loads the mesh.
+
+        Raises:
+            ImportError: without MediaPipe, or with one that has no face mesh of its own.
+        """
+        try:
+            solutions: Any = import_module("mediapipe").solutions
+        except (ImportError, AttributeError) as error:
+            raise ImportError(
+                "the face mesh needs mediapipe with bundled models, such as mediapipe==0.10.14; landmarks from the "
+                "cascades of OpenCV need nothing."
+            ) from error
+        self._mesh = solutions.face_mesh.FaceMesh(static_image_mode=True, max_num_faces=1)
+
+    def detect(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "10 2"] | None:
+        """All ten landmarks in pixels (u, v), or `None` without a face."""
+        found = self._mesh.process(np.repeat(image[:, :, None], 3, axis=2)).multi_face_landmarks
+        if not found:
+            return None
+        mesh = np.array([(p.x, p.y) for p in found[0].landmark]) * image.shape[::-1] - 0.5
+        return np.array([mesh[list(vertices)].mean(axis=0) for vertices in VERTICES])

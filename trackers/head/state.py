@@ -1,0 +1,133 @@
+"""What the head tracker is told, what it knows, and what it says."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from jaxfilters.adaptive import AdaptiveState
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.face.patches import Patches, Slopes
+from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.subspace import Subspace
+
+HEAD_STATUS = ("initialising", "rigid", "deformable", "lost")
+"""Words for the integers in `HeadTrack.status`."""
+INITIALISING, RIGID, DEFORMABLE, LOST = range(4)
+FRAME_S = 1 / 30
+"""Seconds: the step of time in which velocities and diffusion are counted."""
+NUM_MODES = 5
+POSE = 6
+DEGREE = math.radians(1.0)
+UNITS = np.array([1.0, 1.0, 1.0, DEGREE, DEGREE, DEGREE])
+"""Of pose, in which the paper counts velocity and diffusion: a millimetre, a degree."""
+CHOICES = {"mode": ("modern", "paper"), "diffusion": ("proportional", "learnt", "fixed")}
+
+
+@dataclass(frozen=True)
+class HeadOptions:
+    """What a user may set; Python values, read when a session is built."""
+
+    mode: str = "modern"
+    """`modern` refines what the particles find; `paper` is Oka, Sato and Sugano's tracker."""
+    num_particles: int = 1000
+    seed: int = 0
+    diffusion: str = "proportional"
+    """`proportional`: speed plus one unit, as in the paper's experiments; `learnt`: that regression goes on learning;
+    `fixed`: `fixed_diffusion`, whatever the speed."""
+    fixed_diffusion: float = 5.0
+    """Millimetres and degrees a frame."""
+    learn: bool = True
+    """Whether the face may deform; with one camera it never does."""
+    rigid_frames: int = 120
+    """Frames after registration in which deformations are learnt but not yet used."""
+    chunk: int = 8
+    """Frames in one compiled call; 1 for live cameras."""
+    live: bool = False
+    """Whether frames cannot wait: a lost face is then searched for beside the tracking."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        for name in ("num_particles", "chunk"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        if not self.fixed_diffusion > 0:
+            raise ValueError(f"fixed_diffusion must be positive; got {self.fixed_diffusion}.")
+        if self.rigid_frames < 0:
+            raise ValueError(f"rigid_frames must be 0 or more; got {self.rigid_frames}.")
+
+
+class Learner(NamedTuple):
+    """The deformation model while it is learnt."""
+
+    subspace: Subspace
+    num_shapes: Int[Array, ""]
+    """Shapes in the mean."""
+    shape: Float[Array, "K 3"]
+    """The last one that was measured, model frame, millimetres."""
+    windows: Float[Array, "C K T T"]
+    """Grey levels about its images."""
+    is_fresh: Bool[Array, ""]
+    """Whether it is of the frame before."""
+
+
+class Registered(NamedTuple):
+    """What a start leaves behind for good."""
+
+    shape: Float[Array, "K 3"]
+    """Neutral, model frame, millimetres."""
+    covariance: Float[Array, "K 3 3"]
+    """Of each landmark's place, model frame, mm^2."""
+    patches: Patches
+    pose: Float[Array, " 6"]
+    """Of the head at registration, millimetres and radians."""
+    images: Num[Array, "C rows cols"]
+    """In which it was registered."""
+
+
+class HeadState(NamedTuple):
+    """Everything the next frame needs."""
+
+    search: AdaptiveState
+    """Particles of pose and mode coefficients."""
+    belief: Gaussian
+    """Of the last estimate."""
+    model: FaceModel
+    """As learnt so far."""
+    registered: Registered
+    slopes: Slopes
+    looseness: Float[Array, " K"]
+    """Variance of each landmark about the model on every axis, mm^2."""
+    misfit: Float[Array, ""]
+    """Squared error of the alignments over what they claim."""
+    learner: Learner
+    misses: Int[Array, ""]
+    """Frames in a row in which the face was not found."""
+    age: Int[Array, ""]
+    """Frames since registration."""
+    time: Float[Array, ""]
+    """Of the last frame, seconds."""
+    key: Array
+
+
+class HeadTrack(NamedTuple):
+    """What is known of the head in each of `b` frames; NaN where it is not tracked."""
+
+    pose: Float[Array | np.ndarray, "b 6"]
+    """Millimetres and radians: x, y, z, roll, yaw, pitch."""
+    pose_std: Float[Array | np.ndarray, "b 6"]
+    deformation: Float[Array | np.ndarray, "b B"]
+    """Mode coefficients, millimetres."""
+    shape: Float[Array | np.ndarray, "b K 3"]
+    """Landmarks in the model frame, millimetres."""
+    image_points: Float[Array | np.ndarray, "b C K 2"]
+    """Pixels."""
+    score: Float[Array | np.ndarray, " b"]
+    """Mean normalised correlation at the estimate, -1 to 1."""
+    effective_sample_size: Float[Array | np.ndarray, " b"]
+    status: Int[Array | np.ndarray, " b"]
+    """Index into `HEAD_STATUS`."""

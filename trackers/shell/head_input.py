@@ -1,0 +1,148 @@
+"""What `jaxfilters track head-stereo` watches: two cameras of a rig, one camera, or a synthetic face."""
+
+import argparse
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+
+from jaxfilters.models.calibration import Calibration
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.rig import CameraRig, monocular
+from jaxfilters.models.synthetic.face_motion import FPS
+from jaxfilters.models.synthetic.face_sequence import FaceSequence, sequence
+from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.camera_files import open_intrinsics
+from jaxfilters.trackers.shell.head_report import HeadTruth
+from jaxfilters.trackers.shell.landmark_files import read_landmarks
+from jaxfilters.trackers.shell.rig_files import open_rig
+from jaxfilters.trackers.shell.video_input import VideoSource, open_video
+from jaxfilters.trackers.undistortion import Undistortion
+
+FOCAL_WIDTHS = 1.2
+"""Assumed focal length of a single camera, image widths: a horizontal field of view of 45 degrees."""
+_SYNTHETIC_FRAMES, _MOTION = 600, "mix"
+
+
+class Place(NamedTuple):
+    """What is watched, and by what."""
+
+    rig: CameraRig
+    undistortions: list[Undistortion]
+    sources: list[VideoSource]
+    points: np.ndarray | None
+    """(10, 2) landmarks in the first image of the first camera, without lens distortion; None where to be detected."""
+    truth: HeadTruth | None
+    """Of the synthetic face."""
+    note: str | None
+    """What was assumed, for a person."""
+
+
+def place_of(options: argparse.Namespace) -> Place:
+    """The cameras and sources that the command line names.
+
+    Raises:
+        InputError: a source or a file cannot be used, they do not fit each other, or one is missing.
+    """
+    if not options.sources:
+        return _synthetic(options)
+    if len(options.sources) == 1:
+        return _single(options)
+    if options.camera:
+        raise InputError("--camera: for one source alone; two cameras are described by --rig RIG.json.")
+    if not options.rig:
+        raise InputError("--rig: missing; `jaxfilters calibrate stereo` makes a RIG.json of two cameras.")
+    described = open_rig(options.rig)
+    if len(described.cameras) != len(options.sources):
+        raise InputError(
+            f"{options.rig}: {len(described.cameras)} cameras; got {len(options.sources)} sources, expected one each."
+        )
+    sources = [open_video(source, fps=options.fps) for source in options.sources]
+    for source, camera in zip(sources, described.cameras, strict=True):
+        _check_size(source, camera.image_size, f"{options.rig}: {camera.name}")
+    return Place(
+        described.rig, described.undistortions, sources, _points(options, described.undistortions[0]), None, None
+    )
+
+
+def _single(options: argparse.Namespace) -> Place:
+    if options.rig:
+        raise InputError(
+            "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
+        )
+    source = open_video(options.sources[0], fps=options.fps)
+    cols, rows = source.image_size
+    if options.camera:
+        K, distortion, image_size = open_intrinsics(options.camera)
+        _check_size(source, image_size, str(options.camera))
+        note = "one camera: a rigid face of average size"
+    else:
+        focal = FOCAL_WIDTHS * cols
+        K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
+        note = f"one camera: a rigid face of average size, and an assumed focal length of {focal:.0f} px"
+    undistortion = Undistortion((rows, cols), K, distortion)
+    rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
+    return Place(rig, [undistortion], [source], _points(options, undistortion), None, note)
+
+
+def _synthetic(options: argparse.Namespace) -> Place:
+    given = {"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps}
+    if unused := [name for name, value in given.items() if value is not None]:
+        raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic face has its own.")
+    seed = options.seed or 0
+    made = sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True)
+    image = _remembered(made)
+    sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
+    truth = HeadTruth(made.poses, made.uv)
+    undistortions = [Undistortion(made.rig.shape) for _ in sources]
+    return Place(made.rig, undistortions, sources, np.asarray(made.uv[0, 0], float), truth, None)
+
+
+class _SyntheticSource:
+    """One camera of the synthetic face as a source of images."""
+
+    def __init__(self, made: FaceSequence, camera: int, image):
+        self.name, self.fps, self.frames = f"synthetic camera {camera}", FPS, len(made)
+        rows, cols = made.rig.shape
+        self.image_size = (cols, rows)
+        self._made, self._camera, self._image = made, camera, image
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        every = max(1, self.frames // most)
+        return [self._image(i)[self._camera] for i in range(0, self.frames, every)][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        for i, time_s in enumerate(self._made.times):
+            yield float(time_s), self._image(i)[self._camera]
+
+    def trouble(self) -> str | None:
+        return None
+
+
+def _remembered(made: FaceSequence):
+    """`index -> images` in colour of all cameras, which are rendered together and asked for one after the other."""
+
+    @lru_cache(maxsize=4)
+    def images(index: int) -> list[np.ndarray]:
+        return [cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR) for grey in np.asarray(made.frames(index, index + 1)[0])]
+
+    return images
+
+
+def _points(options: argparse.Namespace, undistortion: Undistortion) -> np.ndarray | None:
+    if options.points is None:
+        return None
+    rows, cols = undistortion.shape
+    pixels = read_landmarks(options.points, (cols, rows))
+    if undistortion.K is None or undistortion.is_identity:
+        return pixels
+    return Calibration(undistortion.K, undistortion.distortion, np.eye(3), np.zeros(3), 0.0).undistort(pixels)
+
+
+def _check_size(source: VideoSource, size: tuple[int, int], described_by: str) -> None:
+    if source.image_size != size:
+        got, wanted = (f"{cols}x{rows}" for cols, rows in (source.image_size, size))
+        raise InputError(f"{described_by}: calibrated for images of {wanted}; {source.name} has {got}.")
