@@ -28,6 +28,9 @@ PIXEL_FLOOR = 0.01
 """Standard deviation, pixels, that no alignment is better than: the grid on which grey values were sampled."""
 MOST_DISTANCE = 9.0
 """Squared deviations a row beyond which a landmark is mistaken, and says nothing more about the noise."""
+COMMON_BIAS_PX = 0.006
+"""Standard deviation, pixels, of what all landmarks of one image are off alike: interpolation favours some phases of
+the grid, and the landmarks of two images share their phase of depth."""
 UNSEEN = 1e4
 """Standard deviation, pixels, of a landmark that was not seen."""
 
@@ -91,6 +94,8 @@ def refine(
     residual, H, S, by_shape, distance, trust = pieces(x)
     information = precision + jnp.einsum("k,kia,kib->ab", trust, _solve(S, H), H)
     covariance = jnp.linalg.inv(information)
+    by_bias = covariance @ jnp.einsum("k,kia->ai", trust, _solve(S, H))
+    covariance += COMMON_BIAS_PX**2 * by_bias @ by_bias.T
     off = x - prior.mean
     log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + 0.5 * (
         jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off

@@ -25,13 +25,13 @@ from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState
 ROUNDS = 2
 FEWEST_SEEN = 4
 """Landmarks without which there is no fit."""
-RESTING_STD = 0.05
+RESTING_STD = 0.02
 """Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
 UNLEARNT_STD = 0.01
 """Millimetres: of the coefficient of a mode that is not learnt, or not used."""
 MEMORY = 0.95
 """Of the running variances, a frame."""
-LOOSENESS = (0.05**2, 10.0**2)
+LOOSENESS = (0.02**2, 10.0**2)
 MISFIT = (0.05, 20.0)
 MEASURED_STD = 10.0
 """Millimetres about the model within which a landmark's place is measured."""

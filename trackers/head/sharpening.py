@@ -10,7 +10,7 @@ from jaxfilters.models.face.alignment import align
 from jaxfilters.models.face.patches import SKIN_NORMALS, Slopes, patches
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 
-PLACED_PX = 0.02
+PLACED_PX = 0.01
 """Standard deviation of a landmark in the first camera, where it is by definition: what sampling adds."""
 MOST_CHANGE_PX = 1.0
 """A patch that would go farther is not the one that was matched."""
@@ -32,6 +32,7 @@ def sharpened(
     shape: Float[Array, "K 3"],
     pose: Float[Array, " 6"],
     slopes: Slopes,
+    misfit: Float[Array, ""],
     rig: CameraRig,
 ) -> Sharpened:
     """The shape with depths found anew, with the skin inclined as has been learnt.
@@ -46,6 +47,7 @@ def sharpened(
         shape: As registered, or sharpened before.
         pose: Of the head in these images, millimetres and radians.
         slopes: Of the skin, as known by now.
+        misfit: Squared error of alignments over what they claim, as known by now.
         rig: Cameras.
     """
     normals = jnp.asarray(SKIN_NORMALS, shape.dtype)
@@ -59,7 +61,7 @@ def sharpened(
         near = found.seen[0] & (jnp.linalg.norm(found.uv[0] - uv[c], axis=-1) < MOST_CHANGE_PX)
         inclined = jnp.einsum("kis,kst,kjt->kij", found.by_slope[0], slopes.covariance, found.by_slope[0])
         places.append(jnp.where(near[:, None], found.uv[0], uv[c]))
-        covariances.append(found.covariance[0] + inclined + sampled)
+        covariances.append(misfit * found.covariance[0] + inclined + sampled)
     return _along_rays(shape, pose, jnp.stack(places), jnp.stack(covariances), rig)
 
 

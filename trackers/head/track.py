@@ -81,7 +81,7 @@ def begin(
     images = jnp.asarray(images, pose.dtype)
     seen = patches(images, model.mean, pose, rig, jnp.asarray(SKIN_NORMALS, pose.dtype))
     slopes = unknown_slopes(len(model.mean))
-    _, covariance = sharpened(images, model.mean, pose, slopes, rig)
+    _, covariance = sharpened(images, model.mean, pose, slopes, jnp.ones((), pose.dtype), rig)
     face = rigid(model.mean, model.templates, num_modes=NUM_MODES)
     variances = jnp.concatenate([jnp.diagonal(jnp.eye(POSE)) * 1e-4, jnp.full(NUM_MODES, 1e-4)])
     return HeadState(
@@ -258,7 +258,7 @@ def _learnt(
 def _sharpened(rig: CameraRig, state: HeadState) -> HeadState:
     """The registered shape as it looks now that the skin's slopes are better known, about its own centroid."""
     old = state.registered
-    shape, covariance = sharpened(old.images, old.shape, old.pose, state.slopes, rig)
+    shape, covariance = sharpened(old.images, old.shape, old.pose, state.slopes, state.misfit, rig)
     center = jnp.mean(shape, axis=0)
     # The landmarks stay where they are in the first image: what moves the centroid moves the pose back.
     place = old.pose.at[:3].add(rotation(old.pose[3:]) @ center)
