@@ -13,7 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.models.face.patches import SIZE, SMOOTHNESS_PX, Patches, Slopes, stretch
+from jaxfilters.models.face.correlation import score_map
+from jaxfilters.models.face.patches import (
+    SIZE,
+    SMOOTHNESS_PX,
+    Patches,
+    Slopes,
+    slope_of_grey,
+    stretch,
+    turned,
+    without_light,
+)
 from jaxfilters.models.face.rig import CameraRig, jacobian
 
 ITERATIONS = 6
@@ -23,6 +33,11 @@ LEAST_FACING = 0.2
 """Cosine of the angle between a patch's normal and the line of sight from which on it is looked at."""
 LEAST_TEACHING_SCORE = 0.7
 """Normalised correlation from which on a residual is taken for a matter of the slopes."""
+
+DOUBTFUL_SCORE = 0.8
+"""Normalised correlation below which a landmark may be elsewhere."""
+SEARCHED_PX = 24
+"""How far from where it is expected it is then searched for."""
 
 
 class Alignment(NamedTuple):
@@ -62,7 +77,7 @@ def align(
     grid = jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
     offsets = jnp.einsum("ckij,pj->ckpi", affine, grid)
 
-    def iterate(_: int, uv: Array) -> Array:
+    def iterate(_: Array | int, uv: Array) -> Array:
         shift = _look(patches, images, uv[:, :, None] + offsets)[0]
         step = -jnp.einsum("ckij,ckj->cki", affine, shift)
         length = jnp.linalg.norm(step, axis=-1, keepdims=True)
@@ -75,6 +90,56 @@ def align(
     teaching = seen & (score > LEAST_TEACHING_SCORE)
     by_slope, information, slope_score = _slopes(patches, grid, residual, variance, affine, by_shape, teaching)
     return Alignment(found, covariance, score, seen, by_slope, information, slope_score)
+
+
+def relocated(
+    patches: Patches,
+    slopes: Slopes,
+    images: Float[Array, "C rows cols"],
+    found: Alignment,
+    uv: Float[Array, "C K 2"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+) -> Alignment:
+    """The alignment with landmarks that fit badly searched for all around, up to `SEARCHED_PX` away.
+
+    A mouth that opens is far from where it was within a frame or two. Where a landmark correlates by less than
+    `DOUBTFUL_SCORE`, the best place of its turned template nearby is taken instead, if it is convincing.
+
+    Args:
+        patches: As for `align`, like the others.
+        slopes: Of the skin.
+        images: Grey levels.
+        found: Alignment from `uv`.
+        uv: Where the landmarks are expected, pixels.
+        shape: Model frame, millimetres.
+        pose: Millimetres and radians.
+        rig: Cameras.
+    """
+    doubtful = found.seen & (found.score < DOUBTFUL_SCORE)
+    return jax.lax.cond(
+        jnp.any(doubtful),
+        lambda: _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig),
+        lambda: found,
+    )
+
+
+def _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig):
+    by_shape, _ = jacobian(rig, shape, pose)
+    affine = jnp.where(found.seen[..., None, None], stretch(patches, slopes, by_shape), jnp.eye(2))
+    side = 2 * SEARCHED_PX + 1
+    expected = jnp.where(jnp.isfinite(uv), uv, 0.0)
+    origin = jnp.round(expected - (SIZE - 1) / 2) - SEARCHED_PX
+    search = lambda image, template, corner: score_map(image, template, corner, (side, side))
+    maps = jax.vmap(jax.vmap(search, (None, 0, 0)))(images, turned(patches, affine), origin)
+    best = jnp.argmax(maps.reshape(*maps.shape[:2], -1), axis=-1)
+    place = origin + jnp.stack([best % side, best // side], axis=-1) + (SIZE - 1) / 2
+    again = align(patches, slopes, images, jnp.where(doubtful[..., None], place, found.uv), shape, pose, rig)
+    better = doubtful & again.seen & (again.score > jnp.maximum(found.score, DOUBTFUL_SCORE))
+    pick = lambda a, b: jnp.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), a, b)
+    fields = {name: pick(getattr(again, name), getattr(found, name)) for name in ("uv", "covariance", "score", "seen")}
+    return found._replace(**fields)
 
 
 def _look(patches: Patches, images: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -102,8 +167,8 @@ def _covariance(patches: Patches, residual: Array, affine: Array) -> tuple[Array
     share = jnp.clip(0.5 * (across + down) / (variance * of_neighbours), 0.0, 1.0)
     white = jnp.linalg.inv(patches.inverse)
     mixed = (1 - share)[..., None, None] * white + share[..., None, None] * patches.smooth
-    turned = jnp.einsum("ckij,ckjl->ckil", affine, patches.inverse)
-    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", turned, variance[..., None, None] * mixed, turned)
+    per_moment = jnp.einsum("ckij,ckjl->ckil", affine, patches.inverse)
+    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", per_moment, variance[..., None, None] * mixed, per_moment)
     pixels_a_number = 1 + share * (2 * np.pi * SMOOTHNESS_PX**2 - 1)
     return covariance, variance * pixels_a_number
 
@@ -114,8 +179,9 @@ def _slopes(
     """Effect of the slopes on the place, and what the residual says of them once the shift has had its part."""
     rising = jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)
     rising = jnp.linalg.solve(affine, rising[..., None])[..., 0]
-    along = jnp.einsum("ckpi,cki->ckp", patches.gradient, rising)
-    columns = -along[..., None] * jnp.einsum("ckij,pj->ckpi", patches.plan, grid)
+    # Gain and offset explain some of the picture's change, but only once every pixel has changed as far as it rises.
+    along = jnp.einsum("ckpi,cki->ckp", slope_of_grey(patches), rising)
+    columns = without_light(patches.template, -along[..., None] * jnp.einsum("ckij,pj->ckpi", patches.plan, grid))
     shift = jnp.einsum("ckij,ckpj,ckps->ckis", patches.inverse, patches.gradient, columns)
     left = columns - jnp.einsum("ckpi,ckis->ckps", patches.gradient, shift)
     per_variance = jnp.where(teaching, 1 / variance, 0.0)

@@ -88,11 +88,7 @@ def patches(
     """
     uv, _ = project_shape(rig, shape, pose)
     wide = jax.vmap(lambda image, points: cut(image, points, WIDE_SIZE))(images, uv)
-    border = (WIDE_SIZE - SIZE) // 2
-    window = wide[:, :, border:-border, border:-border]
-    dv, du = jnp.gradient(wide, axis=(2, 3))
-    gradient = jnp.stack([du, dv], axis=-1)[:, :, border:-border, border:-border]
-    template, gradient, inverse, smooth = _moments(window, gradient)
+    template, gradient, inverse, smooth = _moments(_middle(wide), _grey_slope(wide))
     by_shape, _ = jacobian(rig, shape, pose)
     unit = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*uv.shape[:2], 1, 3))], axis=2)
@@ -146,14 +142,34 @@ def turned(patches: Patches, affine: Float[Array, "C K 2 2"]) -> Float[Array, "C
     return (upper * (1 - b) + lower * b).reshape(*affine.shape[:2], SIZE, SIZE)
 
 
+def slope_of_grey(patches: Patches) -> Float[Array, "C K TT 2"]:
+    """Gradient of the template along (u, v), grey levels a pixel, with what gain and offset could explain."""
+    return _grey_slope(patches.wide)
+
+
+def without_light(template: Float[Array, "C K TT"], columns: Float[Array, "C K TT n"]) -> Float[Array, "C K TT n"]:
+    """What another gain and another offset of the template, itself of mean 0, do not explain of each column."""
+    columns = columns - jnp.mean(columns, axis=2, keepdims=True)
+    energy = jnp.maximum(jnp.sum(template * template, axis=2), 1e-6)
+    gain = jnp.einsum("ckp,ckpi->cki", template, columns) / energy[..., None]
+    return columns - template[..., None] * gain[:, :, None]
+
+
+def _middle(wide: Array) -> Array:
+    border = (WIDE_SIZE - SIZE) // 2
+    return wide[:, :, border:-border, border:-border]
+
+
+def _grey_slope(wide: Array) -> Array:
+    dv, du = jnp.gradient(wide, axis=(2, 3))
+    return jnp.stack([_middle(du), _middle(dv)], axis=-1).reshape(*wide.shape[:2], SIZE * SIZE, 2)
+
+
 def _moments(window: Array, gradient: Array) -> tuple[Array, Array, Array, Array]:
     """Template, gradient free of gain and offset, inverse of its moments, and moments under a smooth residual."""
     C, K, size = window.shape[:3]
     flat = (window - jnp.mean(window, axis=(2, 3), keepdims=True)).reshape(C, K, size * size)
-    columns = gradient.reshape(C, K, size * size, 2)
-    columns -= jnp.mean(columns, axis=2, keepdims=True)
-    energy = jnp.maximum(jnp.sum(flat * flat, axis=2), 1e-6)
-    columns -= flat[..., None] * (jnp.einsum("ckp,ckpi->cki", flat, columns) / energy[..., None])[:, :, None]
+    columns = without_light(flat, gradient)
     inverse = jnp.linalg.inv(jnp.einsum("ckpi,ckpj->ckij", columns, columns) + 1e-3 * jnp.eye(2))
     distance = jnp.arange(size)[:, None] - jnp.arange(size)
     correlation = jnp.exp(-0.5 * (distance / SMOOTHNESS_PX) ** 2)

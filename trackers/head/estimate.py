@@ -9,20 +9,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters import weights
 from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.alignment import Alignment, align
+from jaxfilters.models.face.alignment import Alignment, align, relocated
 from jaxfilters.models.face.patches import Slopes, learn_slopes
+from jaxfilters.models.face.pose import rotation, turning_axes
 from jaxfilters.models.face.refinement import displaced, refine
 from jaxfilters.models.face.rig import CameraRig, project_shape
+from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
 from jaxfilters.trackers.head.search import KAPPA
 from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState
 
-ROUNDS = 2
 FEWEST_SEEN = 4
 """Landmarks without which there is no fit."""
 RESTING_STD = 0.02
@@ -33,6 +35,8 @@ MEMORY = 0.95
 """Of the running variances, a frame."""
 LOOSENESS = (0.02**2, 10.0**2)
 MISFIT = (0.05, 20.0)
+ORDINARY_EXPRESSION = float(np.linalg.norm(EXPRESSION_STD))
+"""Millimetres, root of the sum over all landmarks."""
 MEASURED_STD = 10.0
 """Millimetres about the model within which a landmark's place is measured."""
 
@@ -84,10 +88,11 @@ def refined(
     loose_prior = _prior(search, state, model, moved)
     loose = state.registered.covariance + state.looseness[:, None, None] * jnp.eye(3)
     x = jnp.concatenate([search.estimate[:POSE], loose_prior.mean[POSE:]])
-    for _ in range(ROUNDS):
-        found = _aligned(state, model, images, rig, x)
-        free = refine(loose_prior, found, state.slopes, model, loose, rig, x)
-        x = free.belief.mean
+    found = _aligned(align, state, model, images, rig, x)
+    x = refine(loose_prior, found, state.slopes, model, loose, rig, x).belief.mean
+    found = _aligned(_align_anywhere, state, model, images, rig, x)
+    free = refine(loose_prior, found, state.slopes, model, loose, rig, x)
+    x = free.belief.mean
 
     at_rest = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
     tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
@@ -107,6 +112,7 @@ def refined(
     rest_belief = Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
     belief = _mixed(resting, rest_belief, free.belief)
     M = resting * state.registered.shape + (1 - resting) * shape(model, free.belief.mean[POSE:])
+    belief = _with_gauge(belief, M - state.registered.shape, model)
     measured = displaced(
         free.belief.mean, found, state.slopes, model, MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1)), rig
     )
@@ -124,10 +130,15 @@ def refined(
     )
 
 
-def _aligned(state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array) -> Alignment:
+def _align_anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
+    found = align(patches, slopes, images, uv, M, pose, rig)
+    return relocated(patches, slopes, images, found, uv, M, pose, rig)
+
+
+def _aligned(way, state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array) -> Alignment:
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
-    found = align(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
+    found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
     return found._replace(covariance=state.misfit * found.covariance)
 
 
@@ -142,6 +153,16 @@ def _prior(search: AdaptiveState, state: HeadState, model: FaceModel, moved: Arr
     mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])
     covariance = jnp.zeros_like(before.covariance).at[:POSE, :POSE].set(pose_covariance)
     return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
+
+
+def _with_gauge(belief: Gaussian, deformation: Array, model: FaceModel) -> Gaussian:
+    """The belief, with what cannot be known of the skull's motion beside a deformation of this size."""
+    share = jnp.minimum(1.0, jnp.sum(deformation**2) / ORDINARY_EXPRESSION**2)
+    R = rotation(belief.mean[3:POSE])
+    to_angles = jnp.linalg.solve(turning_axes(belief.mean[3:POSE]).T, R)
+    turn = jnp.zeros((POSE, POSE), R.dtype).at[:3, :3].set(R).at[3:, 3:].set(to_angles)
+    extra = share * turn @ motion_covariance(model.mean) @ turn.T
+    return Gaussian(belief.mean, belief.covariance.at[:POSE, :POSE].add(extra))
 
 
 def _mixed(share: Array, first: Gaussian, second: Gaussian) -> Gaussian:

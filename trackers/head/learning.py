@@ -1,6 +1,7 @@
 """Which shapes the deformation model learns from, and what it becomes."""
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,14 @@ MOST_YAW, MOST_PITCH = math.radians(25.0), math.radians(20.0)
 """Of a face that is turned to the cameras."""
 LEAST_SCORE = 0.5
 """Mean correlation from which on a shape is measured. An unseen deformation alone costs up to 0.4."""
+Still = Callable[[Array, Array], Array]
 LEAST_CHANGE = 6.0
 """Millimetres, root of the sum over all landmarks: what counts as a deformation."""
+
+
+def without_weighted_motion(change: Float[Array, "K 3"], mean: Float[Array, "K 3"]) -> Float[Array, "K 3"]:
+    """The specification's way: least squares with weights for landmarks that keep still (section 2.10)."""
+    return remove_rigid(change, mean, jnp.asarray(RIGID_WEIGHTS, change.dtype))
 
 
 def nothing_learnt(shape: Float[Array, "K 3"], windows: Float[Array, "C K T T"]) -> Learner:
@@ -55,6 +62,7 @@ def learnt(
     windows: Float[Array, "C K T T"],
     is_measured: Bool[Array, ""],
     follow: float,
+    still: Still,
 ) -> tuple[Learner, FaceModel]:
     """Learner and model after a shape, if it was measured at all (specification, sections 2.10 to 2.12).
 
@@ -68,8 +76,9 @@ def learnt(
         is_measured: Whether there is a shape.
         follow: How far the mean goes along with the shapes: 1 makes it their mean, as published; 0 keeps it at the
             registered face, which a face comes back to whenever it is at rest.
+        still: `(change, mean) -> change` without the skull's own motion.
     """
-    change = remove_rigid(shape - model.mean, model.mean, jnp.asarray(RIGID_WEIGHTS, shape.dtype))
+    change = still(shape - model.mean, model.mean)
     usable = is_measured & jnp.all(jnp.isfinite(change))
     change = jnp.where(usable, change, 0.0)
     count = learner.num_shapes + usable.astype(jnp.int32)

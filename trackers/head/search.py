@@ -85,10 +85,12 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
 
 def first_diffusion(options: HeadOptions) -> DiffusionFit:
     """`A = I` and a unit of each coordinate a frame (specification, section 2.5); no `A` if it is fixed."""
-    scale = jnp.asarray(UNITS, float)
-    if options.diffusion == "fixed":
-        return diffusion.start(scale, slope=0.0, offset=options.fixed_diffusion)
-    return diffusion.start(scale)
+    # Its arguments are checked by value, also where a caller is being traced.
+    with jax.ensure_compile_time_eval():
+        scale = jnp.asarray(UNITS, float)
+        if options.diffusion == "fixed":
+            return diffusion.start(scale, slope=0.0, offset=options.fixed_diffusion)
+        return diffusion.start(scale)
 
 
 def at(filter: Filter, model: FaceModel, templates: Array, deviation: Array) -> Filter:

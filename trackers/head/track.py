@@ -15,6 +15,7 @@ from jaxfilters.models.face.alignment import facing
 from jaxfilters.models.face.patches import SKIN_NORMALS, patches, stretch, turned, unknown_slopes
 from jaxfilters.models.face.pose import rotation
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+from jaxfilters.models.face.rigid import remove_motion
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
 from jaxfilters.particle import ParticleInfo
 from jaxfilters.trackers.head import learning
@@ -51,8 +52,8 @@ SHARPENING = (15, 300)
 """Frames: how often, and how long after registration, the registered shape is triangulated anew."""
 FIRST_LOOSENESS = 0.3**2
 """mm^2."""
-FOLLOW = {"paper": 1.0, "modern": 0.0}
-"""How far the mean shape goes along with the shapes that were measured."""
+LEARNING = {"paper": (1.0, learning.without_weighted_motion), "modern": (0.0, remove_motion)}
+"""How far the mean shape goes along with those that are measured, and how the skull's motion is taken out of them."""
 MOST_STEPS = 30.0
 """Frame times: a longer gap is treated as one of this length."""
 
@@ -230,7 +231,7 @@ def _learnt(
                 ),
                 lambda: (measured, windows),
             )
-        learner, after = learning.learnt(learner, state.model, measured, windows, is_measured, FOLLOW[options.mode])
+        learner, after = learning.learnt(learner, state.model, measured, windows, is_measured, *LEARNING[options.mode])
     carry = lambda a: learning.carried(a, model, after)
     turning = learning.turning(model, after)
     x = belief.mean.at[POSE:].set(carry(belief.mean[POSE:, None])[:, 0])

@@ -1,0 +1,178 @@
+"""The scenario of heads before two cameras: how runs are judged, and, slowly, all of it in small."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxfilters.benchmarks.scenarios import _head_deformation as deformation
+from jaxfilters.benchmarks.scenarios import _head_runs as runs
+from jaxfilters.benchmarks.scenarios import _head_speed as speed
+from jaxfilters.benchmarks.scenarios import head_stereo
+from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
+from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
+from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.trackers.head.state import RIGID, HeadOptions, HeadTrack
+
+K, C = 10, 2
+
+
+def fake_run(errors, *, std=1.0, shapes=None, off_px=0.0, contributions=(0.5,)):
+    """A run with the given errors (t, 6) of the pose, millimetres and degrees, about a head that moves."""
+    errors = np.asarray(errors, float)
+    t = len(errors)
+    rng = np.random.default_rng(0)
+    poses = np.concatenate([rng.normal(0, 30, (t + 1, 3)), rng.normal(0, 0.2, (t + 1, 3))], axis=-1)
+    true_shapes = np.repeat(MEAN_SHAPE[None], t + 1, axis=0)
+    uv = rng.uniform(100, 400, (t + 1, C, K, 2))
+    truth = SimpleNamespace(poses=poses, shapes=true_shapes, uv=uv)
+    track = HeadTrack(
+        pose=poses[1:] + errors / DISPLAY,
+        pose_std=np.broadcast_to(std / DISPLAY, (t, 6)),
+        deformation=np.zeros((t, 5)),
+        shape=true_shapes[1:] if shapes is None else shapes,
+        image_points=uv[1:] + np.asarray(off_px).reshape(-1, 1, 1, 1) * np.array([1.0, 0.0]),
+        score=np.ones(t),
+        effective_sample_size=np.ones(t),
+        status=np.full(t, RIGID, np.int32),
+    )
+    return HeadRun(track, truth, np.asarray(contributions))
+
+
+def test_errors_are_in_millimetres_and_degrees_and_only_of_frames_with_the_face():
+    errors = np.tile([1.0, 2.0, 3.0, 0.1, 0.2, 0.3], (6, 1))
+    errors[4:] = 50.0
+    run = fake_run(errors, off_px=[0, 0, 0, 0, 9, 9])
+    np.testing.assert_allclose(runs.rmse(run), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], rtol=1e-6)
+    assert runs.lost_share(run) == pytest.approx(2 / 6)
+    assert np.all(np.isinf(runs.rmse(run, slice(4, 6))))
+
+
+def test_a_pose_that_is_not_known_is_a_loss_and_covers_nothing():
+    errors = np.zeros((4, 6))
+    errors[3] = np.nan
+    run = fake_run(errors, off_px=[0, 0, 0, np.nan])
+    assert runs.lost_share(run) == 0.25
+    np.testing.assert_allclose(runs.coverage(run), 0.75)
+    np.testing.assert_allclose(runs.rmse(run), 0.0, atol=1e-9)
+
+
+def test_coverage_is_that_of_a_gaussian():
+    errors = np.random.default_rng(1).normal(0, 0.7, (4000, 6))
+    # Four standard errors of a share of 0.954 in 4000.
+    np.testing.assert_allclose(runs.coverage(fake_run(errors, std=0.7)), 0.9545, atol=4 * np.sqrt(0.0434 / 4000))
+
+
+def test_shapes_are_compared_after_the_best_rotation():
+    rng = np.random.default_rng(2)
+    shapes = MEAN_SHAPE + rng.normal(0, 2, (5, K, 3))
+    turned = np.stack([Rotation.random(random_state=i).apply(shape) + 7 for i, shape in enumerate(shapes)])
+    np.testing.assert_allclose(runs.apart_after_alignment(turned, shapes), 0, atol=1e-6)
+    noisy = turned + rng.normal(0, 1, turned.shape)
+    expected = []
+    for a, b in zip(noisy, shapes, strict=True):
+        _, residual = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))
+        expected.append(residual / np.sqrt(K))
+    np.testing.assert_allclose(runs.apart_after_alignment(noisy, shapes), expected, rtol=1e-6)
+    mirrored = shapes * np.array([-1.0, 1.0, 1.0])
+    assert np.all(runs.apart_after_alignment(mirrored, shapes) > 5)
+    noisy[2] = np.nan
+    assert np.isnan(runs.apart_after_alignment(noisy, shapes)).tolist() == [False, False, True, False, False]
+
+
+def test_landmarks_are_compared_in_the_world():
+    errors = np.zeros((3, 6))
+    errors[:, 2] = [0.0, 1.0, 2.0]
+    np.testing.assert_allclose(fake_run(errors).landmark_errors, [0.0, 1.0, 2.0], atol=1e-4)
+
+
+def test_tables_compare_with_the_rows_of_the_paper():
+    paper = np.array(head_stereo.PAPER_ADAPTIVE["slow"])
+    table = {
+        "": {100: fake_run(np.tile(0.25 * paper, (5, 1))), 101: fake_run(np.tile(0.75 * paper, (5, 1)))},
+        "_paper": {100: fake_run(np.tile(paper, (5, 1)))},
+        "_paper_fixed5": {100: fake_run(np.tile(4 * paper, (5, 1)), off_px=[0, 0, 0, 9, 9])},
+    }
+    metrics = {name: metric.value for name, metric in head_stereo.table_metrics("slow", table).items()}
+    for axis in AXES:
+        assert metrics[f"ratio_to_paper_adaptive_slow_{axis}"] == pytest.approx(0.5)
+        assert metrics[f"worst_ratio_to_paper_adaptive_slow_{axis}"] == pytest.approx(0.75)
+        assert metrics[f"adaptive_to_fixed5_slow_{axis}_paper"] == pytest.approx(0.25)
+    assert metrics["coverage_2sigma_slow_x"] == 1
+    assert metrics["lost_share_slow_paper_fixed5"] == pytest.approx(0.4)
+    assert metrics["lost_runs_slow_paper_fixed5"] == 1
+    assert metrics["lost_runs_slow"] == 0
+
+
+def test_recovery_is_when_the_last_error_that_is_too_large_is_over():
+    errors = np.full((599, 6), 0.1)
+    errors[200:229] = 3.0  # frames 201 to 229: covered until 230
+    errors[229:236, 5] = 0.9  # frames 230 to 236
+    errors[310, 2] = 5.0
+    judged = head_stereo.judge_occlusion(fake_run(errors), np.full(6, 0.1))
+    assert judged["recovery_frames"] == 7
+    assert judged["occlusion_peak_x"] == pytest.approx(3)
+    assert judged["dimming_peak_z"] == pytest.approx(5)
+    assert judged["dimming_peak_x"] == pytest.approx(0.1)
+    assert judged["after_occlusion_to_allowed"] == pytest.approx(0.1 / 0.7)
+    assert judged["occlusion_lost_share"] == 0
+
+
+def test_deformation_is_judged_in_the_frames_in_which_it_is():
+    schedule = Schedule(40, 120, 200)
+    far, near = np.full((199, 6), 0.2), np.full((199, 6), 0.2)
+    shapes = MEAN_SHAPE + np.random.default_rng(3).normal(0, 1, (199, K, 3))
+    far[39:119, 5], near[39:119, 5] = 4.0, 1.0
+    far[119:, 5] = near[119:, 5] = 0.5
+    learnt = fake_run(near, shapes=shapes, contributions=(0.1, 0.2, 0.9, 0.9, 0.9))
+    of = {"rigid": [fake_run(far, shapes=shapes)], "deformable": [learnt]}
+    metrics = {name: metric.value for name, metric in deformation.judged("", of, schedule).items()}
+    assert metrics["deforming_rmse_pitch_rigid"] == pytest.approx(4)
+    assert metrics["deforming_ratio_to_rigid_rmse_pitch"] == pytest.approx(0.25)
+    assert metrics["afterwards_ratio_to_rigid_rmse_pitch"] == pytest.approx(1)
+    assert metrics["deforming_ratio_to_rigid_shape"] == pytest.approx(1)
+    # Frame 120, the last that counts, is in the third block of 40.
+    assert metrics["contribution_deformable"] == metrics["least_contribution_deformable"] == 0.9
+
+
+def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
+    schedule = Schedule(40, 120, 200)
+    wave = np.sin(np.arange(199) / 10)[:, None] * np.ones(6)
+    of = {
+        name: [fake_run(scale * wave, contributions=np.linspace(0, 1, 5))]
+        for scale, name in enumerate(deformation.COLORS)
+    }
+    deformation.plot(tmp_path / "deformation.png", of, schedule)
+    image = cv2.imread(str(tmp_path / "deformation.png"))
+    assert image.shape == (3 * 260 + 200, 900, 3)
+    for color in deformation.COLORS.values():
+        assert np.any(np.all(np.abs(image.astype(int) - color) < 12, axis=-1))
+
+
+@pytest.mark.slow
+def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
+    """Few particles and frames; fixed diffusions are left out, for every option takes long to compile."""
+    few = {name: HeadOptions(mode="paper", learn=False, num_particles=64) for name in ("_paper", "_paper_fixed5")}
+    monkeypatch.setattr(head_stereo, "PAPER", few)
+    monkeypatch.setattr(head_stereo, "ALWAYS", {"": HeadOptions(learn=False, num_particles=64)})
+    monkeypatch.setattr(head_stereo, "QUICK_NUM_SEEDS", 1)
+    monkeypatch.setattr(head_stereo, "QUICK_NUM_FRAMES", 31)
+    monkeypatch.setattr(head_stereo, "STILL_FRAMES", 31)
+    monkeypatch.setattr(head_stereo, "QUICK_OCCLUSION_FRAMES", 310)
+    monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 50, 60))
+    monkeypatch.setattr(head_stereo, "QUICK_COUNTS", (64,))
+    monkeypatch.setattr(speed, "USUAL", 64)
+    chosen = {"rigid": HeadOptions(learn=False, num_particles=64), "deformable": HeadOptions(num_particles=64)}
+    monkeypatch.setattr(Schedule, "trackers", property(lambda self: chosen))
+    metrics = head_stereo.run(quick=True, seed=0, out=tmp_path)
+    for kind in ("slow", "fast"):
+        for axis in AXES:
+            assert metrics[f"ratio_to_paper_adaptive_{kind}_{axis}"].value < 1
+            assert {f"worst_ratio_to_paper_adaptive_{kind}_{axis}", f"coverage_2sigma_{kind}_{axis}"} <= set(metrics)
+        assert metrics[f"lost_share_{kind}"].value == 0
+    names = {"recovery_frames", "occlusion_peak_pitch", "fps_64_particles", "fps_64_particles_paper"}
+    names |= {"still_std_x_paper_fixed5", "stage_share_particles", "deforming_ratio_to_rigid_rmse_pitch"}
+    assert names <= set(metrics)
+    assert (tmp_path / "deformation.png").stat().st_size > 10_000
