@@ -20,7 +20,7 @@ LEAST_CONFIDENCE = 0.2
 NOISE_SHARE = 0.05
 """Noise of a keypoint's coordinate in one frame as a share of the hand's diagonal in the image, where nobody says
 better. Detectors look at a crop around the hand, so that their error grows with it. That of MediaPipe's network is
-13.4 % of the palm's size (F. Zhang et al., MediaPipe Hands: on-device real-time hand tracking, 2020, table 1; which
+13.4 % of the palm's size (F. Zhang et al., MediaPipe Hands: on-device real-time hand tracking, 2020; which
 distances it takes is not said). With the palm as long as from wrist to knuckles, half of the diagonal of an average
 hand, that is 6.7 % of the diagonal, and as a root mean square of distances 4.7 % in each coordinate."""
 

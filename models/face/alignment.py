@@ -52,7 +52,7 @@ class Alignment(NamedTuple):
     seen: Bool[Array, "C K"]
     """Whether the patch faces the camera and lies inside the image."""
     by_slope: Float[Array, "C K 2 2"]
-    """How far the place would move, in pixels, with the slopes of the patch."""
+    """How far the place moves, in pixels, with slopes that the skin has beyond those assumed."""
     slope_information: Float[Array, "K 2 2"]
     slope_score: Float[Array, "K 2"]
     """What the residual says of the slopes, as `learn_slopes` takes it."""

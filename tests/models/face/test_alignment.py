@@ -10,7 +10,7 @@ import pytest
 
 from jaxfilters.models.face import alignment as module
 from jaxfilters.models.face.alignment import LEAST_FACING, SEARCHED_PX
-from jaxfilters.models.face.patches import SLOPE_STD, learn_slopes, patches, stretch, unknown_slopes
+from jaxfilters.models.face.patches import LEAST_SLOPE_STD, SLOPE_STD, learn_slopes, patches, unknown_slopes
 from jaxfilters.models.face.rig import jacobian
 
 align, relocated, facing = (jax.jit(f) for f in (module.align, module.relocated, module.facing))
@@ -59,7 +59,7 @@ def test_landmarks_are_found_on_turned_planes(face, head_poses):
         found = face.align(face.scene.images(pose), pose, rng.uniform(-1.5, 1.5, (2, 6, 2)))
         assert np.abs(found.uv - face.scene.uv(pose)).max() < 0.05
         near = face.align(face.scene.images(pose), pose, 1.0, expected=pose + rng.choice([-1, 1], 6) * apart)
-        assert np.abs(near.uv - face.scene.uv(pose)).max() < 0.25
+        assert np.abs(near.uv - face.scene.uv(pose)).max() < 0.4
 
 
 def test_light_does_not_matter(face, head_poses):
@@ -86,21 +86,16 @@ def noisy(face, pose, std, draws, smooth=0.0):
 
 @pytest.mark.parametrize("std", [3.0, 10.0])
 def test_covariances_are_honest_about_white_noise(face, std):
-    """`e^T P^-1 e` of 200 draws of 12 landmarks has mean 2 and variance 4; interpolation takes some noise away.
+    """`e^T P^-1 e` has mean 2: that of 2400 is within 4 sqrt(4 / 2400) = 0.16 of it where nothing else is claimed.
 
-    The mean of 2400 numbers is within 4 sqrt(4 / 2400) = 0.16 of what it should be.
+    Interpolation makes neighbouring pixels alike, which counts as smooth: up to twice the variance is claimed.
     """
     error, covariance = noisy(face, face.scene.registered + np.array([0.3, -0.2, 0, 0, 0, 0]), std, 200)
     error = error - error.mean(axis=0)
     square = np.einsum("nckj,nckj->nck", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    assert 1.2 < square.mean() < 2.2
-    assert (square < 9.21).mean() > 0.97
-    sample = np.einsum("ncki,nckj->ckij", error, error) / 199
-    np.testing.assert_allclose(
-        np.sqrt(np.trace(sample, axis1=2, axis2=3)),
-        np.sqrt(np.trace(covariance.mean(axis=0), axis1=2, axis2=3)),
-        rtol=0.3,
-    )
+    assert 0.5 * 2 - 0.16 < square.mean() < 2 + 0.16
+    # The 99 % quantile, exceeded by 4 standard deviations more than 1 % at most.
+    assert (square > 9.21).mean() < 0.01 + 4 * np.sqrt(0.01 / square.size)
 
 
 def test_the_bias_of_a_turned_plane_is_within_what_is_claimed(face, head_poses):
@@ -128,15 +123,16 @@ def test_a_smooth_residual_counts_for_less(face):
 
 
 def test_places_follow_the_slopes_as_derivatives_say(face, head_poses):
-    """Another slope moves the place by `by_slope`: central differences over whole alignments."""
+    """Central differences over whole alignments; a slope that is assumed is one that the skin no longer has beyond."""
     pose = head_poses.near[1]
     images = face.scene.images(pose)
     found = face.align(images, pose)
     for axis in range(2):
         step = jnp.zeros(2).at[axis].set(0.02)
         ends = [face.align(images, pose, slopes=face.slopes._replace(mean=face.slopes.mean + s * step)) for s in (1, -1)]
-        difference = (ends[0].uv - ends[1].uv) / 0.04
-        np.testing.assert_allclose(difference, found.by_slope[..., axis], atol=0.15 * np.abs(found.by_slope).max())
+        difference = (ends[1].uv - ends[0].uv) / 0.04
+        assert np.abs(difference).max() > 0.3
+        np.testing.assert_allclose(difference, found.by_slope[..., axis], atol=0.05)
 
 
 def test_slopes_that_are_learnt_are_those_of_the_planes(plane_scene, head_poses, x64):
@@ -156,8 +152,7 @@ def test_slopes_that_are_learnt_are_those_of_the_planes(plane_scene, head_poses,
             images = plane_scene.images(pose) + rng.normal(0, 2, (2, *face.rig.shape))
             found = face.align(images, pose, slopes=slopes)
             slopes = learn_slopes(slopes, found.slope_information, found.slope_score)
-    assert np.abs(slopes.mean - true).max() < 0.08
-    assert np.sqrt(np.mean((slopes.mean - true) ** 2)) < 0.2 * np.sqrt(np.mean(true**2))
+    assert np.abs(slopes.mean - true).max() < LEAST_SLOPE_STD
     assert np.all(np.diagonal(slopes.covariance, axis1=1, axis2=2) < (0.5 * SLOPE_STD) ** 2)
 
 
@@ -165,8 +160,7 @@ def test_a_patch_faces_a_camera_up_to_a_given_angle(face, head_poses):
     pose = head_poses.near[2]
     sight = np.stack([-place[None] - face.scene.world(pose) for place in (np.zeros(3), np.array([-120.0, 0, 0]))])
     sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
-    turns = np.linspace(0, np.pi, 60)
-    for angle in turns:
+    for angle in np.linspace(0, np.pi, 31):
         normals = np.tile([np.sin(angle), 0, -np.cos(angle)], (6, 1))
         cosine = sight @ (face.scene.world(pose, normals[:1]) - pose[:3])[0]
         by_shape, _ = jacobian(face.rig, face.shape, jnp.asarray(pose))
@@ -214,6 +208,5 @@ def test_landmarks_that_moved_far_are_found_again(face):
     np.testing.assert_allclose(found.uv, true, atol=0.05)
     np.testing.assert_array_equal(np.delete(found.uv, 4, axis=1), np.delete(lost.uv, 4, axis=1))
     assert found.score[:, 4].min() > 0.98
-    gone = jnp.where(jnp.arange(images.shape[2]) > 0, 120.0, 120.0) * jnp.ones_like(images)
-    kept = relocated(face.patches, face.slopes, gone, lost, *arguments[4:])
+    kept = relocated(face.patches, face.slopes, jnp.full_like(images, 120.0), *arguments[3:])
     np.testing.assert_array_equal(kept.uv, lost.uv)

@@ -1,0 +1,271 @@
+"""The fit to aligned landmarks against SciPy's least squares, and its covariances against many draws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import multivariate_normal, multivariate_t
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.face import refinement as module
+from jaxfilters.models.face.alignment import Alignment
+from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.models.face.patches import Slopes
+from jaxfilters.models.face.pose import place, rotation
+from jaxfilters.models.face.refinement import COMMON_BIAS_PX, DEGREES_OF_FREEDOM, LEAST_SCORE, PIXEL_FLOOR
+from jaxfilters.models.face.rig import jacobian, nominal, project_shape, triangulate
+from jaxfilters.models.face.shape_model import FaceModel, shape
+
+NU = DEGREES_OF_FREEDOM
+POSE = np.array([60.0, 5, 640, 0.05, -0.2, 0.1])
+PRIOR_STD = np.array([2.0, 2, 4, 0.03, 0.05, 0.05, 3.0, 2.0])
+NOISE = np.array([[0.0016, 0.0004], [0.0004, 0.0009]])
+LOOSE_STD, SLOPE_STD = 0.1, 0.1
+refine, displaced = jax.jit(module.refine), jax.jit(module.displaced)
+
+
+class Face:
+    """Ten landmarks with two modes, and drawn alignments; what `refine` takes."""
+
+    def __init__(self):
+        rng = np.random.default_rng(0)
+        basis = np.linalg.qr(rng.normal(size=(30, 2)))[0]
+        self.rig = nominal()
+        self.model = FaceModel(
+            jnp.asarray(MEAN_SHAPE), jnp.asarray(basis), jnp.array([3.0, 2.0]), jnp.zeros((2, 10, 16, 16))
+        )
+        self.looseness = jnp.tile(LOOSE_STD**2 * jnp.eye(3), (10, 1, 1))
+        self.slopes = Slopes(jnp.zeros((10, 2)), jnp.tile(SLOPE_STD**2 * jnp.eye(2), (10, 1, 1)))
+        self.by_slope = jnp.asarray(rng.normal(0, 0.3, (2, 10, 2, 2)))
+        self.prior = Gaussian(jnp.asarray([*POSE, 0.0, 0.0]), jnp.diag(jnp.asarray(PRIOR_STD**2)))
+
+    def found(self, uv, seen=None):
+        seen = jnp.ones((2, 10), bool) if seen is None else seen
+        return Alignment(
+            uv=jnp.asarray(uv),
+            covariance=jnp.broadcast_to(jnp.asarray(NOISE), (2, 10, 2, 2)),
+            score=jnp.ones((2, 10)),
+            seen=seen,
+            by_slope=self.by_slope,
+            slope_information=jnp.zeros((10, 2, 2)),
+            slope_score=jnp.zeros((10, 2)),
+        )
+
+    def refine(self, found, prior=None):
+        prior = self.prior if prior is None else prior
+        return refine(prior, found, self.slopes, self.model, self.looseness, self.rig, prior.mean)
+
+    def project(self, x, moved=0.0):
+        return project_shape(self.rig, shape(self.model, x[6:]) + moved, x[:6])[0]
+
+    def draw(self, key):
+        """A state from the prior, and what would be seen of it."""
+        keys = jax.random.split(key, 4)
+        x = self.prior.mean + jnp.asarray(PRIOR_STD) * jax.random.normal(keys[0], (8,))
+        moved = LOOSE_STD * jax.random.normal(keys[1], (10, 3))
+        bent = SLOPE_STD * jnp.einsum("ckis,ks->cki", self.by_slope, jax.random.normal(keys[2], (10, 2)))
+        noise = jax.random.normal(keys[3], (2, 10, 2)) @ jnp.linalg.cholesky(jnp.asarray(NOISE)).T
+        return x, self.project(x, moved) + bent + noise
+
+
+@pytest.fixture
+def face(x64):
+    return Face()
+
+
+def covariances(face, x, seen):
+    """Of the seen rows of each landmark, as the module's text has them, in NumPy."""
+    by_shape = np.asarray(jacobian(face.rig, shape(face.model, x[6:]), x[:6])[0])
+    blocks = []
+    for k in range(10):
+        J, bend = (np.concatenate([a[c, k] for c in range(2)]) for a in (by_shape, np.asarray(face.by_slope)))
+        S = LOOSE_STD**2 * J @ J.T + SLOPE_STD**2 * bend @ bend.T
+        S += np.kron(np.eye(2), NOISE + PIXEL_FLOOR**2 * np.eye(2))
+        rows = np.repeat(np.asarray(seen)[:, k], 2)
+        blocks.append(S[np.ix_(rows, rows)])
+    return blocks
+
+
+def residuals(face, uv, x, seen):
+    off = np.asarray(uv) - np.asarray(face.project(jnp.asarray(x)))
+    return [off[:, k][np.asarray(seen)[:, k]].ravel() for k in range(10)]
+
+
+def some_seen():
+    return jnp.ones((2, 10), bool).at[0, 3].set(False).at[:, 7].set(False)
+
+
+@pytest.mark.parametrize("outlier", [0.0, 3.0])
+def test_the_fit_is_the_least_squares_of_scipy(face, outlier):
+    """The same Student residuals, a number each landmark, with the covariances at the solution; 1e-3 deviations."""
+    _, uv = face.draw(jax.random.key(1))
+    seen = some_seen()
+    uv = uv.at[:, 5].add(outlier)
+    found = face.refine(face.found(uv, seen))
+    whiten = [np.linalg.inv(np.linalg.cholesky(S)) for S in covariances(face, found.belief.mean, seen)]
+
+    def function(x):
+        white = [L @ r for L, r in zip(whiten, residuals(face, uv, x, seen), strict=True)]
+        student = [np.sqrt((NU + len(w)) * np.log1p(w @ w / NU)) for w in white]
+        return np.concatenate([student, (x - np.asarray(face.prior.mean)) / PRIOR_STD])
+
+    fit = least_squares(function, face.prior.mean, x_scale=PRIOR_STD, xtol=1e-12, ftol=1e-14)
+    apart = (np.asarray(found.belief.mean) - fit.x) / np.sqrt(np.diagonal(found.belief.covariance))
+    assert np.abs(apart).max() < (1e-3 if outlier == 0 else 0.05)
+    assert np.abs(fit.x - np.asarray(face.prior.mean)).max() > 1
+
+
+def test_covariance_and_evidence_are_those_of_the_formulas(face):
+    _, uv = face.draw(jax.random.key(2))
+    seen = some_seen()
+    found = face.refine(face.found(uv, seen))
+    x = np.asarray(found.belief.mean)
+    S, off = covariances(face, x, seen), residuals(face, uv, x, seen)
+    H = np.asarray(jax.jacfwd(face.project)(jnp.asarray(x)))
+    rows = [H[:, k][np.asarray(seen)[:, k]].reshape(-1, 8) for k in range(10)]
+    distance = np.array([r @ np.linalg.solve(C, r) if r.size else 0.0 for r, C in zip(off, S, strict=True)])
+    trust = (NU + np.array([r.size for r in off])) / (NU + distance)
+    np.testing.assert_allclose(found.trust, trust, rtol=1e-6)
+    information = np.diag(PRIOR_STD**-2.0)
+    for w, h, C in zip(trust, rows, S, strict=True):
+        information += w * h.T @ np.linalg.solve(C, h)
+    covariance = np.linalg.inv(information)
+    pull = sum(w * h.T @ np.linalg.solve(C, _per_axis(len(h))) for w, h, C in zip(trust, rows, S, strict=True))
+    assert pull.shape == (8, 2)
+    # One bias for all landmarks of an image; two images share none.
+    np.testing.assert_array_less(np.linalg.eigvalsh(found.belief.covariance - covariance), 1e-3)
+    np.testing.assert_array_less(-1e-12, np.linalg.eigvalsh(np.asarray(found.belief.covariance) - covariance))
+    evidence = multivariate_normal.logpdf(x, np.asarray(face.prior.mean), np.diag(PRIOR_STD**2.0))
+    evidence += sum(multivariate_t.logpdf(r, shape=C, df=NU) for r, C in zip(off, S, strict=True) if r.size)
+    evidence += 4 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
+    assert float(found.log_evidence) == pytest.approx(evidence, abs=1e-4)
+    assert float(found.num_seen) == 9
+
+
+def _per_axis(rows):
+    return np.tile(np.eye(2), (rows // 2, 1))
+
+
+def test_the_common_bias_of_an_image_adds_to_the_covariance(face, monkeypatch):
+    """All landmarks of the first image a little off: the state moves by what its covariance has been given for it."""
+    _, uv = face.draw(jax.random.key(3))
+    alone, biased = face.found(uv), []
+    for c in range(2):
+        for axis in range(2):
+            biased.append(face.refine(face.found(uv.at[c, :, axis].add(COMMON_BIAS_PX))).belief.mean)
+    base = face.refine(alone)
+    moved = np.array(biased) - np.asarray(base.belief.mean)
+    without = _without_bias(face, alone, monkeypatch)
+    added = np.asarray(base.belief.covariance) - without
+    np.testing.assert_allclose(added, moved.T @ moved, atol=0.1 * np.abs(added).max())
+
+
+def _without_bias(face, found, monkeypatch):
+    monkeypatch.setattr(module, "COMMON_BIAS_PX", 0.0)
+    again = jax.jit(lambda *a: module.refine(*a))
+    return np.asarray(
+        again(face.prior, found, face.slopes, face.model, face.looseness, face.rig, face.prior.mean).belief.covariance
+    )
+
+
+def test_covariances_are_true_over_many_draws(face):
+    """Errors over their covariance: 8 in the mean of 2000 Gaussian draws, where Student's t leaves a little more."""
+
+    def one(key):
+        x, uv = face.draw(key)
+        found = module.refine(
+            face.prior, face.found(uv), face.slopes, face.model, face.looseness, face.rig, face.prior.mean
+        )
+        error = found.belief.mean - x
+        square = error @ jnp.linalg.solve(found.belief.covariance, error)
+        return error, square, jnp.diagonal(found.belief.covariance), found.misfit, found.excess
+
+    error, square, variance, misfit, excess = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), 2000))
+    # Standard error of the mean: sqrt(16 / 2000) = 0.09.
+    assert 6.8 < square.mean() < 9
+    assert np.all(np.abs(error.mean(axis=0)) < 4 * error.std(axis=0) / np.sqrt(2000) + 0.01 * error.std(axis=0))
+    np.testing.assert_allclose(error.std(axis=0), np.sqrt(variance.mean(axis=0)), rtol=0.1)
+    within = (np.abs(error) < 2 * np.sqrt(variance)).mean(axis=0)
+    assert np.all((within > 0.93) & (within < 0.985))
+    assert np.asarray(misfit).mean() == pytest.approx(1, abs=0.1)
+    # Excess is the looseness, and what unknown slopes add to it.
+    assert 0.7 * LOOSE_STD**2 < np.asarray(excess).mean() < 2 * LOOSE_STD**2
+
+
+def test_a_mistaken_landmark_does_not_pull_the_head_along(face):
+    x, uv = face.draw(jax.random.key(5))
+    clean, wrong = face.refine(face.found(uv)), face.refine(face.found(uv.at[:, 6].add(40.0)))
+    deviation = np.sqrt(np.diagonal(clean.belief.covariance))
+    assert np.abs((wrong.belief.mean - clean.belief.mean) / deviation).max() < 1.5
+    assert wrong.trust[6] < 1e-3
+    assert np.delete(wrong.trust, 6).min() > 0.3
+    assert np.all(np.diagonal(wrong.belief.covariance) > 0.99 * np.diagonal(clean.belief.covariance))
+    assert np.abs((wrong.belief.mean - x) / deviation).max() < 4
+
+
+@pytest.mark.parametrize("garbage", [1e3, np.nan, np.inf])
+def test_landmarks_that_are_not_seen_or_score_low_do_not_count(face, garbage):
+    _, uv = face.draw(jax.random.key(6))
+    seen = some_seen()
+    expected = face.refine(face.found(uv, seen))
+    wrong = face.found(jnp.where(seen[..., None], uv, garbage), seen)
+    again = face.refine(wrong._replace(covariance=jnp.where(seen[..., None, None], wrong.covariance, garbage)))
+    low = wrong._replace(seen=jnp.ones((2, 10), bool), score=jnp.where(seen, 1.0, LEAST_SCORE - 0.01))
+    for found in (again, face.refine(low)):
+        np.testing.assert_allclose(found.belief.mean, expected.belief.mean, atol=1e-9)
+        np.testing.assert_allclose(found.belief.covariance, expected.belief.covariance, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-9)
+    assert again.excess[7] == 0
+
+
+def test_without_landmarks_the_prior_is_left(face):
+    found = face.refine(face.found(jnp.zeros((2, 10, 2)), jnp.zeros((2, 10), bool)))
+    np.testing.assert_allclose(found.belief.mean, face.prior.mean, atol=1e-9)
+    np.testing.assert_allclose(found.belief.covariance, face.prior.covariance, rtol=1e-4, atol=1e-8)
+    assert float(found.num_seen) == 0
+
+
+def test_displaced_landmarks_are_where_their_pixels_meet(face):
+    """Loose landmarks go where triangulation puts them; in the model frame, whatever the pose."""
+    moved = np.random.default_rng(1).normal(0, 3, (10, 3))
+    x = face.prior.mean.at[6:].set(jnp.array([2.0, -1.0]))
+    uv = face.project(x, jnp.asarray(moved))
+    found = face.found(uv)._replace(by_slope=jnp.zeros((2, 10, 2, 2)))
+    tight = face.slopes._replace(covariance=jnp.zeros((10, 2, 2)))
+    loose = jnp.tile(1e4 * jnp.eye(3), (10, 1, 1))
+    shapes = [displaced(x, found, tight, face.model, loose, face.rig)]
+    expected = (triangulate(face.rig, uv) - x[:3]) @ rotation(x[3:6])
+    np.testing.assert_allclose(place(jnp.asarray(expected), x[:6]), triangulate(face.rig, uv), atol=1e-6)
+    # One linear step from up to 8 mm away.
+    np.testing.assert_allclose(shapes[0], expected, atol=0.12)
+
+
+def test_displaced_landmarks_stay_where_they_are_tight_or_unseen(face):
+    x = face.prior.mean.at[6:].set(jnp.array([2.0, -1.0]))
+    found = face.found(face.project(x, 2.0), some_seen())
+    still = displaced(x, found, face.slopes, face.model, jnp.zeros((10, 3, 3)), face.rig)
+    np.testing.assert_allclose(still, shape(face.model, x[6:]), atol=1e-12)
+    loose = displaced(x, found, face.slopes, face.model, 100.0 * face.looseness, face.rig)
+    np.testing.assert_allclose(loose[7], still[7], atol=1e-12)
+    # A landmark that one camera sees moves across its line of sight only.
+    sight = jnp.cross(*jacobian(face.rig, still, x[:6])[0][1, 3])
+    step = np.asarray(loose[3] - still[3])
+    assert np.linalg.norm(step) > 1
+    assert abs(step @ np.asarray(sight)) < 1e-6 * np.linalg.norm(sight) * np.linalg.norm(step)
+
+
+def test_displaced_is_the_posterior_mean_of_each_place(face):
+    """Linear-Gaussian: the prior `looseness` about the model, seen through the derivative."""
+    x = face.prior.mean
+    M = np.asarray(shape(face.model, x[6:]))
+    uv = face.project(x) + jnp.asarray(np.random.default_rng(2).normal(0, 0.2, (2, 10, 2)))
+    result = displaced(x, face.found(uv), face.slopes, face.model, face.looseness, face.rig)
+    by_shape = np.asarray(jacobian(face.rig, jnp.asarray(M), x[:6])[0])
+    for k in range(10):
+        J, bend = (np.concatenate([a[c, k] for c in range(2)]) for a in (by_shape, np.asarray(face.by_slope)))
+        noise = np.kron(np.eye(2), NOISE + PIXEL_FLOOR**2 * np.eye(2)) + SLOPE_STD**2 * bend @ bend.T
+        information = np.eye(3) / LOOSE_STD**2 + J.T @ np.linalg.solve(noise, J)
+        off = (np.asarray(uv) - np.asarray(face.project(x)))[:, k].ravel()
+        step = np.linalg.solve(information, J.T @ np.linalg.solve(noise, off))
+        np.testing.assert_allclose(result[k], M[k] + step, atol=1e-9)
