@@ -134,7 +134,7 @@ def errors(one: HeadRun, frames: slice) -> np.ndarray:
 def plot(path: Path, runs: dict[str, list[HeadRun]], schedule: Schedule) -> None:
     """Errors over time, of all faces together."""
     frames = np.arange(1, schedule.num_frames)
-    shades = [Shade(schedule.start, schedule.stop, DEFORMING_COLOR)]
+    shades = [Shade(float(schedule.start), float(schedule.stop), DEFORMING_COLOR)]
     curves = {
         "pitch, deg": lambda one: one.errors[:, AXES.index("pitch")],
         "shape after alignment, mm": lambda one: one.shape_errors,

@@ -77,6 +77,7 @@ def speed_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str, 
         whole = per_frame[f"{usual}{suffix}"]
         spent = {name: per_frame[f"stage {name}{suffix}"] for name in stages}
         spent["rest"] = max(whole - sum(spent.values()), 0.0)
+        whole = sum(spent.values())
         for name, ms in spent.items():
             metrics[f"stage_ms_{name}{suffix}"] = Metric(ms, "ms", "lower")
             metrics[f"stage_share_{name}{suffix}"] = Metric(ms / whole, "", "lower")

@@ -34,8 +34,8 @@ EXPRESSION_STD = np.array(
         *((0.27, 0.88, 0.16), (0.27, 0.88, 0.16)),
     ]
 )
-"""(10, 3) millimetres: root mean square displacement of the landmarks along x, y, z over the expressions of the ICT face
-model without those of the gaze (light-stage scans; R. Li et al., "Learning formation of physically-based face
+"""(10, 3) millimetres: root mean square displacement of the landmarks along x, y, z over the expressions of the ICT
+face model without those of the gaze (light-stage scans; R. Li et al., "Learning formation of physically-based face
 attributes", 2020)."""
 MEASURED_STD = 0.1
 """Millimetres: of a measured landmark."""
@@ -73,15 +73,10 @@ def motion_covariance(mean: Float[Array, "K 3"]) -> Float[Array, "6 6"]:
     The covariance of the small motion that `remove_motion` takes out, in the model frame, where every coordinate errs
     as expressions move it.
     """
-    centred = mean - jnp.mean(mean, axis=0)
-    axes = jnp.eye(3, dtype=mean.dtype)
-    turns = jnp.cross(axes, centred[:, None])
-    T = jnp.concatenate([jnp.broadcast_to(axes, turns.shape), turns], axis=1)
-    T = jnp.swapaxes(T, 1, 2).reshape(-1, 6)
+    T = _motions(mean)
     variance = jnp.asarray(EXPRESSION_STD**2 + MEASURED_STD**2, mean.dtype).ravel()
-    scale = jnp.asarray([1.0] * 3 + [50.0] * 3, mean.dtype)
-    unit = T / scale
-    return jnp.linalg.inv(_product((unit / variance[:, None]).T, unit)) / jnp.outer(scale, scale)
+    scale = jnp.concatenate([jnp.ones(3, mean.dtype), jnp.full(3, _size(mean))])
+    return jnp.linalg.inv(_product((T / variance[:, None]).T, T)) / jnp.outer(scale, scale)
 
 
 def remove_rigid(
@@ -108,11 +103,17 @@ def _motions(mean: Array) -> Array:
     """Columns: three translations and three turns of a shape, in coordinates landmark by landmark."""
     centred = mean - jnp.mean(mean, axis=0)
     # In units of the shape's own size, all columns of T are about as long.
-    centred = centred * jax.lax.rsqrt(jnp.mean(jnp.sum(centred**2, axis=-1)))
+    centred = centred / _size(mean)
     axes = jnp.eye(3, dtype=mean.dtype)
     turns = jnp.cross(axes, centred[:, None])
     T = jnp.concatenate([jnp.broadcast_to(axes, turns.shape), turns], axis=1)
     return jnp.swapaxes(T, 1, 2).reshape(-1, 6)
+
+
+def _size(mean):
+    """Root mean square distance from the centroid."""
+    centred = mean - jnp.mean(mean, axis=0)
+    return jnp.sqrt(jnp.mean(jnp.sum(centred**2, axis=-1)))
 
 
 def _product(A, B):

@@ -18,7 +18,7 @@ from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.face.alignment import Alignment, align, relocated
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.pose import rotation, turning_axes
-from jaxfilters.models.face.refinement import displaced, refine
+from jaxfilters.models.face.refinement import Refined, displaced, refine
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
@@ -94,28 +94,12 @@ def refined(
     free = refine(loose_prior, found, state.slopes, model, loose, rig, x)
     x = free.belief.mean
 
-    at_rest = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
-    tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
-    fixed = jnp.full(NUM_MODES, UNLEARNT_STD**2)
-    rest_prior = Gaussian(
-        loose_prior.mean.at[POSE:].set(0.0),
-        jnp.zeros_like(loose_prior.covariance)
-        .at[:POSE, :POSE]
-        .set(loose_prior.covariance[:POSE, :POSE])
-        .at[POSE:, POSE:]
-        .set(jnp.diag(fixed)),
-    )
-    rest = refine(rest_prior, found, state.slopes, at_rest, tight, rig, x.at[POSE:].set(0.0))
+    rest, rest_belief = _at_rest(loose_prior, found, state, model, rig, x)
     resting = jax.nn.sigmoid(rest.log_evidence - free.log_evidence)
     resting = jnp.where(jnp.isfinite(resting), resting, 0.0)
-    a = model.basis.T @ (state.registered.shape - model.mean).ravel()
-    rest_belief = Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
-    belief = _mixed(resting, rest_belief, free.belief)
-    M = resting * state.registered.shape + (1 - resting) * shape(model, free.belief.mean[POSE:])
-    belief = _with_gauge(belief, M - state.registered.shape, model)
-    measured = displaced(
-        free.belief.mean, found, state.slopes, model, MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1)), rig
-    )
+    M = resting * state.registered.shape + (1 - resting) * shape(model, x[POSE:])
+    belief = _with_gauge(_mixed(resting, rest_belief, free.belief), M - state.registered.shape, model)
+    measured = displaced(x, found, state.slopes, model, MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1)), rig)
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
     is_found = sound & (free.num_seen >= FEWEST_SEEN)
     misfit = resting * rest.misfit + (1 - resting) * free.misfit
@@ -128,6 +112,20 @@ def refined(
         jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * free.excess, *LOOSENESS),
         jnp.clip(state.misfit * (MEMORY + (1 - MEMORY) * misfit), *MISFIT),
     )
+
+
+def _at_rest(
+    prior: Gaussian, found: Alignment, state: HeadState, model: FaceModel, rig: CameraRig, x: Array
+) -> tuple[Refined, Gaussian]:
+    """The fit of the registered face, and its belief with the mode coefficients of that face."""
+    face = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
+    tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
+    covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
+    covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
+    prior = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
+    rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0))
+    a = model.basis.T @ (state.registered.shape - model.mean).ravel()
+    return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
 
 
 def _align_anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:

@@ -179,7 +179,9 @@ class HeadSession:
         key = jax.random.fold_in(jax.random.key(self._options.seed), self._frames)
         old = self._state
         pose = jnp.asarray(registration.pose, float)
-        self._state = begin(key, registration.model, pose, images, jnp.asarray(time, float), self._rig, self._options)
+        self._state = begin(
+            key, registration.model, pose, jnp.asarray(images), jnp.asarray(time, float), self._rig, self._options
+        )
         self._is_lost, self._said = False, ""
         self._detector = StableDetector()
         kept = False
@@ -212,7 +214,7 @@ class HeadSession:
 
 
 def _with_known_face(state: HeadState, old: HeadState) -> tuple[HeadState, bool]:
-    """The new state with what was learnt of deformations, if the face is the one of before (specification, section 1)."""
+    """The new state with what was learnt of deformations, if the face is that of before (specification, section 1)."""
     R, t = align(old.registered.shape, state.registered.shape)
     moved = old.registered.shape @ R.T + t
     apart = float(jnp.sqrt(jnp.mean(jnp.sum((moved - state.registered.shape) ** 2, axis=-1))))

@@ -159,7 +159,7 @@ def _usable(state: HeadState, deforms: Array) -> FaceModel:
 
 
 def _templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array, options: HeadOptions) -> Array:
-    """What the landmarks look like; in the modern mode from where the head is expected, flat if they are turned away."""
+    """What the landmarks look like: in the modern mode as the head is expected to be turned, flat where turned away."""
     if options.mode == "paper":
         return model.templates
     pose = state.belief.mean[:POSE] + moved
@@ -169,7 +169,16 @@ def _templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array,
     return jnp.where(is_facing, turned(state.registered.patches, affine), 0.0)
 
 
-def _searched(key, searches, state, model, templates, images, steps, options):
+def _searched(
+    key: AnyKey,
+    searches: Searches,
+    state: HeadState,
+    model: FaceModel,
+    templates: Array,
+    images: Array,
+    steps: Array,
+    options: HeadOptions,
+) -> tuple[AdaptiveState, ParticleInfo]:
     """Particles after this frame; they deform where the model does, in the paper's mode."""
 
     def run(filter: Filter, deviation: Array) -> tuple[AdaptiveState, ParticleInfo]:
@@ -188,7 +197,7 @@ def _searched(key, searches, state, model, templates, images, steps, options):
 def _followed(
     search: AdaptiveState, state: HeadState, estimate: Estimate, steps: Array, options: HeadOptions
 ) -> AdaptiveState:
-    """The search once the fit has said where the head is: velocity and diffusion follow the fit, and so do particles."""
+    """The search after the fit has said where the head is: particles, velocity and diffusion follow the fit."""
     before, x = state.search, estimate.belief.mean
     velocity = (x - before.estimate)[:POSE] / jnp.maximum(before.elapsed + steps, 1e-3)
     fit = before.fit
@@ -232,9 +241,26 @@ def _learnt(
                 lambda: (measured, windows),
             )
         learner, after = learning.learnt(learner, state.model, measured, windows, is_measured, *LEARNING[options.mode])
-    carry = lambda a: learning.carried(a, model, after)
-    turning = learning.turning(model, after)
-    x = belief.mean.at[POSE:].set(carry(belief.mean[POSE:, None])[:, 0])
+    search, belief = _carried(search, belief, model, after)
+    # A face that is not found is not headed anywhere.
+    search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
+    return state._replace(
+        search=search,
+        belief=belief,
+        model=after,
+        slopes=keep(estimate.slopes, state.slopes),
+        looseness=keep(estimate.looseness, state.looseness),
+        misfit=keep(estimate.misfit, state.misfit),
+        learner=learner,
+    )
+
+
+def _carried(
+    search: AdaptiveState, belief: Gaussian, before: FaceModel, after: FaceModel
+) -> tuple[AdaptiveState, Gaussian]:
+    """Particles and belief in the modes of a model that has changed."""
+    carry = lambda a: learning.carried(a, before, after)
+    turning = learning.turning(before, after)
     block = turning @ belief.covariance[POSE:, POSE:] @ turning.T
     cross = belief.covariance[:POSE, POSE:] @ turning.T
     covariance = belief.covariance.at[POSE:, POSE:].set(block)
@@ -243,17 +269,7 @@ def _learnt(
         particles=search.particles.at[POSE:].set(carry(search.particles[POSE:])),
         estimate=search.estimate.at[POSE:].set(carry(search.estimate[POSE:, None])[:, 0]),
     )
-    # A face that is not found is not headed anywhere.
-    search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
-    return state._replace(
-        search=search,
-        belief=Gaussian(x, covariance),
-        model=after,
-        slopes=keep(estimate.slopes, state.slopes),
-        looseness=keep(estimate.looseness, state.looseness),
-        misfit=keep(estimate.misfit, state.misfit),
-        learner=learner,
-    )
+    return search, Gaussian(belief.mean.at[POSE:].set(carry(belief.mean[POSE:, None])[:, 0]), covariance)
 
 
 def _sharpened(rig: CameraRig, state: HeadState) -> HeadState:

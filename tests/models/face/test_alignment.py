@@ -129,7 +129,9 @@ def test_places_follow_the_slopes_as_derivatives_say(face, head_poses):
     found = face.align(images, pose)
     for axis in range(2):
         step = jnp.zeros(2).at[axis].set(0.02)
-        ends = [face.align(images, pose, slopes=face.slopes._replace(mean=face.slopes.mean + s * step)) for s in (1, -1)]
+        ends = [
+            face.align(images, pose, slopes=face.slopes._replace(mean=face.slopes.mean + s * step)) for s in (1, -1)
+        ]
         difference = (ends[1].uv - ends[0].uv) / 0.04
         assert np.abs(difference).max() > 0.3
         np.testing.assert_allclose(difference, found.by_slope[..., axis], atol=0.05)

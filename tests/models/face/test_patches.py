@@ -75,9 +75,7 @@ def test_slopes_make_up_for_normals_that_were_wrong(plane_scene, head_poses, x64
 
 def test_the_length_of_a_normal_does_not_matter(plane_scene, x64):
     found = registered(plane_scene, plane_scene.normals * np.array([[0.5], [2], [3], [1], [1], [7]]))
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, registered(plane_scene)
-    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, registered(plane_scene))
 
 
 def test_templates_are_windows_and_gradients_are_free_of_gain_and_offset(plane_scene, x64):
