@@ -101,19 +101,24 @@ def refine(
         jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off
     )
     count = jnp.sum(seen)
-    dof = jnp.maximum(2.0 * count / jnp.maximum(2.0 * count - x.size, 2.0), 1.0)
-    squares = jnp.minimum(jnp.sum(residual**2, axis=1), MOST_DISTANCE * jnp.trace(S, axis1=1, axis2=2))
-    own = jnp.sum(jnp.where(seen[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
-    reach = jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3))
-    excess = (dof * squares - own) / jnp.maximum(reach, 1e-6)
     return Refined(
         belief=Gaussian(x, 0.5 * (covariance + covariance.T)),
         log_evidence=log_evidence,
-        excess=jnp.where(per_landmark > 0, excess, 0.0),
+        excess=_excess(found, seen, residual, S, by_shape, x.size),
         trust=trust,
         misfit=jnp.sum(jnp.minimum(distance, MOST_DISTANCE * per_landmark)) / jnp.maximum(2.0 * count - x.size, 2.0),
         num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
     )
+
+
+def _excess(found, seen, residual, S, by_shape, size):
+    """What the residuals hold beyond the alignments' own errors, spread over the axes of the model frame."""
+    count = 2.0 * jnp.sum(seen)
+    fitted = jnp.maximum(count / jnp.maximum(count - size, 2.0), 1.0)
+    squares = jnp.minimum(jnp.sum(residual**2, axis=1), MOST_DISTANCE * jnp.trace(S, axis1=1, axis2=2))
+    own = jnp.sum(jnp.where(seen[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
+    reach = jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3))
+    return jnp.where(jnp.any(seen, axis=0), (fitted * squares - own) / jnp.maximum(reach, 1e-6), 0.0)
 
 
 def displaced(
