@@ -142,8 +142,10 @@ def plot(path: Path, runs: dict[str, list[HeadRun]], schedule: Schedule) -> None
     }
     charts = []
     for title, values in curves.items():
-        lines = [Curve(name.replace("_", ", "), _running([values(one) for one in each]), COLORS[name])
-                 for name, each in runs.items()]  # fmt: skip
+        lines = [
+            Curve(name.replace("_", ", "), _running([values(one) for one in each]), COLORS[name])
+            for name, each in runs.items()
+        ]
         charts.append(draw_chart((260, 900), title, frames, lines, from_zero=True, shades=shades))
     shares = [
         Curve(name.replace("_", ", "), np.mean([one.contributions for one in each], axis=0), COLORS[name])

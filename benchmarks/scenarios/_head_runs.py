@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfilters.models.face.pose import place
+from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.session import HeadSession
 from jaxfilters.trackers.head.state import HeadOptions, HeadTrack
@@ -43,8 +44,9 @@ class HeadRun(NamedTuple):
 
     @property
     def is_tracked(self) -> Bool[np.ndarray, " t"]:
-        """Whether there is a pose, and the landmarks are where the face is."""
-        off = np.asarray(self.track.image_points, float) - self.truth.uv[1:]
+        """Whether there is a pose, and a face of the true shape that had it would be seen where the face is."""
+        at_pose = _projected(self.truth.rig, self.truth.shapes[1:], np.asarray(self.track.pose, np.float32))
+        off = np.asarray(at_pose, float) - self.truth.uv[1:]
         return np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=(1, 2))) < ASTRAY_PX
 
     @property
@@ -112,3 +114,8 @@ def apart_after_alignment(
 
 
 _placed = jax.jit(jax.vmap(place))
+
+
+@jax.jit
+def _projected(rig, shapes, poses):
+    return jax.vmap(project_shape, in_axes=(None, 0, 0))(rig, shapes, poses)[0]

@@ -60,7 +60,7 @@ def speed_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str, 
     trackers = {name: prepared(recorded, chosen) for name, chosen in options.items()}
     modern, paper = trackers[usual], trackers[f"{usual}_paper"]
     trackers[f"{usual}_live"] = modern._replace(images=modern.images[:1], times=modern.times[:1])
-    calls: dict[str, Callable] = {**trackers}
+    calls: dict[str, Callable] = {name: one.__call__ for name, one in trackers.items()}
     parts = {"": modern_stages(modern), "_paper": paper_stages(paper)}
     for suffix, stages in parts.items():
         calls |= {f"stage {name}{suffix}": call for name, call in stages.items()}

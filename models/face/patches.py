@@ -87,11 +87,26 @@ def patches(
         normals: Outward normals of the skin at the landmarks, model frame, of any length.
     """
     uv, _ = project_shape(rig, shape, pose)
-    wide = jax.vmap(lambda image, points: cut(image, points, WIDE_SIZE))(images, uv)
+    return patches_of(windows(images, uv), shape, pose, rig, normals)
+
+
+def windows(images: Num[Array, "C rows cols"], uv: Float[Array, "C K 2"]) -> Float[Array, "C K W W"]:
+    """Grey levels about pixels, as `Patches.wide` holds them."""
+    return jax.vmap(lambda image, points: cut(image, points, WIDE_SIZE))(images, uv)
+
+
+def patches_of(
+    wide: Float[Array, "C K W W"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+    normals: Float[Array, "K 3"],
+) -> Patches:
+    """Patches from `windows` of a posed shape; the other arguments are those of `patches`."""
     template, gradient, inverse, smooth = _moments(_middle(wide), _grey_slope(wide))
     by_shape, _ = jacobian(rig, shape, pose)
     unit = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
-    frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*uv.shape[:2], 1, 3))], axis=2)
+    frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*wide.shape[:2], 1, 3))], axis=2)
     # Two columns keep within the plane; the third, of no pixels, goes along the line of sight.
     columns = jnp.linalg.inv(frame)
     plan = jnp.einsum("kxi,ckxj->ckij", _within(unit), columns[..., :2])

@@ -61,7 +61,7 @@ def remove_motion(residual: Float[Array, "K 3"], mean: Float[Array, "K 3"]) -> F
         Q, R = jnp.linalg.qr(root[:, None] * T)
         return r - _product(T, jax.scipy.linalg.solve_triangular(R, _product(Q.T, root * r)))
 
-    def reweighted(_: int, rest: Array) -> Array:
+    def reweighted(_: Array | int, rest: Array) -> Array:
         return left((DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM * variance + rest**2))
 
     return jax.lax.fori_loop(0, ROUNDS, reweighted, left(1 / variance)).reshape(residual.shape)

@@ -20,10 +20,12 @@ def test_consistency_is_measured_as_it_should_be():
 
 @pytest.mark.slow
 def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
+    """As many seeds and frames of the held pose as of the moving hand: the same compiled filters."""
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     monkeypatch.setattr(articulated, "QUICK_NUM_SEEDS", 2)
+    monkeypatch.setattr(articulated, "QUICK_NUM_HELD_SEEDS", 2)
     monkeypatch.setattr(paper, "FILTERS", {name: paper.FILTERS[name] for name in ("literal", "recommended")})
-    monkeypatch.setattr(articulated, "QUICK_HELD_FRAMES", 12)
+    monkeypatch.setattr(articulated, "QUICK_HELD_FRAMES", 55)
     metrics = articulated.run(quick=True, seed=0, out=tmp_path)
     for mode in ("literal", "recommended"):
         for name in ("diverged_share", "r13_error_px", "angle_error_deg", "coverage_2sigma", "nees_lengths"):

@@ -22,8 +22,9 @@ from jaxfilters.models.face.refinement import Refined, displaced, refine
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
+from jaxfilters.trackers.head import recent
 from jaxfilters.trackers.head.search import KAPPA
-from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState
+from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState, Recent
 
 FEWEST_SEEN = 4
 """Landmarks without which there is no fit."""
@@ -51,6 +52,9 @@ class Estimate(NamedTuple):
     measured: Float[Array, "K 3"]
     """The same as the images alone have it."""
     is_found: Bool[Array, ""]
+    num_anchored: Float[Array, ""]
+    """Landmarks that look as registered, and are where the model has them."""
+    recent: Recent
     slopes: Slopes
     looseness: Float[Array, " K"]
     misfit: Float[Array, ""]
@@ -64,7 +68,9 @@ def around_mode(search: AdaptiveState, state: HeadState, model: FaceModel) -> Es
     covariance = jnp.matmul(apart * w, apart.T, precision="highest")
     M = shape(model, x[POSE:])
     found = jnp.ones((), bool)
-    return Estimate(Gaussian(x, covariance), M, M, found, state.slopes, state.looseness, state.misfit)
+    all_of_them = jnp.full((), float(len(M)), x.dtype)
+    belief = Gaussian(x, covariance)
+    return Estimate(belief, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
 
 
 def refined(
@@ -88,9 +94,9 @@ def refined(
     loose_prior = _prior(search, state, model, moved)
     loose = state.registered.covariance + state.looseness[:, None, None] * jnp.eye(3)
     x = jnp.concatenate([search.estimate[:POSE], loose_prior.mean[POSE:]])
-    found = _aligned(align, state, model, images, rig, x)
+    found, _ = _aligned(align, state, model, images, rig, x)
     x = refine(loose_prior, found, state.slopes, model, loose, rig, x).belief.mean
-    found = _aligned(_align_anywhere, state, model, images, rig, x)
+    found, anchored = _aligned(_align_anywhere, state, model, images, rig, x)
     free = refine(loose_prior, found, state.slopes, model, loose, rig, x)
     x = free.belief.mean
 
@@ -103,11 +109,14 @@ def refined(
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
     is_found = sound & (free.num_seen >= FEWEST_SEEN)
     misfit = resting * rest.misfit + (1 - resting) * free.misfit
+    seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig)
     return Estimate(
         belief,
         M,
         measured,
         is_found,
+        jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
+        seen,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
         jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * free.excess, *LOOSENESS),
         jnp.clip(state.misfit * (MEMORY + (1 - MEMORY) * misfit), *MISFIT),
@@ -133,11 +142,17 @@ def _align_anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
     return relocated(patches, slopes, images, found, uv, M, pose, rig)
 
 
-def _aligned(way, state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array) -> Alignment:
+def _aligned(
+    way, state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array
+) -> tuple[Alignment, Array]:
+    """Landmarks in the images, and which of them look as registered."""
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
     found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
-    return found._replace(covariance=state.misfit * found.covariance)
+    anchored = recent.is_anchored(found)
+    found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
+    drift = jnp.where(is_followed[..., None, None], recent.DRIFT_PX**2 * jnp.eye(2), 0.0)
+    return found._replace(covariance=state.misfit * found.covariance + drift), anchored
 
 
 def _prior(search: AdaptiveState, state: HeadState, model: FaceModel, moved: Array) -> Gaussian:

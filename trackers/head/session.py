@@ -1,5 +1,6 @@
 """From frames to a track: waiting for a face, registering it, following it, and finding it again after a loss."""
 
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -13,7 +14,8 @@ from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import align
 from jaxfilters.models.face.shape_model import FaceModel
-from jaxfilters.trackers.head.detect import StableDetector, complete
+from jaxfilters.trackers.head.corners import eye_centers
+from jaxfilters.trackers.head.detect import StableDetector, complete, detect
 from jaxfilters.trackers.head.registration import Registration, RegistrationError, register, register_monocular
 from jaxfilters.trackers.head.search import searches
 from jaxfilters.trackers.head.state import INITIALISING, LOST, NUM_MODES, POSE, HeadOptions, HeadState, HeadTrack
@@ -21,13 +23,30 @@ from jaxfilters.trackers.head.track import advance, begin
 
 SAME_FACE_MM = 4.0
 """Root mean square distance between two registered shapes up to which they are of one person."""
+LOOK_EVERY_S = 1.0
+"""Seconds between looks for faces while one is followed."""
+SAME_PLACE, MOST_CONTRADICTIONS = 0.5, 3
+"""How far, in distances between the eyes, a face that is seen may be from the one that is followed; how many looks in a
+row may contradict the track before it is given up."""
+
+
+class _Found(NamedTuple):
+    """A face, and the images in which it was registered."""
+
+    registration: Registration
+    images: np.ndarray
+    time: float
 
 
 class _Wait(NamedTuple):
     """A search for a face that goes on beside the tracking."""
 
-    outcome: Future
-    frame: int
+    outcome: Future[Registration | None]
+    images: np.ndarray
+    time: float
+
+
+_begun = jax.jit(begin, static_argnames="options")
 
 
 class HeadSession:
@@ -59,10 +78,11 @@ class HeadSession:
         self._searches = searches(rig, self._options)
         self._state: HeadState | None = None
         self._detector = StableDetector()
-        self._frames, self._is_lost = 0, False
+        self._frames, self._is_lost, self._time = 0, False, 0.0
         self._pool = ThreadPoolExecutor(1) if self._options.live else None
         self._wait: _Wait | None = None
-        self._said = ""
+        self._said: set[str] = set()
+        self._looked, self._contradictions, self._is_refuted = -math.inf, 0, False
 
     @property
     def model(self) -> FaceModel | None:
@@ -89,6 +109,8 @@ class HeadSession:
             raise ValueError(f"images must be {expected} of uint8; got {images.shape} of {images.dtype}.")
         if not np.all(np.isfinite(times)):
             raise ValueError("times must be finite.")
+        if not len(times):
+            return self._empty(0, None)
         rows, done = [], 0
         while done < len(times):
             if self._state is None or self._is_lost:
@@ -106,52 +128,71 @@ class HeadSession:
         missing = self._options.chunk - len(times)
         is_frame = np.arange(self._options.chunk) < len(times)
         filled = np.concatenate([images, np.repeat(images[-1:], missing, axis=0)])
-        clock = np.concatenate([times, np.repeat(times[-1:], missing)]).astype(np.float32)
         assert self._state is not None
-        self._state, track = advance(self._rig, self._searches, self._state, filled, clock, is_frame, self._options)
+        # Counted from the last frame, which single precision can do however late it is.
+        state = self._state._replace(time=jnp.zeros_like(self._state.time))
+        clock = (np.concatenate([times, np.repeat(times[-1:], missing)]) - self._time).astype(state.time.dtype)
+        self._state, track = advance(self._rig, self._searches, state, filled, clock, is_frame, self._options)
+        self._time = max(self._time, float(np.max(times)))
         track = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(times)], track)
-        lost = np.flatnonzero(track.status == LOST)
-        if lost.size:
-            self._say(int(lost[0]), "lost")
-        self._is_lost = bool(track.status[-1] == LOST)
-        if lost.size and not self._is_lost:
-            self._say(len(times) - 1, "found again near where it was lost")
+        for i, is_lost in enumerate(track.status == LOST):
+            if is_lost != self._is_lost:
+                self._say(i, "lost" if is_lost else "found again near where it was lost")
+            self._is_lost = bool(is_lost)
         self._frames += len(times)
+        if not self._is_lost and times[-1] - self._looked >= LOOK_EVERY_S:
+            self._looked = float(times[-1])
+            self._look_at(images[-1, 0], track.image_points[-1, 0])
         return track
+
+    def _look_at(self, image: np.ndarray, points: np.ndarray) -> None:
+        """Give the track up if a face is seen elsewhere time after time; that none is seen says nothing."""
+        seen = detect(image, near=points.mean(axis=0))
+        if seen is None:
+            return
+        right, left = eye_centers(seen.points)
+        apart = np.median(np.linalg.norm(points[: len(seen.points)] - seen.points, axis=1))
+        is_elsewhere = apart > SAME_PLACE * np.linalg.norm(left - right)
+        self._contradictions = self._contradictions + 1 if is_elsewhere else 0
+        if self._contradictions == MOST_CONTRADICTIONS:
+            self._is_lost = self._is_refuted = True
+            self._say(-1, "lost: the face is seen elsewhere")
 
     def _look_for_face(self, images: np.ndarray, times: np.ndarray, start: int) -> HeadTrack:
         """Rows up to the frame that registers a face, or all; a lost face may also turn up where it was lost."""
-        if self._is_lost:
+        status = LOST if self._is_lost else INITIALISING
+        if self._is_lost and not self._is_refuted:
             stop = min(start + self._options.chunk, len(times))
             track = self._follow(images[start:stop], times[start:stop])
             if not self._is_lost:
+                self._wait, self._detector = None, StableDetector()
                 return track
             self._frames -= stop - start
         else:
             stop, track = len(times), None
         for i in range(start, stop):
-            registration = self._registered(images[i])
+            found = self._registered(images[i], float(times[i]))
             self._frames += 1
-            if registration is None:
-                continue
-            self._begin(registration, images[i], float(times[i]))
-            return self._empty(i + 1 - start, track)
-        return self._empty(stop - start, track)
+            if found is not None:
+                self._begin(found)
+                return self._empty(i + 1 - start, track, status)
+        return self._empty(stop - start, track, status)
 
-    def _registered(self, images: np.ndarray) -> Registration | None:
+    def _registered(self, images: np.ndarray, time: float) -> _Found | None:
         """The face in these images, if one can be registered; in a live session, that of an earlier frame."""
-        if self._points is not None:
+        if self._points is not None or self._pool is None:
             points, self._points = self._points, None
-            return self._try(images, points)
-        if self._pool is None:
-            return self._searched(images)
+            registration = self._searched(images) if points is None else self._try(images, points)
+            return None if registration is None else _Found(registration, images, time)
         if self._wait is None:
-            self._wait = _Wait(self._pool.submit(self._searched, images.copy()), self._frames)
+            images = images.copy()
+            self._wait = _Wait(self._pool.submit(self._searched, images), images, time)
             return None
         if not self._wait.outcome.done():
             return None
-        found, self._wait = self._wait.outcome.result(), None
-        return found
+        wait, self._wait = self._wait, None
+        registration = wait.outcome.result()
+        return None if registration is None else _Found(registration, wait.images, wait.time)
 
     def _searched(self, images: np.ndarray) -> Registration | None:
         found = self._detector.update(images[0])
@@ -175,23 +216,23 @@ class HeadSession:
             self._complain(str(error))
             return None
 
-    def _begin(self, registration: Registration, images: np.ndarray, time: float) -> None:
+    def _begin(self, found: _Found) -> None:
         key = jax.random.fold_in(jax.random.key(self._options.seed), self._frames)
-        old = self._state
-        pose = jnp.asarray(registration.pose, float)
-        self._state = begin(
-            key, registration.model, pose, jnp.asarray(images), jnp.asarray(time, float), self._rig, self._options
-        )
-        self._is_lost, self._said = False, ""
+        old, face = self._state, found.registration
+        pose = jnp.asarray(face.pose, float)
+        self._time, start = found.time, jnp.zeros((), pose.dtype)
+        self._state = _begun(key, face.model, pose, found.images, start, self._rig, options=self._options)
+        self._is_lost, self._is_refuted, self._said = False, False, set()
+        self._looked, self._contradictions = found.time, 0
         self._detector = StableDetector()
         kept = False
         if old is not None:
             self._state, kept = _with_known_face(self._state, old)
         self._say(-1, "registered" + (", a face that is known" if kept else ""))
 
-    def _empty(self, count: int, track: HeadTrack | None) -> HeadTrack:
+    def _empty(self, count: int, track: HeadTrack | None, status: int = INITIALISING) -> HeadTrack:
         """Rows of frames without a face."""
-        C, status = self._rig.num_cameras, INITIALISING if self._state is None or track is None else LOST
+        C = self._rig.num_cameras
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)
         return HeadTrack(
             pose=nothing(POSE),
@@ -205,9 +246,10 @@ class HeadSession:
         )
 
     def _complain(self, reason: str) -> None:
-        if reason != self._said and not reason.endswith("px"):
+        """Says once in every search why there is no face; a detection that is not steady yet is no reason."""
+        if reason not in self._said and not reason.endswith("px"):
             self._say(0, reason)
-        self._said = reason
+        self._said.add(reason)
 
     def _say(self, offset: int, what: str) -> None:
         self.events.append((self._frames + offset, what))

@@ -89,6 +89,23 @@ class Registered(NamedTuple):
     """In which it was registered."""
 
 
+class Recent(NamedTuple):
+    """The face as the last frame showed it in which it was found."""
+
+    found: Float[Array, "C K W W"]
+    """Grey levels about where the landmarks were found."""
+    apart: Float[Array, "C K 2"]
+    """From the model's landmarks to there, pixels."""
+    expected: Float[Array, "C K W W"]
+    """Grey levels about the model's landmarks."""
+    has_changed: Bool[Array, "C K"]
+    """Which landmarks do not look as registered, or are not where the model has them."""
+    shape: Float[Array, "K 3"]
+    """Of the model, millimetres."""
+    pose: Float[Array, " 6"]
+    """Millimetres and radians."""
+
+
 class HeadState(NamedTuple):
     """Everything the next frame needs."""
 
@@ -99,6 +116,7 @@ class HeadState(NamedTuple):
     model: FaceModel
     """As learnt so far."""
     registered: Registered
+    recent: Recent
     slopes: Slopes
     looseness: Float[Array, " K"]
     """Variance of each landmark about the model on every axis, mm^2."""
@@ -107,6 +125,8 @@ class HeadState(NamedTuple):
     learner: Learner
     misses: Int[Array, ""]
     """Frames in a row in which the face was not found."""
+    strange: Int[Array, ""]
+    """Frames in which hardly any landmark looked as registered, two less for each in which some did."""
     age: Int[Array, ""]
     """Frames since registration."""
     time: Float[Array, ""]

@@ -20,6 +20,7 @@ from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
 from jaxfilters.particle import ParticleInfo
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.estimate import Estimate, around_mode, refined
+from jaxfilters.trackers.head.recent import latest_templates, nothing_changed
 from jaxfilters.trackers.head.search import (
     Searches,
     at,
@@ -46,6 +47,9 @@ from jaxfilters.typing import AnyKey
 
 PATIENCE = 10
 """Frames in a row in which the face is not found before it counts as lost."""
+FEWEST_ANCHORED, MOST_STRANGE = 2, 35
+"""Landmarks that must look as registered, and be where the model has them; for how many frames they need not: eyes may
+close while a mouth opens wide, but not for long."""
 LEAST_SCORE, REGAINED_SCORE = 0.35, 0.5
 """Mean correlation below which a face is not found; from which on a lost one is found again."""
 SHARPENING = (15, 300)
@@ -90,11 +94,13 @@ def begin(
         belief=Gaussian(x, jnp.diag(variances).astype(x.dtype)),
         model=face,
         registered=Registered(model.mean, covariance, seen, pose, images),
+        recent=nothing_changed(images, model.mean, pose, rig),
         slopes=slopes,
         looseness=jnp.full(len(model.mean), FIRST_LOOSENESS, x.dtype),
         misfit=jnp.ones((), x.dtype),
         learner=learning.nothing_learnt(model.mean, model.templates),
         misses=jnp.zeros((), jnp.int32),
+        strange=jnp.zeros((), jnp.int32),
         age=jnp.zeros((), jnp.int32),
         time=jnp.asarray(time, x.dtype),
         key=key,
@@ -132,7 +138,8 @@ def _step(
     model = _usable(state, deforms)
     moved = state.search.velocity * steps
     templates = _templates(state, model, rig, moved, options)
-    search, info = _searched(search_key, searches, state, model, templates, images, steps, options)
+    looks = _looks(state, model, templates, rig, moved, options)
+    search, info = _searched(search_key, searches, state, model, looks, images, steps, options)
     if options.mode == "modern":
         estimate = refined(search, state, model, images, rig, moved)
         search = _followed(search, state, estimate, steps, options)
@@ -140,14 +147,21 @@ def _step(
         estimate = around_mode(search, state, model)
     belief = _held(estimate, search, model, state)
     score = score_at(model, templates, rig, belief.mean, images)
-    missed = ~estimate.is_found | (score < LEAST_SCORE)
+    likeness = jnp.maximum(score, score_at(model, looks, rig, belief.mean, images))
+    is_strange = estimate.num_anchored < FEWEST_ANCHORED
+    strange = jnp.where(is_strange, state.strange + 1, jnp.maximum(state.strange - 2, 0))
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (strange > MOST_STRANGE)
     missed |= (state.misses >= PATIENCE) & (score < REGAINED_SCORE)
     state = _learnt(state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
     due &= options.mode == "modern"
     state = jax.lax.cond(due, partial(_sharpened, rig), lambda state: state, state)
     state = state._replace(
-        misses=jnp.where(missed, state.misses + 1, 0), age=state.age + 1, time=jnp.maximum(time, state.time), key=key
+        misses=jnp.where(missed, state.misses + 1, 0),
+        strange=strange,
+        age=state.age + 1,
+        time=jnp.maximum(time, state.time),
+        key=key,
     )
     return state, _track(state, belief, estimate, score, info.effective_sample_size, deforms, rig)
 
@@ -167,6 +181,20 @@ def _templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array,
     is_facing = facing(state.registered.patches, by_shape)[..., None, None]
     affine = jnp.where(is_facing, stretch(state.registered.patches, state.slopes, by_shape), jnp.eye(2))
     return jnp.where(is_facing, turned(state.registered.patches, affine), 0.0)
+
+
+def _looks(
+    state: HeadState, model: FaceModel, templates: Array, rig: CameraRig, moved: Array, options: HeadOptions
+) -> Array:
+    """The templates; in the modern mode, for landmarks that have changed since registration, as they looked last.
+
+    Where a face was lost the last frame shows something else.
+    """
+    if options.mode == "paper":
+        return templates
+    x = state.belief.mean
+    latest = latest_templates(state.recent, state.slopes, templates, shape(model, x[POSE:]), x[:POSE] + moved, rig)
+    return jnp.where(state.misses < PATIENCE, latest, templates)
 
 
 def _searched(
@@ -248,6 +276,7 @@ def _learnt(
         search=search,
         belief=belief,
         model=after,
+        recent=keep(estimate.recent, state.recent),
         slopes=keep(estimate.slopes, state.slopes),
         looseness=keep(estimate.looseness, state.looseness),
         misfit=keep(estimate.misfit, state.misfit),

@@ -1,5 +1,6 @@
 """The fit to aligned landmarks against SciPy's least squares, and its covariances against many draws."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -217,6 +218,26 @@ def test_a_mistaken_landmark_does_not_pull_the_head_along(face):
     assert np.delete(wrong.trust, 6).min() > 0.3
     assert np.all(np.diagonal(wrong.belief.covariance) > 0.99 * np.diagonal(clean.belief.covariance))
     assert np.abs((wrong.belief.mean - x) / deviation).max() < 4
+
+
+def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
+    """Oracle 13; the world stays the frame of the left camera."""
+    _, uv = face.draw(jax.random.key(7))
+    found = face.found(uv, some_seen())
+    expected = face.refine(found)
+    order = np.random.default_rng(3).permutation(10)
+    rows = (3 * order[:, None] + np.arange(3)).ravel()
+    per_camera = {"uv", "covariance", "score", "seen", "by_slope"}
+    mixed = found._replace(**{name: getattr(found, name)[:, order] for name in per_camera})
+    model = replace(face.model, mean=face.model.mean[order], basis=face.model.basis[rows])
+    landmarks = refine(face.prior, mixed, face.slopes, model, face.looseness, face.rig, face.prior.mean)
+    swapped = found._replace(**{name: getattr(found, name)[::-1] for name in per_camera})
+    rig = jax.tree.map(lambda leaf: leaf[::-1], face.rig)
+    cameras = refine(face.prior, swapped, face.slopes, face.model, face.looseness, rig, face.prior.mean)
+    for again in (landmarks, cameras):
+        np.testing.assert_allclose(again.belief.mean, expected.belief.mean, atol=1e-9)
+        np.testing.assert_allclose(again.belief.covariance, expected.belief.covariance, rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(again.log_evidence, expected.log_evidence, rtol=1e-9)
 
 
 @pytest.mark.parametrize("garbage", [1e3, np.nan, np.inf])

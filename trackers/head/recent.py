@@ -1,0 +1,124 @@
+"""Landmarks that do not look as registered, followed by what they looked like in the last frame.
+
+An eye that closes and a mouth that opens have no likeness to what was registered, but from one frame to the next they
+change little. Such a landmark is found by its window of the last frame, at the price of some drift, until it looks as
+registered again: the registered picture comes first wherever it fits.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.models.face.alignment import Alignment, align, facing
+from jaxfilters.models.face.patches import SKIN_NORMALS, Patches, Slopes, patches_of, stretch, turned, windows
+from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+from jaxfilters.trackers.head.state import Recent
+
+CHANGED_SCORE = 0.7
+"""Normalised correlation below which a landmark may have changed its looks."""
+CLEARLY_BETTER = 0.1
+"""By how much it must then resemble the last frame better."""
+ANCHORED_SCORE = 0.5
+"""Normalised correlation from which on a landmark looks as registered."""
+DRIFT_PX = 0.3
+"""Standard deviation of what following from frame to frame adds."""
+FAR_PX = 3.0
+"""How far a landmark is from the model's that has left its place."""
+
+
+def nothing_changed(
+    images: Float[Array, "C rows cols"], shape: Float[Array, "K 3"], pose: Float[Array, " 6"], rig: CameraRig
+) -> Recent:
+    """What is known at registration, of a shape posed in these images."""
+    uv, _ = project_shape(rig, shape, pose)
+    seen = windows(images, uv)
+    return Recent(seen, jnp.zeros_like(uv), seen, jnp.zeros(uv.shape[:2], bool), shape, pose)
+
+
+def followed(
+    recent: Recent,
+    found: Alignment,
+    slopes: Slopes,
+    images: Float[Array, "C rows cols"],
+    uv: Float[Array, "C K 2"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+) -> tuple[Alignment, Bool[Array, "C K"]]:
+    """The alignment with landmarks that fit badly taken from the last frame on, and which those are.
+
+    Args:
+        recent: The last frame.
+        found: Alignment of the registered patches.
+        slopes: Of the skin.
+        images: Grey levels.
+        uv: Where the model has the landmarks, pixels.
+        shape: Model frame, millimetres.
+        pose: Millimetres and radians.
+        rig: Cameras.
+    """
+    doubtful = found.seen & (found.score < CHANGED_SCORE)
+
+    def from_last() -> tuple[Alignment, Array]:
+        again = align(_patches(recent.found, recent, rig), slopes, images, uv + recent.apart, shape, pose, rig)
+        better = doubtful & again.seen & (again.score > found.score + CLEARLY_BETTER)
+        pick = lambda a, b: jnp.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), a, b)
+        names = ("uv", "covariance", "score", "by_slope")
+        return found._replace(**{name: pick(getattr(again, name), getattr(found, name)) for name in names}), better
+
+    return jax.lax.cond(jnp.any(doubtful), from_last, lambda: (found, jnp.zeros_like(doubtful)))
+
+
+def is_anchored(found: Alignment) -> Bool[Array, "C K"]:
+    """Which landmarks look as registered, by the alignment of the registered patches."""
+    return found.seen & (found.score > ANCHORED_SCORE)
+
+
+def as_seen(
+    found: Alignment,
+    anchored: Bool[Array, "C K"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    images: Float[Array, "C rows cols"],
+    rig: CameraRig,
+) -> Recent:
+    """What the next frame is compared with: where landmarks were `found` beside those of the posed shape."""
+    uv, _ = project_shape(rig, shape, pose)
+    uv = jnp.where(jnp.isfinite(uv), uv, 0.0)
+    is_there = found.seen & (found.score > CHANGED_SCORE)
+    apart = jnp.where(is_there[..., None], found.uv - uv, 0.0)
+    has_left = jnp.linalg.norm(apart, axis=-1) > FAR_PX
+    return Recent(windows(images, uv + apart), apart, windows(images, uv), ~anchored | has_left, shape, pose)
+
+
+def latest_templates(
+    recent: Recent,
+    slopes: Slopes,
+    templates: Float[Array, "C K T T"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+) -> Float[Array, "C K T T"]:
+    """The templates, but for landmarks that have changed what the last frame showed in their place.
+
+    Args:
+        recent: The last frame.
+        slopes: Of the skin.
+        templates: As registered.
+        shape: Expected, millimetres.
+        pose: Expected, millimetres and radians.
+        rig: Cameras.
+    """
+
+    def renewed() -> Array:
+        last = _patches(recent.expected, recent, rig)
+        by_shape, _ = jacobian(rig, shape, pose)
+        usable = (recent.has_changed & facing(last, by_shape))[..., None, None]
+        affine = jnp.where(usable, stretch(last, slopes, by_shape), jnp.eye(2))
+        return jnp.where(usable, turned(last, affine), templates)
+
+    return jax.lax.cond(jnp.any(recent.has_changed), renewed, lambda: templates)
+
+
+def _patches(wide: Array, recent: Recent, rig: CameraRig) -> Patches:
+    return patches_of(wide, recent.shape, recent.pose, rig, jnp.asarray(SKIN_NORMALS, wide.dtype))
