@@ -97,9 +97,8 @@ def prepared(recorded: Recording, options: HeadOptions) -> Prepared:
     truth, images = recorded
     registration = register(images[0], np.asarray(truth.uv[0, 0], float), truth.rig)
     pose, times = jnp.asarray(registration.pose, float), truth.times.astype(np.float32)
-    state = begin(
-        jax.random.key(0), registration.model, pose, images[0], jnp.asarray(times[0], float), truth.rig, options
-    )
+    first, time = jnp.asarray(images[0]), jnp.asarray(times[0], float)
+    state = begin(jax.random.key(0), registration.model, pose, first, time, truth.rig, options)
     state = state._replace(age=jnp.full_like(state.age, SHARPENING[1]))
     search, is_frame = searches(truth.rig, options), np.ones(BATCH, bool)
     for start in range(1, 1 + WARM_UP * BATCH, BATCH):

@@ -51,7 +51,7 @@ FEWEST_ANCHORED, MOST_STRANGE = 2, 35
 """Landmarks that must look as registered, and be where the model has them; for how many frames they need not: eyes may
 close while a mouth opens wide, but not for long."""
 LEAST_SCORE, REGAINED_SCORE = 0.35, 0.5
-"""Mean correlation below which a face is not found; from which on a lost one is found again."""
+"""Mean correlation below which a face is not found; from which on one that was not found is found again."""
 SHARPENING = (15, 300)
 """Frames: how often, and how long after registration, the registered shape is triangulated anew."""
 FIRST_LOOSENESS = 0.3**2
@@ -151,7 +151,7 @@ def _step(
     is_strange = estimate.num_anchored < FEWEST_ANCHORED
     strange = jnp.where(is_strange, state.strange + 1, jnp.maximum(state.strange - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (strange > MOST_STRANGE)
-    missed |= (state.misses >= PATIENCE) & (score < REGAINED_SCORE)
+    missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     state = _learnt(state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
     due &= options.mode == "modern"
