@@ -96,11 +96,14 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         track = follow(session, images[:, None], np.arange(len(images)) / fps)
         is_tracked = np.isin(track.status, TRACKED)
         apart = detector_distances(images, track, round(fps))
+        counts = {
+            word: float(sum(what.startswith(word) for _, what in session.events)) for word in ("lost", "registered")
+        }
         metrics |= {
             f"{name}_longest_stretch_s": Metric(longest(is_tracked) / fps, "s", "higher"),
             f"{name}_share_tracked": Metric(100 * float(is_tracked.mean()), "%", "higher"),
-            f"{name}_losses": Metric(sum("lost" in what[:4] for _, what in session.events), "", "lower"),
-            f"{name}_registrations": Metric(sum(what[:10] == "registered" for _, what in session.events), "", "lower"),
+            f"{name}_losses": Metric(counts["lost"], "", "lower"),
+            f"{name}_registrations": Metric(counts["registered"], "", "lower"),
             f"{name}_detector_distance": Metric(float(np.median(apart)), "eyes' distances", "lower"),
             f"{name}_detector_distance_worst": Metric(float(np.max(apart)), "eyes' distances", "lower"),
         }
