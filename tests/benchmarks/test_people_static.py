@@ -1,7 +1,5 @@
 """The scenario of people in front of the paper's cameras: scenes, and section 4 of the specification."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -180,14 +178,7 @@ def test_the_smallest_safe_gap_is_above_every_exchange(first, monkeypatch):
 
 @pytest.mark.slow
 def test_the_modern_tracker_places_people_and_every_metric_has_its_name(monkeypatch):
-    """Three places of each group, one gap and one distance of the start.
-
-    Everything lasts as long, and cells so wide that cameras see the same few, is fewer programs to compile: nobody new
-    comes.
-    """
-    monkeypatch.setattr(people_static, "NUM_FRAMES", 16)
-    monkeypatch.setattr(people_static, "CROSSING_FRAMES", 16)
-    monkeypatch.setattr(people_static, "MODERN", replace(people_static.MODERN, cell_m=4.0))
+    """Three places of each group, one gap and one distance of the start."""
     monkeypatch.setattr(people_static, "GROUPS", {name: points[:3] for name, points in GROUPS.items()})
     monkeypatch.setattr(people_static, "QUICK_GAPS_M", (0.5,))
     monkeypatch.setattr(people_static, "OFFSETS_M", (0.3,))

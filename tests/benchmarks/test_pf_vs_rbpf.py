@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.benchmarks.scenarios import _hand_filters as hand
-from jaxfilters.benchmarks.scenarios import _step_time, pf_vs_rbpf
+from jaxfilters.benchmarks.scenarios import pf_vs_rbpf
 from jaxfilters.benchmarks.scenarios._accuracy import Run, append_csv, evaluate, p_value_better
 from jaxfilters.benchmarks.scenarios._step_time import StepTimes
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
@@ -126,8 +126,7 @@ def test_the_wide_filter_spreads_like_the_rao_blackwellized_one():
 def test_a_tiny_comparison_has_every_metric_of_the_issue(tmp_path, monkeypatch):
     monkeypatch.setattr(pf_vs_rbpf, "QUICK_COUNTS", (16,))
     monkeypatch.setattr(pf_vs_rbpf, "QUICK_ROUNDS", 2)
-    monkeypatch.setattr(_step_time, "NUM_FRAMES", 15)
-    options = {"num_particles": 16, "num_seeds": 2, "num_frames": 15}
+    options = {"num_particles": 16, "num_seeds": 2, "num_frames": 12}
     metrics = pf_vs_rbpf.run(quick=True, seed=0, out=tmp_path, **options)
     names = {f"{name}_{data}" for name in ("joint_error_mm_pf", "joint_error_mm_rbpf") for data in "ab"}
     names |= {"p_value_rbpf_better_b"}
