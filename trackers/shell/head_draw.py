@@ -89,9 +89,8 @@ def _write_state(picture: np.ndarray, track: TimedHeadTrack, i: int) -> None:
     caption(picture, f"{STATUS_WORDS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])
     if status in TRACKED:
         x, y, z, roll, pitch, yaw = in_degrees(track.pose[i])
-        caption(
-            picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm   roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 2
-        )
+        caption(picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm", 2)
+        caption(picture, f"roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 3)
 
 
 def _fixed(point: np.ndarray) -> tuple[int, int]:
