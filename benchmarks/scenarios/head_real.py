@@ -213,7 +213,7 @@ def read_video(path: Path, frames: int | None) -> tuple[np.ndarray, float]:
         RecordingError: if the video cannot be read.
     """
     capture = cv2.VideoCapture(str(path))
-    images = []
+    images: list[np.ndarray] = []
     while (frames is None or len(images) < frames) and (read := capture.read())[0]:
         images.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY))
     if not images:
