@@ -137,9 +137,14 @@ def _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig):
     place = origin + jnp.stack([best % side, best // side], axis=-1) + (SIZE - 1) / 2
     again = align(patches, slopes, images, jnp.where(doubtful[..., None], place, found.uv), shape, pose, rig)
     better = doubtful & again.seen & (again.score > jnp.maximum(found.score, DOUBTFUL_SCORE))
+    return taken_over(found, again, better)
+
+
+def taken_over(found: Alignment, again: Alignment, better: Bool[Array, "C K"]) -> Alignment:
+    """The first alignment, but for landmarks that the second has seen better; of slopes only the first speaks."""
     pick = lambda a, b: jnp.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), a, b)
-    fields = {name: pick(getattr(again, name), getattr(found, name)) for name in ("uv", "covariance", "score", "seen")}
-    return found._replace(**fields)
+    names = ("uv", "covariance", "score", "by_slope")
+    return found._replace(**{name: pick(getattr(again, name), getattr(found, name)) for name in names})
 
 
 def _look(patches: Patches, images: Array, points: Array) -> tuple[Array, Array, Array]:

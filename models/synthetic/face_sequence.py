@@ -1,11 +1,12 @@
 """Video of a face with known truth, rendered frame by frame as it is asked for."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfilters.models.face.landmarks import MOUTH, NOSTRILS
@@ -59,17 +60,11 @@ class FaceSequence:
         Raises:
             ValueError: if these are not frames of the sequence.
         """
-        if not 0 <= start <= stop <= len(self):
-            raise ValueError(f"start and stop must be within 0..{len(self)}, in order; got {start} and {stop}.")
-        images = np.empty((stop - start, self.rig.num_cameras, *self.rig.shape), np.uint8)
-        for index in range(start, stop):
-            images[index - start] = self._image(index)
-        return images
+        return rendered(self._image, len(self), self.rig, start, stop)
 
     def chunks(self, size: int = 60) -> Iterator[tuple[int, UInt8[np.ndarray, "frames C rows cols"]]]:
         """First frame and images of successive pieces of at most `size` frames."""
-        for start in range(0, len(self), size):
-            yield start, self.frames(start, min(start + size, len(self)))
+        return pieces(self.frames, len(self), size)
 
     def _image(self, index):
         shape, pose = jnp.asarray(self.shapes[index], float), jnp.asarray(self.poses[index], float)
@@ -79,6 +74,30 @@ class FaceSequence:
         return render_face(
             key, self.scene, self.rig, pose, shape, gain=jnp.asarray(self.gain[index], float), occluder=occluder
         )
+
+
+def rendered(
+    image: Callable[[int], ArrayLike], length: int, rig: CameraRig, start: int, stop: int
+) -> UInt8[np.ndarray, "frames C rows cols"]:
+    """Images of the frames from `start` up to `stop` of a video of `length` frames, `image(index)` each.
+
+    Raises:
+        ValueError: if these are not frames of the video.
+    """
+    if not 0 <= start <= stop <= length:
+        raise ValueError(f"start and stop must be within 0..{length}, in order; got {start} and {stop}.")
+    images = np.empty((stop - start, rig.num_cameras, *rig.shape), np.uint8)
+    for index in range(start, stop):
+        images[index - start] = image(index)
+    return images
+
+
+def pieces(
+    frames: Callable[[int, int], np.ndarray], length: int, size: int
+) -> Iterator[tuple[int, UInt8[np.ndarray, "frames C rows cols"]]]:
+    """First frame and images of successive pieces of at most `size` of `length` frames."""
+    for start in range(0, length, size):
+        yield start, frames(start, min(start + size, length))
 
 
 def sequence(

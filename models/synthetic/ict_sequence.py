@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, UInt8
 
 from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
 from jaxfilters.models.synthetic.face_motion import FPS
+from jaxfilters.models.synthetic.face_sequence import pieces, rendered
 from jaxfilters.models.synthetic.face_texture import make_background
 from jaxfilters.models.synthetic.ict_face import IctModel, IctPerson, deformed, make_ict_person, ten_landmarks
 from jaxfilters.models.synthetic.ict_render import IctHead, make_ict_head, render_ict
@@ -51,28 +52,25 @@ class IctSequence:
         Raises:
             ValueError: if these are not frames of the sequence.
         """
-        if not 0 <= start <= stop <= len(self):
-            raise ValueError(f"start and stop must be within 0..{len(self)}, in order; got {start} and {stop}.")
-        images = np.empty((stop - start, self.rig.num_cameras, *self.rig.shape), np.uint8)
-        for index in range(start, stop):
-            images[index - start] = render_ict(
-                jax.random.fold_in(self.key, index),
-                self.model,
-                self.person,
-                self.head,
-                self.skin,
-                self.background,
-                self.rig,
-                jnp.asarray(self.poses[index], float),
-                jnp.asarray(self.expressions[index], float),
-                gain=jnp.asarray(self.gain[index], float),
-            )
-        return images
+        return rendered(self._image, len(self), self.rig, start, stop)
 
     def chunks(self, size: int = 60) -> Iterator[tuple[int, UInt8[np.ndarray, "frames C rows cols"]]]:
         """First frame and images of successive pieces of at most `size` frames."""
-        for start in range(0, len(self), size):
-            yield start, self.frames(start, min(start + size, len(self)))
+        return pieces(self.frames, len(self), size)
+
+    def _image(self, index):
+        return render_ict(
+            jax.random.fold_in(self.key, index),
+            self.model,
+            self.person,
+            self.head,
+            self.skin,
+            self.background,
+            self.rig,
+            jnp.asarray(self.poses[index], float),
+            jnp.asarray(self.expressions[index], float),
+            gain=jnp.asarray(self.gain[index], float),
+        )
 
 
 def ict_sequence(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.models.face.alignment import Alignment, align, facing
+from jaxfilters.models.face.alignment import Alignment, align, facing, taken_over
 from jaxfilters.models.face.patches import SKIN_NORMALS, Patches, Slopes, patches_of, stretch, turned, windows
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.trackers.head.state import Recent
@@ -62,9 +62,7 @@ def followed(
     def from_last() -> tuple[Alignment, Array]:
         again = align(_patches(recent.found, recent, rig), slopes, images, uv + recent.apart, shape, pose, rig)
         better = doubtful & again.seen & (again.score > found.score + CLEARLY_BETTER)
-        pick = lambda a, b: jnp.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), a, b)
-        names = ("uv", "covariance", "score", "by_slope")
-        return found._replace(**{name: pick(getattr(again, name), getattr(found, name)) for name in names}), better
+        return taken_over(found, again, better), better
 
     return jax.lax.cond(jnp.any(doubtful), from_last, lambda: (found, jnp.zeros_like(doubtful)))
 

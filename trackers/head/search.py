@@ -14,7 +14,7 @@ from jaxfilters.adaptive import AdaptiveState, adaptive_particle_filter
 from jaxfilters.diffusion import DiffusionFit
 from jaxfilters.filter import Filter
 from jaxfilters.layered import Layers, consecutive
-from jaxfilters.models.face.correlation import cut, inside, ncc
+from jaxfilters.models.face.correlation import score_points
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.likelihood import log_weights, scores
 from jaxfilters.models.face.patches import SIZE
@@ -137,11 +137,8 @@ def score_at(
     """Mean correlation of all templates at one state, -1 where a window leaves the image."""
     uv, _ = project_shape(rig, shape(model, x[POSE:]), x[:POSE])
 
-    def camera(image: Array, template: Array, points: Array) -> Array:
-        found = jax.vmap(ncc)(cut(image, points, template.shape[-1]), template)
-        return jnp.where(inside(image.shape, points, template.shape[-1]), found, -1.0)
-
-    return jnp.mean(jax.vmap(camera)(images, templates, uv))
+    at_one = lambda image, template, point: score_points(image, template, point[None])[0]
+    return jnp.mean(jax.vmap(jax.vmap(at_one, (None, 0, 0)))(images, templates, uv))
 
 
 def _no_prior(key: AnyKey) -> Array:

@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfilters import subspace
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import align
 from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.corners import eye_centers
 from jaxfilters.trackers.head.detect import StableDetector, complete, detect
 from jaxfilters.trackers.head.registration import Registration, RegistrationError, register, register_monocular
@@ -74,6 +75,8 @@ class HeadSession:
             raise ValueError(f"points must be ({NUM_LANDMARKS}, 2) finite pixels; got shape {np.shape(points)}.")
         self.events: list[tuple[int, str]] = []
         self._rig, self._options = rig, options or HeadOptions()
+        # What is compiled knows its options, but need not be compiled anew for another seed.
+        self._compiled = replace(self._options, seed=0)
         self._points = points
         self._searches = searches(rig, self._options)
         self._state: HeadState | None = None
@@ -92,7 +95,7 @@ class HeadSession:
     @property
     def contribution(self) -> float:
         """Share of the deformation seen so far that the modes explain, 0 to 1; 0 before there was any."""
-        return 0.0 if self._state is None else float(subspace.contribution(self._state.learner.subspace))
+        return 0.0 if self._state is None else float(learning.contribution(self._state.learner))
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> HeadTrack:
         """Track of the next frames, a row each.
@@ -132,7 +135,7 @@ class HeadSession:
         # Counted from the last frame, which single precision can do however late it is.
         state = self._state._replace(time=jnp.zeros_like(self._state.time))
         clock = (np.concatenate([times, np.repeat(times[-1:], missing)]) - self._time).astype(state.time.dtype)
-        self._state, track = advance(self._rig, self._searches, state, filled, clock, is_frame, self._options)
+        self._state, track = advance(self._rig, self._searches, state, filled, clock, is_frame, self._compiled)
         self._time = max(self._time, float(np.max(times)))
         track = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(times)], track)
         for i, is_lost in enumerate(track.status == LOST):
@@ -221,7 +224,7 @@ class HeadSession:
         old, face = self._state, found.registration
         pose = jnp.asarray(face.pose, float)
         self._time, start = found.time, jnp.zeros((), pose.dtype)
-        self._state = _begun(key, face.model, pose, found.images, start, self._rig, options=self._options)
+        self._state = _begun(key, face.model, pose, found.images, start, self._rig, options=self._compiled)
         self._is_lost, self._is_refuted, self._said = False, False, set()
         self._looked, self._contradictions = found.time, 0
         self._detector = StableDetector()
