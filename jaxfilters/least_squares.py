@@ -11,7 +11,7 @@ constraints", 2004). All iterates lie within the bounds, and the error never gro
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -56,9 +56,9 @@ class BoxLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
         """Damping is chosen in the first step, where the Jacobian is known."""
         del fn, args, options, f_struct, aux_struct, tags
         dtype = ravel_pytree(y)[0].dtype
-        return _State(
-            jnp.zeros((), dtype), jnp.full((), 2.0, dtype), jnp.zeros((), bool), optimistix.RESULTS.successful
-        )
+        # equinox declares the items of an enumeration as the strings that they are written with.
+        underway = cast(optimistix.RESULTS, optimistix.RESULTS.successful)
+        return _State(jnp.zeros((), dtype), jnp.full((), 2.0, dtype), jnp.zeros((), bool), underway)
 
     def step(self, fn, y, args, options, state: _State, tags) -> tuple[PyTree, _State, Any]:
         """One step that is taken, or none if nothing decreases the error."""
