@@ -1,0 +1,1 @@
+"""Symbols drawn with fingertips: codes and features of strokes, and models that tell symbols apart."""
