@@ -76,7 +76,8 @@ class BoxLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
         free = ~held(x, gradient, lower, upper)
         direction = _damped(normal, gradient, damping, free)
         energy_at = lambda x: 0.5 * jnp.sum(jnp.square(residuals(x)))
-        taken, success, gain = _searched(energy_at, x, direction, gradient, normal, energy, lower, upper)
+        product = lambda step: _product(normal, step)
+        taken, success, gain = searched(energy_at, x, direction, gradient, product, energy, lower, upper)
         factor = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
         moved = jnp.max(jnp.abs(taken - x), initial=0.0) > self.rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
         small = jnp.max(jnp.abs(x - jnp.clip(x - gradient, lower, upper)), initial=0.0) <= self.atol
@@ -210,8 +211,10 @@ def schur(
     `[[U, W], [W^T, V]] (x, y) = (b_shared, b_frames)` with a block of V for each frame, by the Schur complement of V.
     """
     solve = lambda V, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(V), True), b)
-    VW = jax.vmap(lambda V, W: solve(V, W.T))(V, W)
-    Vb = jax.vmap(solve)(V, b_frames)
+    # One by one: batches of factorisations can stand still on two cores.
+    both = jnp.concatenate([jnp.swapaxes(W, 1, 2), b_frames[..., None]], axis=-1)
+    solved = jax.lax.map(lambda frame: solve(*frame), (V, both))
+    VW, Vb = solved[..., :-1], solved[..., -1]
     S = U - jnp.einsum("nsf,nft->st", W, VW, precision="highest")
     x = solve(S, b_shared - jnp.einsum("nsf,nf->s", W, Vb, precision="highest"))
     return x, Vb - jnp.einsum("nfs,s->nf", VW, x, precision="highest")
@@ -226,11 +229,34 @@ def _damped(normal, gradient, damping, free):
     return jnp.where(jnp.all(jnp.isfinite(step)), step, -jnp.where(free, gradient, 0.0) / damping)
 
 
-def _searched(energy_at, x, direction, gradient, normal, energy, lower, upper):
-    """The next point, whether the whole step was a success, and its gain ratio."""
+def searched(
+    energy_at: Callable[[Array], Array],
+    x: Float[Array, " n"],
+    direction: Float[Array, " n"],
+    gradient: Float[Array, " n"],
+    product: Callable[[Array], Array],
+    energy: Float[Array, ""],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], Bool[Array, ""], Float[Array, ""]]:
+    """The next point within the bounds, whether the whole step was a success, and its gain ratio, 0 to 1.
+
+    A step that fails is halved, or where it does not descend the projected gradient is, until the energy falls enough
+    (L. Armijo 1966); where nothing does, the point stays.
+
+    Args:
+        energy_at: `x -> energy`, half the sum of squares.
+        x: Where the step begins.
+        direction: The step.
+        gradient: Of the energy at `x`.
+        product: `step -> N step` with the normal matrix.
+        energy: At `x`.
+        lower: Bounds.
+        upper: Bounds.
+    """
     trial = jnp.clip(x + direction, lower, upper)
     step = trial - x
-    predicted = -jnp.sum(gradient * step) - 0.5 * jnp.sum(step * _product(normal, step))
+    predicted = -jnp.sum(gradient * step) - 0.5 * jnp.sum(step * product(step))
     there = energy_at(trial)
     gain = (energy - there) / jnp.where(predicted > 0, predicted, 1.0)
     success = (there <= _SUFFICIENT * energy) | ((predicted > 0) & (gain > _LEAST_GAIN))

@@ -1,0 +1,255 @@
+"""Least squares within bounds: the box Levenberg-Marquardt against SciPy, jaxopt and optimistix; shared variables.
+
+300 random problems of 2 to 4 variables and 8 residuals, in double precision: solutions have to be feasible and
+stationary, and are compared with those of SciPy's trust-region reflective method. Where both are stationary in
+different places the problem has several minima, which is counted apart. Then 256 of them at once: this library and the
+peers that know bounds (`scipy`: one after the other; `jaxopt_lbfgsb` and `jaxopt_projected`, L-BFGS-B and projected
+gradients, under vmap), and optimistix's own Levenberg-Marquardt, which takes bounds without a word and leaves them, on
+the same problems without bounds. All stop at a projected gradient of 1e-6. At last the adjustment of frames that share
+variables, dense and by the Schur complement.
+"""
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxopt
+import numpy as np
+import optimistix
+import scipy.optimize
+from jaxtyping import Array
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.timing import interleaved
+from jaxfilters.least_squares import BoxLevenbergMarquardt
+from jaxfilters.shared_least_squares import Split, solve_shared
+
+NUM_PROBLEMS, QUICK_NUM_PROBLEMS, BATCH = 300, 30, 256
+SIZE, NUM_RESIDUALS, MOST_STEPS = 4, 8, 400
+STATIONARY = 1e-6
+FRAMES, QUICK_FRAMES = (8, 32, 128, 512), (8, 32)
+MOST_DENSE = 128
+NUM_POINTS, NUM_SHARED = 10, 12
+MEAN = np.random.default_rng(0).normal(0, 1, 3 * NUM_POINTS)
+BASIS = np.random.default_rng(1).normal(0, 0.3, (3 * NUM_POINTS, NUM_SHARED))
+"""Of the shape that frames share."""
+ROUNDS, QUICK_ROUNDS = 15, 2
+
+
+def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
+    """Check the answers, then time them; `out` is not used."""
+    del out
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    with jax.enable_x64(True):
+        problems = random_problems(seed, QUICK_NUM_PROBLEMS if quick else NUM_PROBLEMS)
+        metrics = answer_metrics(problems)
+        metrics |= batch_metrics(tuple(a[:BATCH] for a in problems), rounds)
+        return metrics | shared_metrics(seed, QUICK_FRAMES if quick else FRAMES, rounds)
+
+
+def residuals(y: Array, args: tuple) -> Array:
+    """Smooth, with several minima now and then."""
+    A, b, c = args
+    turned = A @ y
+    return 2 * jnp.tanh(turned) + 0.3 * turned - b + 0.1 * jnp.sum(y * y) * c
+
+
+def energy(y: Array, args: tuple) -> Array:
+    """Half the sum of squares."""
+    return 0.5 * jnp.sum(residuals(y, args) ** 2)
+
+
+def random_problems(seed: int, count: int) -> tuple[np.ndarray, ...]:
+    """(A, b, c, lower, upper, start), a third each of two, three and four variables that matter."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(count, NUM_RESIDUALS, SIZE))
+    A[: count // 3, :, 2:], A[count // 3 : 2 * count // 3, :, 3:] = 0, 0
+    b, c = 2 * rng.normal(size=(count, NUM_RESIDUALS)), rng.normal(size=(count, NUM_RESIDUALS))
+    lower, upper = -rng.uniform(0.1, 1.5, (count, SIZE)), rng.uniform(0.1, 1.5, (count, SIZE))
+    return A, b, c, lower, upper, rng.uniform(lower, upper)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0,) * 6)
+def box_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> tuple[Array, Array]:
+    """Solutions and steps of this library."""
+    solver = BoxLevenbergMarquardt(rtol=1e-12, atol=STATIONARY)
+    options = {"lower": lower, "upper": upper}
+    found = optimistix.least_squares(residuals, solver, start, (A, b, c), options, max_steps=MOST_STEPS, throw=False)
+    return found.value, found.stats["num_steps"]
+
+
+def answer_metrics(problems: tuple[np.ndarray, ...]) -> dict[str, Metric]:
+    """Are the answers right, and as good as SciPy's?"""
+    A, b, c, lower, upper, _ = problems
+    y, steps = (np.asarray(part) for part in box_solve(*problems))
+    peers = [scipy_solve(*one) for one in zip(*problems, strict=True)]
+    cost, stationary = jax.vmap(energy)(y, (A, b, c)), projected_gradient(y, problems)
+    ratio = np.asarray(cost) / np.array([peer.cost for peer in peers])
+    elsewhere = projected_gradient(np.stack([peer.x for peer in peers]), problems) < 1e-4
+    elsewhere &= (stationary < 1e-4) & (ratio > 1 + 1e-6)
+    return {
+        "infeasible": Metric(float(np.sum((y < lower) | (y > upper))), "", "lower"),
+        "projected_gradient_worst": Metric(float(stationary.max()), "", "lower"),
+        "worse_than_scipy": Metric(float(np.sum((ratio > 1 + 1e-6) & ~elsewhere)), "problems", "lower"),
+        "worse_than_scipy_in_another_minimum": Metric(float(np.sum(elsewhere)), "problems", "lower"),
+        "better_than_scipy": Metric(float(np.sum(ratio < 1 - 1e-6)), "problems", "higher"),
+        "steps_median": Metric(float(np.median(steps)), "", "lower"),
+        "scipy_evaluations_median": Metric(float(np.median([peer.nfev for peer in peers])), "", "lower"),
+    }
+
+
+def projected_gradient(y: np.ndarray, problems: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Of each problem, the largest component."""
+    A, b, c, lower, upper, _ = problems
+    gradient = np.asarray(jax.vmap(jax.grad(energy))(y, (A, b, c)))
+    return np.abs(y - np.clip(y - gradient, lower, upper)).max(axis=1)
+
+
+def scipy_solve(
+    A: np.ndarray, b: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray
+) -> scipy.optimize.OptimizeResult:
+    """One problem by the trust-region reflective method, with the exact Jacobian."""
+
+    def value(y: np.ndarray) -> np.ndarray:
+        turned = A @ y
+        return 2 * np.tanh(turned) + 0.3 * turned - b + 0.1 * np.sum(y * y) * c
+
+    def jacobian(y: np.ndarray) -> np.ndarray:
+        slope = 2 / np.cosh(A @ y) ** 2 + 0.3
+        return slope[:, None] * A + 0.2 * c[:, None] * y
+
+    return scipy.optimize.least_squares(
+        value, start, jacobian, (lower, upper), gtol=STATIONARY, xtol=1e-14, ftol=1e-14, max_nfev=MOST_STEPS
+    )
+
+
+def batch_metrics(problems: tuple[np.ndarray, ...], rounds: int) -> dict[str, Metric]:
+    """Milliseconds for the whole batch, and how many each solved."""
+    arrays = tuple(jnp.asarray(a) for a in problems)
+    calls: dict[str, Callable[[], Any]] = {
+        "box": lambda: box_solve(*arrays)[0],
+        "jaxopt_lbfgsb": lambda: lbfgsb_solve(*arrays),
+        "jaxopt_projected": lambda: projected_solve(*arrays),
+        "optimistix_unbounded": lambda: unbounded_solve(*arrays),
+        "scipy": lambda: np.stack([scipy_solve(*one).x for one in zip(*problems, strict=True)]),
+    }
+    seconds = interleaved(calls, rounds)
+    metrics = {f"batch_ms_{name}": Metric(1e3 * value, "ms", "lower") for name, value in seconds.items()}
+    for name, call in calls.items():
+        if name == "optimistix_unbounded":
+            continue
+        y = np.asarray(call())
+        solved = (projected_gradient(y, problems) < 1e-4) & np.all((y >= problems[3]) & (y <= problems[4]), axis=1)
+        metrics[f"batch_solved_{name}"] = Metric(100 * float(solved.mean()), "%", "higher")
+    for name in calls:
+        if name != "box":
+            metrics[f"ratio_batch_to_{name}"] = Metric(seconds["box"] / seconds[name], "", "lower")
+    return metrics
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0,) * 6)
+def lbfgsb_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
+    """By jaxopt's L-BFGS-B."""
+    solver = jaxopt.LBFGSB(fun=energy, tol=STATIONARY, maxiter=MOST_STEPS)
+    return solver.run(start, bounds=(lower, upper), args=(A, b, c)).params
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0,) * 6)
+def projected_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
+    """By jaxopt's accelerated projected gradients."""
+    solver = jaxopt.ProjectedGradient(
+        fun=energy, projection=jaxopt.projection.projection_box, tol=STATIONARY, maxiter=MOST_STEPS
+    )
+    return solver.run(start, hyperparams_proj=(lower, upper), args=(A, b, c)).params
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0,) * 6)
+def unbounded_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
+    """By optimistix's Levenberg-Marquardt, without the bounds."""
+    del lower, upper
+    solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=STATIONARY)
+    return optimistix.least_squares(residuals, solver, start, (A, b, c), max_steps=MOST_STEPS, throw=False).value
+
+
+def shared_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str, Metric]:
+    """Milliseconds of ten steps by the number of frames, and how far the two ways are apart."""
+    calls: dict[str, Callable[[], Any]] = {}
+    apart = 0.0
+    for count in counts:
+        start, data = shared_problem(seed, count)
+        calls[f"schur_{count}_frames"] = partial(shared_solve, start, data)
+        if count <= MOST_DENSE:
+            calls[f"dense_{count}_frames"] = partial(dense_solve, start, data)
+            ends = [jax.flatten_util.ravel_pytree(solve(start, data))[0] for solve in (converged, dense_converged)]
+            apart = max(apart, float(jnp.max(jnp.abs(ends[0] - ends[1]))))
+    seconds = interleaved(calls, rounds)
+    metrics = {f"shared_ms_{name}": Metric(1e3 * value, "ms", "lower") for name, value in seconds.items()}
+    first, last = counts[-2], counts[-1]
+    growth = seconds[f"schur_{last}_frames"] / seconds[f"schur_{first}_frames"] / (last / first)
+    sys.stderr.write(f"  shared variables: {growth:.2f} times linear from {first} to {last} frames\n")
+    return metrics | {
+        "shared_growth_over_linear": Metric(growth, "", "lower"),
+        "shared_apart_from_dense": Metric(apart, "", "lower"),
+    }
+
+
+def shared_problem(seed: int, count: int) -> tuple[Split, Array]:
+    """Frames of a shape of ten points with `NUM_SHARED` parameters, each turned and moved its own way; and a start."""
+    rng = np.random.default_rng(seed)
+    shared, frames = 0.5 * rng.normal(size=NUM_SHARED), 0.2 * rng.normal(size=(count, 6))
+    seen = jax.vmap(of_frame, (None, 0, 0))(jnp.asarray(shared), jnp.asarray(frames), jnp.zeros((count, NUM_POINTS, 3)))
+    data = seen.reshape(count, NUM_POINTS, 3) + 0.01 * rng.normal(size=(count, NUM_POINTS, 3))
+    start = Split(shared + 0.1 * rng.normal(size=NUM_SHARED), frames + 0.05 * rng.normal(size=(count, 6)))
+    return jax.tree.map(jnp.asarray, start), data
+
+
+def of_frame(shared: Array, frame: Array, data: Array) -> Array:
+    """Points of a shape that all frames share, turned by small angles and moved."""
+    points = jnp.asarray(MEAN + BASIS @ shared, shared.dtype).reshape(NUM_POINTS, 3)
+    turned = points + jnp.cross(jnp.sin(frame[:3]), points)
+    return (turned + frame[3:] - data).ravel()
+
+
+def prior(shared: Array) -> Array:
+    """A little of it."""
+    return 0.1 * shared
+
+
+def everything(split: Split, data: Array) -> Array:
+    """All residuals."""
+    of_frames = jax.vmap(of_frame, (None, 0, 0))(split.shared, split.frames, data)
+    return jnp.concatenate([of_frames.ravel(), prior(split.shared)])
+
+
+@jax.jit
+def shared_solve(start: Split, data: Array) -> Split:
+    """Ten steps by the Schur complement."""
+    return solve_shared(of_frame, start, data, prior=prior, steps=10, rtol=0.0, atol=0.0).value
+
+
+@jax.jit
+def dense_solve(start: Split, data: Array) -> Split:
+    """Ten dense steps."""
+    solver = BoxLevenbergMarquardt(rtol=0.0, atol=0.0)
+    return optimistix.least_squares(everything, solver, start, data, max_steps=10, throw=False).value
+
+
+@jax.jit
+def converged(start: Split, data: Array) -> Split:
+    """By the Schur complement, to the end."""
+    return solve_shared(of_frame, start, data, prior=prior, steps=300, rtol=1e-14, atol=1e-11).value
+
+
+@jax.jit
+def dense_converged(start: Split, data: Array) -> Split:
+    """By dense steps, to the end."""
+    solver = BoxLevenbergMarquardt(rtol=1e-14, atol=1e-11)
+    return optimistix.least_squares(everything, solver, start, data, max_steps=300, throw=False).value

@@ -1,0 +1,191 @@
+"""Least squares within bounds where many frames share some variables: steps in time linear in the frames.
+
+    residuals = lambda shared, frame, data: ...          # of one frame
+    solution = solve_shared(residuals, Split(shared, frames), data, steps=50)
+
+Bundle adjustment, calibration and hand-eye problems are of this form. Steps are those of `BoxLevenbergMarquardt`; the
+normal equations are solved by the Schur complement of the frames' own variables.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxfilters.least_squares import bounds_of, held, schur, searched
+
+_FIRST_DAMPING = 1e-3
+"""Of the largest diagonal element of the normal matrix."""
+_SMALLEST = 1e-30
+"""Of the damping: a Jacobian of zeros is the end, not a division by zero."""
+
+
+class Split(NamedTuple):
+    """Variables, or bounds of them."""
+
+    shared: PyTree
+    frames: PyTree
+    """Leaves with a leading axis of n frames."""
+
+
+class SharedSolution(NamedTuple):
+    """How it ended."""
+
+    value: Split
+    energy: Float[Array, ""]
+    """Half of the sum of squared residuals."""
+    projected_gradient: Float[Array, ""]
+    """Largest change of a variable by a gradient step within the bounds: 0 at a solution."""
+    steps: Int[Array, ""]
+    finite: Bool[Array, ""]
+    """False if residuals or derivatives became infinite or NaN; the value is the last good one."""
+
+
+class _Blocks(NamedTuple):
+    """Normal equations, a block for each frame."""
+
+    U: Float[Array, "s s"]
+    W: Float[Array, "n s f"]
+    V: Float[Array, "n f f"]
+    shared: Float[Array, " s"]
+    """Gradient."""
+    frames: Float[Array, "n f"]
+
+    def product(self, x: Float[Array, " s"], y: Float[Array, "n f"]) -> tuple[Array, Array]:
+        """Normal matrix times (x, y)."""
+        dot = lambda spec, *a: jnp.einsum(spec, *a, precision="highest")
+        return dot("st,t->s", self.U, x) + dot("nsf,nf->s", self.W, y), dot("nsf,s->nf", self.W, x) + dot(
+            "nfg,ng->nf", self.V, y
+        )
+
+
+def solve_shared(
+    residuals: Callable[[Any, Any, Any], Float[Array, " rows"]],
+    start: Split,
+    data: PyTree,
+    *,
+    prior: Callable[[Any], Float[Array, " rows"]] | None = None,
+    lower: Split | None = None,
+    upper: Split | None = None,
+    steps: int = 100,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+) -> SharedSolution:
+    """Variables of least energy within their bounds, by at most so many steps.
+
+    Args:
+        residuals: `(shared, frame, data of the frame) -> residuals`.
+        start: Moved to the nearest point within the bounds if outside.
+        data: Leaves with a leading axis of n frames.
+        prior: `shared -> residuals`.
+        lower: Bounds with the structure of `start`; none where absent or infinite.
+        upper: The same.
+        steps: Largest number of steps.
+        rtol: It ends when no variable moves by more than `rtol (1 + |x|)`, with the largest |x|.
+        atol: Or when the projected gradient is at most this.
+
+    Raises:
+        ValueError: if a bound has another structure than `start`, or a lower one is above the upper one.
+    """
+    flat, whole = _flattened(start)
+    _, as_tree = ravel_pytree(start)
+    low, high = (_flattened(as_tree(side))[0] for side in bounds_of({"lower": lower, "upper": upper}, start))
+    size = ravel_pytree(start.shared)[0].size
+    count = jax.tree.leaves(start.frames)[0].shape[0]
+    split = lambda x: (x[:size], x[size:].reshape(count, -1))
+    join = lambda s, f: jnp.concatenate([s, f.ravel()])
+    problem = _problem(residuals, prior, start, data)
+    energy_at = lambda x: problem.energy(*split(x))
+
+    def step(carry: tuple) -> tuple:
+        x, energy, damping, growth, taken, _, _ = carry
+        blocks = _blocks(problem, *split(x))
+        gradient = join(blocks.shared, blocks.frames)
+        diagonal = join(jnp.diagonal(blocks.U), jnp.diagonal(blocks.V, axis1=1, axis2=2))
+        damping = jnp.where(damping > 0, damping, _FIRST_DAMPING * jnp.max(diagonal))
+        damping = jnp.maximum(damping, _SMALLEST)
+        free = ~held(x, gradient, low, high)
+        direction = join(*_step(blocks, damping, *split(free)))
+        # Rounding can take a nearly singular matrix below zero; the gradient then leads on.
+        direction = jnp.where(jnp.all(jnp.isfinite(direction)), direction, -jnp.where(free, gradient, 0.0) / damping)
+        product = lambda y: join(*blocks.product(*split(y)))
+        y, success, gain = searched(energy_at, x, direction, gradient, product, energy, low, high)
+        eased = damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
+        finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(gradient))
+        moved = jnp.max(jnp.abs(y - x), initial=0.0) > rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
+        rest = jnp.max(jnp.abs(x - jnp.clip(x - gradient, low, high)), initial=0.0)
+        y = jnp.where(finite, y, x)
+        damping, growth = jnp.where(success, eased, damping * growth), jnp.where(success, 2.0, 2 * growth)
+        return y, energy_at(y), damping, growth, taken + 1, moved & (rest > atol) & finite, finite
+
+    x = jnp.clip(flat, low, high)
+    zero, yes = jnp.zeros((), x.dtype), jnp.ones((), bool)
+    begin = (x, energy_at(x), zero, zero + 2, jnp.zeros((), jnp.int32), yes, yes)
+    x, energy, _, _, taken, _, finite = jax.lax.while_loop(lambda c: c[5] & (c[4] < steps), step, begin)
+    blocks = _blocks(problem, *split(x))
+    rest = jnp.max(jnp.abs(x - jnp.clip(x - join(blocks.shared, blocks.frames), low, high)), initial=0.0)
+    return SharedSolution(whole(x), energy, rest, taken, finite)
+
+
+def _flattened(start: Split) -> tuple[Array, Callable[[Array], Split]]:
+    """All variables, the shared ones first and the others frame by frame, and the way back."""
+    shared, to_shared = ravel_pytree(start.shared)
+    one, to_frame = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], start.frames))
+    frames = jax.vmap(lambda frame: ravel_pytree(frame)[0])(start.frames)
+
+    def whole(x: Array) -> Split:
+        return Split(to_shared(x[: shared.size]), jax.vmap(to_frame)(x[shared.size :].reshape(-1, one.size)))
+
+    return jnp.concatenate([shared, frames.ravel()]), whole
+
+
+class _Problem(NamedTuple):
+    """Residuals as functions of flat variables."""
+
+    of_frame: Callable[[Array, Array, Any], Array]
+    own: Callable[[Array], Array]
+    """The prior's."""
+    data: PyTree
+
+    def energy(self, s: Array, f: Array) -> Array:
+        """Half of the sum of squares."""
+        of_frames = jax.vmap(self.of_frame, (None, 0, 0))(s, f, self.data)
+        return 0.5 * (jnp.sum(of_frames**2) + jnp.sum(self.own(s) ** 2))
+
+
+def _problem(residuals, prior, start: Split, data: PyTree) -> _Problem:
+    _, to_shared = ravel_pytree(start.shared)
+    _, to_frame = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], start.frames))
+    of_frame = lambda s, f, data: ravel_pytree(residuals(to_shared(s), to_frame(f), data))[0]
+    own = (lambda s: ravel_pytree(prior(to_shared(s)))[0]) if prior else (lambda s: jnp.zeros(0, s.dtype))
+    return _Problem(of_frame, own, data)
+
+
+def _blocks(problem: _Problem, s: Array, f: Array) -> _Blocks:
+    def one(f: Array, data: Any) -> tuple[Array, Array, Array]:
+        r = problem.of_frame(s, f, data)
+        return r, *jax.jacfwd(problem.of_frame, (0, 1))(s, f, data)
+
+    r, by_shared, by_frame = jax.vmap(one)(f, problem.data)
+    own, by_own = problem.own(s), jax.jacfwd(problem.own)(s)
+    dot = lambda spec, *a: jnp.einsum(spec, *a, precision="highest")
+    return _Blocks(
+        U=dot("nrs,nrt->st", by_shared, by_shared) + dot("rs,rt->st", by_own, by_own),
+        W=dot("nrs,nrf->nsf", by_shared, by_frame),
+        V=dot("nrf,nrg->nfg", by_frame, by_frame),
+        shared=dot("nrs,nr->s", by_shared, r) + dot("rs,r->s", by_own, own),
+        frames=dot("nrf,nr->nf", by_frame, r),
+    )
+
+
+def _step(blocks: _Blocks, damping: Array, free_shared: Array, free_frames: Array) -> tuple[Array, Array]:
+    """The damped step of the free variables; the others stay."""
+    U = jnp.where(free_shared[:, None] & free_shared, blocks.U, 0.0)
+    W = jnp.where(free_shared[:, None] & free_frames[:, None], blocks.W, 0.0)
+    V = jnp.where(free_frames[:, :, None] & free_frames[:, None], blocks.V, 0.0)
+    U += jnp.diag(jnp.where(free_shared, damping, 1.0))
+    V += jax.vmap(jnp.diag)(jnp.where(free_frames, damping, 1.0))
+    return schur(U, W, V, -jnp.where(free_shared, blocks.shared, 0.0), -jnp.where(free_frames, blocks.frames, 0.0))
