@@ -79,7 +79,7 @@ def box_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: A
     """Solutions and steps of this library."""
     solver = BoxLevenbergMarquardt(rtol=1e-12, atol=STATIONARY)
     options = {"lower": lower, "upper": upper}
-    found = optimistix.least_squares(residuals, solver, start, (A, b, c), options, max_steps=MOST_STEPS, throw=False)
+    found: Any = optimistix.least_squares(residuals, solver, start, (A, b, c), options, max_steps=MOST_STEPS, throw=False)
     return found.value, found.stats["num_steps"]
 
 
@@ -88,7 +88,7 @@ def answer_metrics(problems: tuple[np.ndarray, ...]) -> dict[str, Metric]:
     A, b, c, lower, upper, _ = problems
     y, steps = (np.asarray(part) for part in box_solve(*problems))
     peers = [scipy_solve(*one) for one in zip(*problems, strict=True)]
-    cost, stationary = jax.vmap(energy)(y, (A, b, c)), projected_gradient(y, problems)
+    cost, stationary = jax.vmap(energy)(jnp.asarray(y), (A, b, c)), projected_gradient(y, problems)
     ratio = np.asarray(cost) / np.array([peer.cost for peer in peers])
     elsewhere = projected_gradient(np.stack([peer.x for peer in peers]), problems) < 1e-4
     elsewhere &= (stationary < 1e-4) & (ratio > 1 + 1e-6)
@@ -175,7 +175,7 @@ def projected_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, st
 def unbounded_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
     """By optimistix's Levenberg-Marquardt, without the bounds."""
     del lower, upper
-    solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=STATIONARY)
+    solver: Any = optimistix.LevenbergMarquardt(rtol=1e-8, atol=STATIONARY)
     return optimistix.least_squares(residuals, solver, start, (A, b, c), max_steps=MOST_STEPS, throw=False).value
 
 

@@ -21,6 +21,8 @@ from jaxfilters.tensor_completion import complete
 
 IDENTITIES, EXPRESSIONS = 10, 5
 """S' and A' of the thesis."""
+LEAST_VARIANCE = 1e-5
+"""Of any combination of parameters, as a share of their mean variance."""
 PEOPLE_MODE, EXPRESSION_MODE = 2, 3
 """Of the data tensor (K, 3, 2S, A)."""
 
@@ -165,10 +167,12 @@ def of_tensor(T: Float[Array, "K 3 n A"], ranks: dict[int, int]) -> MultilinearF
 
 
 def _moments(rows):
-    """Mean and sample covariance."""
+    """Mean and sample covariance, of full rank also where there are as many parameters as examples."""
     mean = jnp.mean(rows, axis=0)
     apart = rows - mean
-    return mean, jnp.matmul(apart.T, apart, precision="highest") / (len(rows) - 1)
+    covariance = jnp.matmul(apart.T, apart, precision="highest") / (len(rows) - 1)
+    least = LEAST_VARIANCE * jnp.trace(covariance) / len(covariance)
+    return mean, covariance + least * jnp.eye(len(covariance), dtype=covariance.dtype)
 
 
 def _along_last(basis, coefficients):

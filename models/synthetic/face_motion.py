@@ -90,6 +90,20 @@ def deformation_schedule(
     return amp * w[:, None] * np.stack([e1, e2], axis=-1)
 
 
+def speech_schedule(num_frames: int, *, start: int = 60) -> Float[np.ndarray, "frames 2"]:
+    """Expressions (e1, e2) of a face that is neutral until `start` (one-camera specification, section 4).
+
+    With w a one-second ramp and s the time in seconds, `e1 = w .45 max(0, sin(2 pi .17 s)) sign(sin(2 pi .05 s) + .3)`
+    and `e2 = w .6 max(0, sin(2 pi .23 s + 1))`.
+    """
+    frame = np.arange(num_frames)
+    s = frame / FPS
+    w = np.clip((frame - start) / FPS, 0, 1)
+    e1 = 0.45 * np.maximum(0, np.sin(2 * math.pi * 0.17 * s)) * np.sign(np.sin(2 * math.pi * 0.05 * s) + 0.3)
+    e2 = 0.6 * np.maximum(0, np.sin(2 * math.pi * 0.23 * s + 1))
+    return w[:, None] * np.stack([e1, e2], axis=-1)
+
+
 def occlusion_schedule(num_frames: int, *, frames: tuple[int, int] = OCCLUSION_FRAMES) -> Bool[np.ndarray, " frames"]:
     """Whether mouth and nostrils are covered: 30 frames (specification, section 5.1)."""
     frame = np.arange(num_frames)

@@ -10,7 +10,9 @@ from typing import Any
 
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.devices import use_all_cores
+from jaxfilters.trackers.shell.fit_options import add_fit
 from jaxfilters.trackers.shell.head_options import add_head
+from jaxfilters.trackers.shell.mono_options import add_mono
 from jaxfilters.trackers.shell.people_options import add_people
 
 FAILURE, INTERRUPTED = 2, 130
@@ -35,10 +37,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             from jaxfilters.trackers.shell.calibrate_command import calibrate
 
             print(calibrate(options))
+        elif options.command == "fit":
+            from jaxfilters.trackers.shell.fit_command import fit
+
+            print(fit(options))
         elif getattr(options, "what", None) == "people":
             from jaxfilters.trackers.shell.people_command import track_people
 
             track_people(options)
+        elif getattr(options, "what", None) == "head-mono":
+            from jaxfilters.trackers.shell.mono_command import track_mono
+
+            print(track_mono(options))
         elif getattr(options, "what", None) == "head-stereo":
             from jaxfilters.trackers.shell.head_command import track_head
 
@@ -96,6 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_people(what, _seed)
     add_head(what, _seed)
+    add_mono(what, _seed)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
@@ -103,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_filter_options(demo)
 
     add_calibrate(commands, _image_size)
+    add_fit(commands, _seed)
     commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
     return parser
 

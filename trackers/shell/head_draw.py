@@ -10,7 +10,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.trackers.shell.head_table import STATUS_WORDS, TRACKED, TimedHeadTrack, in_degrees
+from jaxfilters.trackers.shell.head_table import STATUS_WORDS, TRACKED, HeadRows, in_degrees
 from jaxfilters.trackers.shell.video import caption, side_by_side
 
 HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (190, 190, 190))
@@ -25,7 +25,7 @@ _SUBPIXEL = 4
 """Fractional bits of the coordinates that OpenCV draws with."""
 
 
-def draw_frame(images: list[np.ndarray | None], rig: CameraRig, track: TimedHeadTrack, i: int) -> np.ndarray:
+def draw_frame(images: list[np.ndarray | None], rig: CameraRig, track: HeadRows, i: int) -> np.ndarray:
     """(rows, cols, 3) uint8: the images of all cameras side by side with row `i` of the track.
 
     `images` are straightened, (rows, cols, 3) uint8, or None where there is none; they are not changed.
@@ -83,7 +83,7 @@ def _draw_axes(picture: np.ndarray, ends: np.ndarray) -> None:
             cv2.line(picture, _fixed(ends[0]), _fixed(end), color, 3, cv2.LINE_AA, _SUBPIXEL)
 
 
-def _write_state(picture: np.ndarray, track: TimedHeadTrack, i: int) -> None:
+def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
     status, score = int(track.status[i]), float(track.score[i])
     scored = f"   score {score:.2f}" if np.isfinite(score) else ""
     caption(picture, f"{STATUS_WORDS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])

@@ -1,9 +1,9 @@
-"""What `jaxfilters track head-stereo` watches: two cameras of a rig, one camera, or a synthetic face."""
+"""What the head trackers watch: two cameras of a rig, one camera, or a synthetic face."""
 
 import argparse
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -12,8 +12,8 @@ import numpy as np
 from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.rig import CameraRig, monocular
-from jaxfilters.models.synthetic.face_motion import FPS
-from jaxfilters.models.synthetic.face_sequence import FaceSequence, sequence
+from jaxfilters.models.synthetic.face_motion import FPS, MONOCULAR_PLACE_MM, motion, speech_schedule
+from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence, sequence
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.camera_files import open_intrinsics
 from jaxfilters.trackers.shell.head_report import HeadTruth
@@ -25,6 +25,8 @@ from jaxfilters.trackers.undistortion import Undistortion
 FOCAL_WIDTHS = 1.2
 """Assumed focal length of a single camera, image widths: a horizontal field of view of 45 degrees."""
 _SYNTHETIC_FRAMES, _MOTION = 600, "mix"
+_SYNTHETIC_FOCAL = 800.0
+"""Pixels, of the one camera before a synthetic face."""
 
 
 class Place(NamedTuple):
@@ -42,7 +44,7 @@ class Place(NamedTuple):
 
 
 def place_of(options: argparse.Namespace) -> Place:
-    """The cameras and sources that the command line names.
+    """The cameras and sources that the command line of `track head-stereo` names.
 
     Raises:
         InputError: a source or a file cannot be used, they do not fit each other, or one is missing.
@@ -50,7 +52,8 @@ def place_of(options: argparse.Namespace) -> Place:
     if not options.sources:
         return _synthetic(options)
     if len(options.sources) == 1:
-        return _single(options)
+        place = _single(options, options.sources[0])
+        return place._replace(note="; ".join(["one camera: a rigid face of average size", *filter(None, [place.note])]))
     if options.camera:
         raise InputError("--camera: for one source alone; two cameras are described by --rig RIG.json.")
     if not options.rig:
@@ -68,32 +71,54 @@ def place_of(options: argparse.Namespace) -> Place:
     )
 
 
-def _single(options: argparse.Namespace) -> Place:
-    if options.rig:
+def place_of_one(options: argparse.Namespace) -> Place:
+    """The camera and source that the command line of `track head-mono` names.
+
+    Raises:
+        InputError: the source or a file cannot be used, or they do not fit each other.
+    """
+    if options.video_source is not None:
+        return _single(options, options.video_source)
+    _refuse_unused({"--camera": options.camera, "--points": options.points, "--fps": options.fps})
+    seed = options.seed or 0
+    camera = Pinhole.from_intrinsics(_SYNTHETIC_FOCAL, (319.5, 239.5), (480, 640))
+    poses = motion(_MOTION, _SYNTHETIC_FRAMES, seed, place_mm=MONOCULAR_PLACE_MM)
+    talking = speech_schedule(_SYNTHETIC_FRAMES)
+    return _rendered(face_sequence(jax.random.key(seed), poses, rig=monocular(camera), expressions=talking))
+
+
+def _single(options: argparse.Namespace, name: str) -> Place:
+    if getattr(options, "rig", None):
         raise InputError(
             "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
         )
-    source = open_video(options.sources[0], fps=options.fps)
+    source = open_video(name, fps=options.fps)
     cols, rows = source.image_size
+    note = None
     if options.camera:
         K, distortion, image_size = open_intrinsics(options.camera)
         _check_size(source, image_size, str(options.camera))
-        note = "one camera: a rigid face of average size"
     else:
         focal = FOCAL_WIDTHS * cols
         K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
-        note = f"one camera: a rigid face of average size, and an assumed focal length of {focal:.0f} px"
+        note = f"an assumed focal length of {focal:.0f} px"
     undistortion = Undistortion((rows, cols), K, distortion)
     rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
     return Place(rig, [undistortion], [source], _points(options, undistortion), None, note)
 
 
 def _synthetic(options: argparse.Namespace) -> Place:
-    given = {"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps}
+    _refuse_unused({"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps})
+    seed = options.seed or 0
+    return _rendered(sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True))
+
+
+def _refuse_unused(given: dict[str, Any]) -> None:
     if unused := [name for name, value in given.items() if value is not None]:
         raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic face has its own.")
-    seed = options.seed or 0
-    made = sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True)
+
+
+def _rendered(made: FaceSequence) -> Place:
     image = _remembered(made)
     sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
     truth = HeadTruth(made.poses, made.uv)

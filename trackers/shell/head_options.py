@@ -41,6 +41,11 @@ def add_head(what: Any, seed: Callable[[str], int]) -> None:
     head.add_argument(
         "--mode", choices=("modern", "paper"), help="improved filter (default: modern), or the one of the papers"
     )
+    head.add_argument(
+        "--detector",
+        choices=("cascades", "mediapipe"),
+        help="what finds the landmarks at the start: OpenCV's cascades (default) or MediaPipe's face mesh",
+    )
     head.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 1000)")
     head.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
     head.add_argument("--fps", type=float, metavar="FPS", help="of the recordings, in place of what they say")

@@ -10,12 +10,13 @@ from jaxfilters.trackers.shell.head_table import (
     SKIPPED,
     STATUS_WORDS,
     TRACKED,
-    TimedHeadTrack,
+    HeadRows,
     in_degrees,
     longest_stretch,
 )
 
 _SIGMAS = 2.0
+"""Within which errors should be."""
 
 
 class HeadTruth(NamedTuple):
@@ -27,7 +28,7 @@ class HeadTruth(NamedTuple):
     """(frames, cameras, 10, 2) pixels of the landmarks."""
 
 
-def shares(track: TimedHeadTrack) -> dict[str, Any]:
+def shares(track: HeadRows) -> dict[str, Any]:
     """Frames by status, how much of the run is tracked, and the longest stretch without loss."""
     counts = np.bincount(track.status, minlength=len(STATUS_WORDS))
     seen = int(len(track.status) - counts[SKIPPED])
@@ -44,7 +45,7 @@ def shares(track: TimedHeadTrack) -> dict[str, Any]:
     }
 
 
-def errors(track: TimedHeadTrack, truth: HeadTruth | None) -> dict[str, Any]:
+def errors(track: HeadRows, truth: HeadTruth | None) -> dict[str, Any]:
     """Root mean square errors of the tracked frames, and the share of them that is within 2 standard deviations."""
     tracked = np.flatnonzero(np.isin(track.status, TRACKED))
     if truth is None or not len(tracked):

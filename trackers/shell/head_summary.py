@@ -1,6 +1,7 @@
 """One picture of a whole run of a head: pose, deformation and score over time, and what was learnt of the face."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.state import NUM_MODES
 from jaxfilters.trackers.shell.chart import Color, Curve, Shade, draw_chart
 from jaxfilters.trackers.shell.head_draw import HEAD_STATUS_COLORS, draw_points
-from jaxfilters.trackers.shell.head_table import AXES, STATUS_WORDS, TimedHeadTrack, in_degrees
+from jaxfilters.trackers.shell.head_table import AXES, STATUS_WORDS, HeadRows, in_degrees
 from jaxfilters.trackers.shell.results import OutputError
 
 DEVIATIONS = 2.0
@@ -27,7 +28,21 @@ _TINT = 0.22
 """Share of a status's colour in the paper behind a chart."""
 
 
-def draw_summary(track: TimedHeadTrack, model: FaceModel | None, truth: np.ndarray | None) -> np.ndarray:
+class Labels(NamedTuple):
+    """What the numbers of a face's changes are called."""
+
+    coefficients: str = "deformation, mm"
+    curve: str = "a"
+    mode: str = "a"
+    modes: str = "deformation learnt"
+
+
+DEFORMATION = Labels()
+
+
+def draw_summary(
+    track: HeadRows, model: FaceModel | None, truth: np.ndarray | None, labels: Labels = DEFORMATION
+) -> np.ndarray:
     """(rows, cols, 3) uint8: charts with 2-sigma bands over paper in the colours of the statuses, and the modes learnt.
 
     `truth` are poses (frames, 6) in millimetres and radians, drawn in grey; None where they are not known.
@@ -47,25 +62,27 @@ def draw_summary(track: TimedHeadTrack, model: FaceModel | None, truth: np.ndarr
         word, unit = name.split("_")
         charts.append(chart(f"{word}, {unit}, with 2 sigma", [*under, curve]))
     modes = [
-        Curve(f"a{mode + 1}", track.deformation[:, mode].astype(float), _COLORS[mode])
-        for mode in range(min(NUM_MODES, 0 if model is None else model.num_modes))
+        Curve(f"{labels.curve}{mode + 1}", track.deformation[:, mode].astype(float), _COLORS[mode])
+        for mode in range(min(NUM_MODES, 0 if model is None else track.deformation.shape[1]))
         if np.any(np.nan_to_num(track.deformation[:, mode]))
     ]
-    charts.append(chart("deformation, mm", modes, "time (s)"))
+    charts.append(chart(labels.coefficients, modes, "time (s)"))
     charts.append(chart("score: mean correlation", [Curve("", track.score.astype(float), _INK)], "time (s)"))
     # Translations on the left, rotations on the right.
     order = [0, 3, 1, 4, 2, 5, 6, 7]
     rows = [np.concatenate([charts[a], charts[b]], axis=1) for a, b in zip(order[::2], order[1::2], strict=True)]
-    return np.concatenate([_legend(track.status), *rows, draw_modes(model)])
+    return np.concatenate([_legend(track.status), *rows, draw_modes(model, labels)])
 
 
-def write_summary(path: Path, track: TimedHeadTrack, model: FaceModel | None, truth: np.ndarray | None) -> None:
+def write_summary(
+    path: Path, track: HeadRows, model: FaceModel | None, truth: np.ndarray | None, labels: Labels = DEFORMATION
+) -> None:
     """Write `draw_summary` as a PNG image.
 
     Raises:
         OutputError: the image cannot be written.
     """
-    if not cv2.imwrite(str(path), draw_summary(track, model, truth)):
+    if not cv2.imwrite(str(path), draw_summary(track, model, truth, labels)):
         raise OutputError(f"cannot write {path} (is the disk full?).")
 
 
@@ -78,7 +95,7 @@ def status_shades(times_s: np.ndarray, status: np.ndarray) -> list[Shade]:
     return [Shade(a, b, _tint(int(s))) for a, b, s in zip(edges[:-1], edges[1:], states, strict=True)]
 
 
-def draw_modes(model: FaceModel | None) -> np.ndarray:
+def draw_modes(model: FaceModel | None, labels: Labels = DEFORMATION) -> np.ndarray:
     """(rows, cols, 3) uint8: for each mode learnt the mean face and those beside it, from the front and the side."""
     sheet = np.full((_MODE_ROWS, _WIDTH, 3), 255, np.uint8)
     deviation = np.zeros(0) if model is None else np.asarray(model.deviation, float)
@@ -91,9 +108,9 @@ def draw_modes(model: FaceModel | None) -> np.ndarray:
     for cell, mode in enumerate(learnt):
         offset = DEVIATIONS * deviation[mode] * np.asarray(model.basis, float)[:, mode].reshape(-1, 3)
         picture = _draw_mode((_MODE_ROWS, width), np.asarray(model.mean, float), offset)
-        _text(picture, f"a{mode + 1}, sd {deviation[mode]:.1f} mm", (26, 52))
+        _text(picture, f"{labels.mode}{mode + 1}, sd {deviation[mode]:.1f} mm", (26, 52))
         sheet[:, cell * width : (cell + 1) * width] = picture
-    legend = f"deformation learnt: mean in grey, {DEVIATIONS:g} sd more in red, {DEVIATIONS:g} sd less in blue"
+    legend = f"{labels.modes}: mean in grey, {DEVIATIONS:g} sd more in red, {DEVIATIONS:g} sd less in blue"
     _text(sheet, legend, (_LEFT, 24))
     return sheet
 

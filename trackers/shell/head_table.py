@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
-from jaxfilters.trackers.head.state import DEFORMABLE, HEAD_STATUS, NUM_MODES, RIGID, HeadTrack
+from jaxfilters.trackers.head.state import DEFORMABLE, HEAD_STATUS, NUM_MODES, RIGID
 from jaxfilters.trackers.shell.results import TrackTable
 
 STATUS_WORDS = (*HEAD_STATUS, "skipped")
@@ -20,6 +20,26 @@ AXES = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
 AXIS_ORDER = [0, 1, 2, 3, 5, 4]
 """Where they are in a pose of the tracker."""
 _COLUMNS = (*AXES, *(f"sd_{axis}" for axis in AXES), *(f"a{i}_mm" for i in range(1, NUM_MODES + 1)), "score")
+
+
+@runtime_checkable
+class HeadRows(Protocol):
+    """What the tracks of all head trackers have on the host; arrays are frames first, as in `TimedHeadTrack`."""
+
+    @property
+    def times_s(self) -> np.ndarray: ...
+    @property
+    def pose(self) -> np.ndarray: ...
+    @property
+    def pose_std(self) -> np.ndarray: ...
+    @property
+    def deformation(self) -> np.ndarray: ...
+    @property
+    def image_points(self) -> np.ndarray: ...
+    @property
+    def score(self) -> np.ndarray: ...
+    @property
+    def status(self) -> np.ndarray: ...
 
 
 class TimedHeadTrack(NamedTuple):
@@ -55,27 +75,26 @@ def in_degrees(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([pose[..., :3], np.rad2deg(pose[..., 3:])], axis=-1)[..., AXIS_ORDER]
 
 
-def with_gaps(track: HeadTrack | None, times_s: np.ndarray, whole: Sequence[bool], num_cameras: int) -> TimedHeadTrack:
+def with_gaps(track: Any, times_s: np.ndarray, whole: Sequence[bool], table: TrackTable) -> Any:
     """The rows of all moments, in order: those of `track` where a moment is whole, else nothing and `SKIPPED`.
+
+    `track` has the fields of the table's rows but for the times, or is None where no moment is whole.
 
     Rows whose status says that nothing is tracked lose their numbers, so that none of them passes for a pose.
     """
-    rows = {
-        name: np.full_like(field, np.nan)
-        for name, field in _empty(num_cameras, len(whole))._asdict().items()
-        if name != "status"
-    }
+    none = table.empty(len(whole))
+    rows = {name: np.full_like(field, np.nan) for name, field in none._asdict().items() if name != "status"}
     status = np.full(len(whole), SKIPPED, np.int32)
     places = np.flatnonzero(whole)
     if track is not None and len(places):
         status[places] = np.asarray(track.status)
         tracked = np.isin(track.status, TRACKED)
-        for name in HeadTrack._fields[:-1]:
+        for name in none._fields[1:-1]:
             values = np.asarray(getattr(track, name), np.float32)
-            values = _with_all_modes(values) if name == "deformation" else values
+            values = _as_wide(values, rows[name]) if name == "deformation" else values
             says_why = name in ("score", "effective_sample_size")
             rows[name][places] = values if says_why else np.where(_beside(tracked, values), values, np.nan)
-    return TimedHeadTrack(**rows | {"times_s": times_s, "status": status})
+    return type(none)(**rows | {"times_s": times_s, "status": status})
 
 
 def longest_stretch(status: np.ndarray) -> slice:
@@ -97,9 +116,10 @@ def _numbers(track: TimedHeadTrack, i: int) -> np.ndarray:
     )
 
 
-def _with_all_modes(values: np.ndarray) -> np.ndarray:
-    """(b, NUM_MODES): zeros for modes that the face has not."""
-    return np.pad(values[:, :NUM_MODES], ((0, 0), (0, max(0, NUM_MODES - values.shape[1]))))
+def _as_wide(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """With as many columns as the table: zeros for modes that the face has not."""
+    modes = rows.shape[1]
+    return np.pad(values[:, :modes], ((0, 0), (0, max(0, modes - values.shape[1]))))
 
 
 def _beside(rows: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ def chunk(status, modes=2, cameras=2):
 def test_rows_are_in_degrees_with_pitch_before_yaw(tmp_path):
     writer = begin(tmp_path, {}, head_table(2))
     times_s = np.array([0.0, 1 / 30])
-    writer.append(times_s, with_gaps(chunk([1, 2]), times_s, [True, True], 2)[1:])
+    writer.append(times_s, with_gaps(chunk([1, 2]), times_s, [True, True], head_table(2))[1:])
     lines = (tmp_path / "track.csv").read_text().splitlines()
     assert lines[0] == COLUMNS
     row = next(csv.DictReader(lines))
@@ -47,7 +47,7 @@ def test_rows_are_in_degrees_with_pitch_before_yaw(tmp_path):
 
 def test_what_is_not_tracked_has_no_numbers(tmp_path):
     """A frozen pose must not pass for a tracked one; the score, which says why, stays."""
-    rows = with_gaps(chunk([0, 1, 3]), np.arange(5.0), [True, False, True, False, True], 2)
+    rows = with_gaps(chunk([0, 1, 3]), np.arange(5.0), [True, False, True, False, True], head_table(2))
     np.testing.assert_array_equal(rows.status, [0, SKIPPED, 1, SKIPPED, 3])
     np.testing.assert_array_equal(rows.times_s, np.arange(5))
     tracked = np.array([False, False, True, False, False])
@@ -57,14 +57,14 @@ def test_what_is_not_tracked_has_no_numbers(tmp_path):
         np.testing.assert_array_equal(np.isnan(values).all(axis=1), ~tracked)
     np.testing.assert_array_equal(rows.pose[2], np.float32([2, 2, 3, 0.1, 0.2, 0.3]))
     np.testing.assert_array_equal(rows.score, [0.75, np.nan, 0.75, np.nan, 0.75])
-    nothing = with_gaps(None, np.arange(2.0), [False, False], 1)
+    nothing = with_gaps(None, np.arange(2.0), [False, False], head_table(1))
     np.testing.assert_array_equal(nothing.status, [SKIPPED] * 2)
     assert nothing.image_points.shape == (2, 1, 10, 2)
 
 
 def test_faces_with_fewer_or_more_modes_fit():
     for modes in (0, 5, 7):
-        deformation = with_gaps(chunk([2], modes), np.zeros(1), [True], 2).deformation
+        deformation = with_gaps(chunk([2], modes), np.zeros(1), [True], head_table(2)).deformation
         np.testing.assert_array_equal(deformation, [[i + 1 if i < modes else 0 for i in range(5)]])
 
 

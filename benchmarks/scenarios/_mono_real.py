@@ -1,0 +1,136 @@
+"""Modelled people that turn and speak as recorded, and real video, before one camera."""
+
+import sys
+
+import jax
+import numpy as np
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, camera, follow_all
+from jaxfilters.benchmarks.scenarios.head_real import VIDEOS, detector_distances, longest, read_video
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.multilinear import MultilinearFace, learn
+from jaxfilters.models.face.rig import monocular
+from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
+from jaxfilters.models.synthetic.face_training import ict_shapes
+from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
+from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
+from jaxfilters.models.synthetic.ict_sequence import ict_sequence
+from jaxfilters.trackers.head_mono.session import MonoSession
+from jaxfilters.trackers.head_mono.state import MonoOptions
+from jaxfilters.trackers.shell.face_model_files import default_face_model
+from jaxfilters.trackers.shell.head_input import FOCAL_WIDTHS
+from jaxfilters.trackers.shell.head_table import TRACKED
+
+PEOPLE = ((0, 1), (1, 2), (2, 0), (3, 13), (4, 5), (5, 14), (6, 3), (7, 8))
+"""Random key of the person, and which stretch of recorded rotations."""
+NUM_FRAMES, QUICK_NUM_FRAMES, QUICK_VIDEO_FRAMES = 300, 64, 90
+RANGES = {"0_10": (0, 10), "10_20": (10, 20), "20_30": (20, 30), "30_40": (30, 40), "beyond_40": (40, 91)}
+"""Degrees of yaw to either side."""
+ROTATIONS = {"roll": 3, "yaw": 4, "pitch": 5}
+NUM_TRAINING, IDENTITIES, EXPRESSIONS = 200, 15, 8
+TRAINING_KEY, FIRST_PERSON = 2000, 100
+"""Of training people, and of those who are filmed: never the same."""
+PIECE = 48
+"""Frames that are handed over at once."""
+
+
+def modelled_face(seed: int) -> MultilinearFace:
+    """What people of the ICT face model differ in.
+
+    Raises:
+        RecordingError: if the model is not there.
+    """
+    model = read_ict(recording_folder("ict_face_model"))
+    shapes = ict_shapes(jax.random.key(TRAINING_KEY + seed), model, NUM_TRAINING, noise_mm=0.5)
+    return learn(shapes, identities=IDENTITIES, expressions=EXPRESSIONS)
+
+
+def cross_model(seed: int) -> dict[str, Contender]:
+    """The tracker with what modelled people differ in, for faces of the generator; nothing without that model."""
+    try:
+        return {"b_rendered_modelled": Contender(modelled_face(seed), MonoOptions())}
+    except RecordingError as error:
+        sys.stderr.write(f"  left out: {error}\n")
+        return {}
+
+
+def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
+    """Mean absolute errors of the rotation of modelled people, by axis and by yaw, with two models of faces.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
+    model = read_ict(recording_folder("ict_face_model"))
+    turns = read_biwi(recording_folder("biwi_head_rotation"))
+    speech = read_livelink(recording_folder("livelinkface_take"), model.names)
+    contenders = {"modelled": Contender(modelled_face(seed), MonoOptions())}
+    if not quick:
+        contenders["modelled_rendered"] = Contender(default_face_model().model, MonoOptions())
+    runs: dict[str, list[MonoRun]] = {name: [] for name in contenders}
+    num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
+    for person, stretch in PEOPLE[: 1 if quick else None]:
+        made = _filmed(model, turns[stretch], speech, person + seed, num_frames)
+        for name, one in follow_all(made, contenders, person + seed).items():
+            runs[name].append(one)
+            sys.stderr.write(f"  person {person}, {name}: {np.round(one.means, 1)}\n")
+    metrics: dict[str, Metric] = {}
+    for name, of_people in runs.items():
+        metrics |= _by_yaw(name, of_people)
+    return metrics
+
+
+def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
+    """How long the faces of the videos are followed, and how near to where they are detected.
+
+    Raises:
+        RecordingError: if the videos are missing.
+    """
+    folder = recording_folder("talking_face_video")
+    metrics: dict[str, Metric] = {}
+    for name, file in list(VIDEOS.items())[: 1 if quick else None]:
+        images, fps = read_video(folder / file, QUICK_VIDEO_FRAMES if quick else None)
+        rows, cols = images.shape[1:]
+        rig = monocular(Pinhole.from_intrinsics(FOCAL_WIDTHS * cols, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
+        session = MonoSession(rig, default_face_model().model, MonoOptions(seed=seed))
+        times = np.arange(len(images)) / fps
+        parts = [
+            session.process(images[i : i + PIECE, None], times[i : i + PIECE]) for i in range(0, len(images), PIECE)
+        ]
+        track = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        is_tracked = np.isin(track.status, TRACKED)
+        apart = detector_distances(images, track, round(fps))
+        for frame, what in session.events:
+            sys.stderr.write(f"  {name}, frame {frame}: {what}\n")
+        metrics |= {
+            f"{name}_longest_stretch_s": Metric(longest(is_tracked) / fps, "s", "higher"),
+            f"{name}_share_tracked": Metric(100 * float(is_tracked.mean()), "%", "higher"),
+            f"{name}_losses": Metric(float(sum(what.startswith("lost") for _, what in session.events)), "", "lower"),
+            f"{name}_detector_distance": Metric(float(np.median(apart)), "eyes' distances", "lower"),
+            f"{name}_detector_distance_worst": Metric(float(np.max(apart)), "eyes' distances", "lower"),
+        }
+    return metrics
+
+
+def _filmed(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int):
+    poses = biwi_course(turns, num_frames, place_mm=MONOCULAR_PLACE_MM)
+    expressions = livelink_course(speech, num_frames)
+    return ict_sequence(jax.random.key(FIRST_PERSON + person), model, poses, rig=camera(), expressions=expressions)
+
+
+def _by_yaw(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
+    """Over all frames in which the face is followed; ranges without one are left out."""
+    errors = np.concatenate([run.errors for run in runs])
+    yaw = np.abs(np.concatenate([run.yaw_deg for run in runs]))
+    is_tracked = np.concatenate([run.is_tracked for run in runs])
+    metrics = {f"{name}_lost_share": Metric(100 * float(np.mean(~is_tracked)), "%", "lower")}
+    for suffix, (low, high) in {"": (0, 91), **{f"_{key}": value for key, value in RANGES.items()}}.items():
+        rows = is_tracked & (yaw >= low) & (yaw < high)
+        if rows.any():
+            mean = np.mean(np.abs(errors[rows]), axis=0)
+            metrics |= {
+                f"{name}_mae_{axis}{suffix}": Metric(float(mean[i]), "deg", "lower") for axis, i in ROTATIONS.items()
+            }
+            metrics[f"{name}_mae_z{suffix}"] = Metric(float(mean[2]), "mm", "lower")
+    return metrics

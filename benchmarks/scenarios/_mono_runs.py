@@ -1,0 +1,126 @@
+"""Rendered heads before one camera, followed by several trackers at once."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.multilinear import MultilinearFace, learn
+from jaxfilters.models.face.rig import CameraRig, monocular
+from jaxfilters.models.synthetic.face import Identity
+from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, speech_schedule
+from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
+from jaxfilters.models.synthetic.face_training import generator_shapes
+from jaxfilters.models.synthetic.ict_sequence import IctSequence
+from jaxfilters.trackers.head_mono.detections import Detections
+from jaxfilters.trackers.head_mono.session import MonoSession
+from jaxfilters.trackers.head_mono.state import MonoOptions, MonoTrack
+from jaxfilters.trackers.shell.head_table import TRACKED
+
+DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
+"""From millimetres and radians to millimetres and degrees."""
+START_FRAMES, DETECTED_PX = (0, 6, 12, 18, 24), 0.5
+"""In which landmarks are detected, and the standard deviation of each coordinate (specification, section 4)."""
+BLOCK = 40
+"""Frames in memory at once."""
+TRAINING_KEY = 77
+
+
+class MonoRun(NamedTuple):
+    """What one tracker says of a sequence from the first frame on in which it follows the face."""
+
+    track: MonoTrack
+    errors: Float[np.ndarray, "t 6"]
+    """Of the pose, millimetres and degrees; NaN where there is none."""
+    landmark_mm: Float[np.ndarray, " t"]
+    """Mean distance of the landmarks from the true ones in head coordinates, both about their centroids."""
+    yaw_deg: Float[np.ndarray, " t"]
+    """True one."""
+
+    @property
+    def is_tracked(self) -> Bool[np.ndarray, " t"]:
+        """Whether the tracker follows the face."""
+        return np.isin(self.track.status, TRACKED)
+
+    @property
+    def means(self) -> Float[np.ndarray, " 6"]:
+        """Mean sizes of the errors; infinite if nothing is tracked."""
+        return np.mean(np.abs(self.errors[self.is_tracked]), axis=0) if self.is_tracked.any() else np.full(6, np.inf)
+
+    @property
+    def coverage(self) -> Float[np.ndarray, " 6"]:
+        """Share of the frames in which the true pose is within two of the claimed standard deviations."""
+        return np.mean(np.abs(self.errors) <= 2 * np.asarray(self.track.pose_std) * DISPLAY, axis=0)
+
+
+class Contender(NamedTuple):
+    """A tracker, and what it knows of faces."""
+
+    face: MultilinearFace
+    options: MonoOptions
+
+
+def camera() -> CameraRig:
+    """The one of the specification: 800 px, 640 x 480."""
+    return monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
+
+
+def talking_head(user: int, num_frames: int) -> FaceSequence:
+    """A person of the generator who moves and speaks; the same user number is the same person."""
+    poses = motion("mix", num_frames, user, place_mm=MONOCULAR_PLACE_MM)
+    return face_sequence(jax.random.key(user), poses, rig=camera(), expressions=speech_schedule(num_frames))
+
+
+def learnt_from(people: list[Identity], identities: int, seed: int) -> MultilinearFace:
+    """The model of the specification's training faces of some people."""
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *people)
+    key = jax.random.fold_in(jax.random.key(TRAINING_KEY), seed)
+    return learn(generator_shapes(key, together), identities=identities)
+
+
+def follow_all(made: FaceSequence | IctSequence, contenders: Mapping[str, Contender], seed: int) -> dict[str, MonoRun]:
+    """Runs of all trackers over one sequence, which is rendered once; they start from landmarks with noise."""
+    found = _detections(made, seed)
+    sessions = {
+        name: MonoSession(made.rig, one.face, one.options, detections=found) for name, one in contenders.items()
+    }
+    tracks: dict[str, list[MonoTrack]] = {name: [] for name in contenders}
+    for start, images in made.chunks(BLOCK):
+        for name, session in sessions.items():
+            tracks[name].append(session.process(images, made.times[start : start + len(images)]))
+    joined = {name: jax.tree.map(lambda *rows: np.concatenate(rows), *parts) for name, parts in tracks.items()}
+    return {name: judged(track, made) for name, track in joined.items()}
+
+
+def judged(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:
+    """A track beside the truth, without the frames up to the start."""
+    first = START_FRAMES[-1] + 1
+    track = jax.tree.map(lambda leaf: leaf[first:], track)
+    errors = (np.asarray(track.pose, float) - made.poses[first:]) * DISPLAY
+    errors[:, 3:] = (errors[:, 3:] + 180) % 360 - 180
+    centred = lambda shapes: shapes - shapes.mean(axis=1, keepdims=True)
+    apart = centred(np.asarray(track.shape, float)) - centred(made.shapes[first:])
+    return MonoRun(track, errors, np.linalg.norm(apart, axis=-1).mean(axis=1), np.degrees(made.poses[first:, 4]))
+
+
+def averaged(runs: list[MonoRun], of: Callable[[MonoRun], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and largest over users."""
+    values = np.stack([np.asarray(of(run), float) for run in runs])
+    return np.asarray(values.mean(axis=0)), np.asarray(values.max(axis=0))
+
+
+def eyes_apart_of(identity: Identity) -> float:
+    """Millimetres between the middles of the corners of either eye of a neutral face."""
+    corners = np.asarray(identity.neutral[:4], float)
+    return float(np.linalg.norm(corners[2:].mean(axis=0) - corners[:2].mean(axis=0)))
+
+
+def _detections(made: FaceSequence | IctSequence, seed: int) -> Detections:
+    frames = [i for i in START_FRAMES if i < len(made)]
+    noise = np.random.default_rng(seed).normal(0, DETECTED_PX, (len(frames), *made.uv.shape[2:]))
+    images = np.concatenate([made.frames(i, i + 1)[:, 0] for i in frames])
+    return Detections(made.uv[frames, 0] + noise, images, float(made.times[frames[-1]]))

@@ -1,0 +1,74 @@
+"""The scenario on heads before one camera: its arithmetic on made tracks, and a few rendered frames."""
+
+import numpy as np
+import pytest
+
+from jaxfilters.benchmarks.scenarios import _mono_runs, head_mono
+from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
+from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
+from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
+from jaxfilters.trackers.head_mono.state import MonoOptions, MonoTrack
+from jaxfilters.trackers.shell.face_model_files import default_face_model
+
+
+def made_run(errors, status, yaw=None):
+    b = len(errors)
+    nothing = {name: np.zeros((b, 1)) for name in MonoTrack._fields}
+    track = MonoTrack(**nothing | {"pose_std": np.full((b, 6), 1.0), "status": np.asarray(status)})
+    yaw = np.zeros(b) if yaw is None else yaw
+    return MonoRun(track, np.asarray(errors, float), np.arange(b, dtype=float), yaw)
+
+
+def test_errors_are_means_over_users_of_tracked_frames_beside_the_thesis():
+    """Two users: errors of 1 and 3 everywhere, and a lost frame that counts as a loss alone."""
+    one = made_run(np.concatenate([np.full((4, 6), -1.0), np.full((1, 6), np.nan)]), [2, 2, 2, 2, 3])
+    other = made_run(np.full((5, 6), 3.0), [2] * 5)
+    metrics = head_mono.errors_of("a", [one, other])
+    assert metrics["error_a_z"].value == pytest.approx(2.0)
+    assert metrics["error_a_z_worst"].value == pytest.approx(3.0)
+    assert metrics["ratio_to_thesis_a_z"].value == pytest.approx(2.0 / 9.56)
+    assert metrics["ratio_to_thesis_a_pitch"].value == pytest.approx(2.0 / 2.45)
+    assert metrics["ratio_to_thesis_a_yaw"].value == pytest.approx(2.0 / 2.33)
+    assert metrics["lost_share_a"].value == pytest.approx(10.0)
+    assert metrics["error_a_landmark"].value == pytest.approx((1.5 + 2.0) / 2)
+    # One millimetre or degree is within two deviations; in millimetres three are not.
+    assert metrics["coverage_a_x"].value == pytest.approx(100 * (0.8 + 0.0) / 2)
+
+
+def test_rotation_errors_go_by_yaw():
+    errors = np.zeros((3, 6))
+    errors[:, 4] = [1.0, 5.0, 9.0]
+    metrics = _by_yaw("m", [made_run(errors, [2, 2, 3], np.array([-5.0, 25.0, 25.0]))])
+    assert metrics["m_mae_yaw"].value == pytest.approx(3.0)
+    assert metrics["m_mae_yaw_20_30"].value == pytest.approx(5.0)
+    assert metrics["m_mae_yaw_0_10"].value == pytest.approx(1.0)
+    assert metrics["m_lost_share"].value == pytest.approx(100 / 3)
+    assert "m_mae_yaw_30_40" not in metrics
+
+
+def test_users_are_who_the_training_faces_say():
+    """The eleven without one are ten others; the first user is the person in the video."""
+    made = talking_head(head_mono.FIRST_USER, 2)
+    np.testing.assert_allclose(made.identity.neutral, head_mono.people_but(None)[0].neutral, rtol=1e-6)
+    others = head_mono.people_but(0)
+    assert len(others) == head_mono.NUM_KNOWN - 1
+    assert not any(np.allclose(made.identity.neutral, person.neutral) for person in others)
+    assert 45 < eyes_apart_of(made.identity) < 80
+
+
+def test_wider_turns_make_better_starts():
+    face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0)
+    metrics = start_metrics(face, 0, 6)
+    assert metrics["start_free_spread_2_pitch"].value < metrics["start_free_spread_0.1_pitch"].value
+    assert metrics["start_spread_1_reprojection"].value < 1.0
+
+
+@pytest.mark.slow
+def test_a_short_video_is_followed_by_several_trackers():
+    made = talking_head(3, 40)
+    face = default_face_model().model
+    runs = follow_all(made, {"usual": Contender(face, MonoOptions())}, 0)
+    assert runs["usual"].is_tracked.all()
+    assert len(runs["usual"].errors) == 40 - _mono_runs.START_FRAMES[-1] - 1
+    assert np.all(runs["usual"].means[3:] < 3.0)
+    assert runs["usual"].means[2] < 60.0

@@ -1,0 +1,128 @@
+"""Which frames are chosen, against exhaustive search and normal matrices written out (oracle 13)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Person, Prior, Views, projected
+from jaxfilters.models.face.frame_selection import by_angles, by_information, told
+from jaxfilters.models.face.multilinear import learn
+from jaxfilters.models.face.rig import monocular
+from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
+
+AGES, ALL = jnp.array([4, 3, 2, 1, 0]), jnp.ones(5, bool)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_angles_choose_as_exhaustive_search_does(x64, seed):
+    rng = np.random.default_rng(seed)
+    angles, new = rng.normal(0, 0.2, (5, 2)), rng.normal(0, 0.2, 2)
+    sets = [np.concatenate([np.delete(angles, i, axis=0), new[None]]) for i in range(5)]
+    spreads = [kept.var(axis=0).sum() for kept in sets]
+    place, spread = by_angles(jnp.asarray(angles), jnp.asarray(new), AGES, ALL)
+    assert place == int(np.argmax(spreads))
+    assert float(spread) == pytest.approx(max(spreads), rel=1e-12)
+
+
+def test_of_sets_that_are_as_good_the_oldest_frame_goes(x64):
+    same = jnp.zeros((5, 2))
+    assert by_angles(same, jnp.zeros(2), AGES, ALL)[0] == 0
+    assert by_angles(same, jnp.ones(2), jnp.array([0, 1, 2, 4, 3]), ALL)[0] == 3
+
+
+def test_a_frame_that_must_stay_stays(x64):
+    """The first is the farthest from the others' mean and would go."""
+    angles = jnp.array([[0.0, 0.0], [0.3, 0.0], [-0.3, 0.1], [0.2, -0.2], [-0.1, 0.2]])
+    new = jnp.array([0.6, 0.0])
+    free, _ = by_angles(angles, new, AGES, ALL)
+    held, _ = by_angles(angles, new, AGES, ALL.at[free].set(False))
+    assert held != free
+
+
+def random_information(rng, n, d=4, rank=2):
+    roots = rng.normal(0, 1, (n, d, rank))
+    return roots @ roots.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_information_chooses_as_exhaustive_search_does(x64, seed):
+    rng = np.random.default_rng(seed)
+    frames, prior = random_information(rng, 6), np.eye(4)
+    may_go = np.array([False, True, True, True, True])
+    gains = [
+        0.5
+        * (np.linalg.slogdet(prior + frames.sum(0) - frames[i])[1] - np.linalg.slogdet(prior + frames[:5].sum(0))[1])
+        for i in range(5)
+    ]
+    place, gain = by_information(*(jnp.asarray(a) for a in (frames[:5], frames[5], prior, may_go)))
+    assert place == 1 + int(np.argmax(gains[1:]))
+    assert float(gain) == pytest.approx(max(gains[1:]), rel=1e-9)
+
+
+def test_a_frame_that_tells_nothing_gains_nothing(x64):
+    frames = jnp.asarray(random_information(np.random.default_rng(0), 5))
+    _, gain = by_information(frames, jnp.zeros((4, 4)), jnp.eye(4), jnp.ones(5, bool))
+    assert gain < 0
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A frame of a face with landmarks to half a pixel; in double precision."""
+    with jax.enable_x64(True):
+        face = learn(generator_shapes(jax.random.key(1), people_of(jax.random.key(0), 11)))
+        rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
+        pose = jnp.array([[10.0, -5, 650, 0.05, 0.2, -0.1]])
+        frame = Bundle(pose, face.expression_mean[None], Person(face.identity_mean, jnp.zeros((10, 3))))
+        covariance = 0.25 * jnp.tile(jnp.eye(2), (1, 10, 1, 1))
+        view = Views(projected(face, rig, frame), covariance, jnp.ones((1, 10), bool))
+        return face, rig, view, frame
+
+
+def whole_jacobian(scene, offset_std):
+    """Of 20 whitened rows by pose, expression, identity and offset, by central differences."""
+    face, rig, _, frame = scene
+    units = np.concatenate([POSE_UNITS, face.expression_std, face.identity_std, np.full(30, offset_std)])
+
+    def pixels(y):
+        y = jnp.asarray(units * y)
+        who = Person(frame.person.identity + y[11:21], y[21:].reshape(10, 3))
+        return np.asarray(projected(face, rig, Bundle(frame.poses + y[:6], frame.expressions + y[6:11], who))).ravel()
+
+    h = 1e-4
+    columns = [(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(len(units))]
+    return np.stack(columns, axis=1) / 0.5, units
+
+
+def held(face):
+    """What holds the expression, in its standard deviations."""
+    std = np.asarray(face.expression_std)
+    inverse = std[:, None] * np.linalg.inv(np.asarray(face.expression_covariance)) * std
+    return 1e-6 * np.eye(11) + np.block([[np.zeros((6, 6)), np.zeros((6, 5))], [np.zeros((5, 6)), inverse]])
+
+
+def test_what_a_frame_tells_is_the_schur_complement(x64, scene):
+    face, rig, view, frame = scene
+    found = told(face, rig, view, frame, Prior(1.0, 0.8))
+    J, _ = whole_jacobian(scene, 0.8)
+    N = J.T @ J + np.pad(held(face), (0, 40))
+    own, cross = N[:11, :11], N[:11, 11:]
+    np.testing.assert_allclose(found.information, N[11:, 11:] - cross.T @ np.linalg.solve(own, cross), atol=2e-5)
+
+
+def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, scene):
+    face, rig, view, frame = scene
+    found = told(face, rig, view, frame, Prior(1.0, 0.8))
+    J, units = whole_jacobian(scene, 0.8)
+    own = J[:, :11].T @ J[:, :11] + held(face)
+    expected = -units[:11, None] * np.linalg.solve(own, J[:, :11].T @ J[:, 11:])
+    np.testing.assert_allclose(found.response, expected, atol=2e-5 * np.abs(expected).max())
+
+
+def test_hidden_landmarks_tell_less(x64, scene):
+    face, rig, view, frame = scene
+    some = view._replace(seen=view.seen.at[0, :4].set(False))
+    more, less = (told(face, rig, v, frame, Prior(1.0, 1.0)).information for v in (view, some))
+    assert np.linalg.eigvalsh(np.asarray(more - less)).min() > -1e-8
+    assert np.trace(more) > np.trace(less)

@@ -1,0 +1,1 @@
+"""Head pose, expression and identity from one camera, with a multilinear face model."""

@@ -1,0 +1,190 @@
+"""Which frames the face is adjusted to, and who it is after that."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.least_squares import cauchy, huber
+from jaxfilters.models.face.bundle import Bundle, Person, Prior, Views, adjust, eyes_apart, posed_shape, square
+from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.patches import patches_of
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.state import POSE
+from jaxfilters.trackers.head_mono.person import Modes, model_of
+from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, Window
+
+STEPS = (5, 5)
+"""Of both stages (specification, section 3)."""
+MOST_YAW, MOST_PITCH, LEAST_SCORE = np.radians(25.0), np.radians(20.0), 0.7
+"""Of a face that may be adjusted (specification, section 2.8)."""
+FURTHER = 1.6
+"""How much farther it may be turned where landmarks are aligned by patches that turn with it."""
+LEAST_GAIN = 0.02
+"""Nats about the person for which a frame is taken."""
+UNKNOWN = 1e-6
+"""Information, in standard deviations, of a person of whom nothing is known beforehand."""
+
+
+class Frame(NamedTuple):
+    """One frame that the face may be adjusted to."""
+
+    view: Views
+    pose: Float[Array, " 6"]
+    expression: Float[Array, " A"]
+    told: Told
+
+
+def frame_of(
+    face: MultilinearFace,
+    rig: CameraRig,
+    view: Views,
+    person: Person,
+    x: Float[Array, " n"],
+    modes: Modes,
+    prior: Prior,
+) -> Frame:
+    """The frame in which the face was estimated at `x`, and what it tells of the person."""
+    expression = modes.expression(face, x[POSE:])
+    here = Bundle(x[None, :POSE], expression[None], person)
+    return Frame(view, x[:POSE], expression, told(face, rig, view, here, prior))
+
+
+def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Person, prior: Prior) -> Window:
+    """The window with what its frames tell of the person."""
+
+    def one(inputs: tuple) -> Array:
+        view, pose, expression = inputs
+        alone = jax.tree.map(lambda leaf: leaf[None], view)
+        return told(face, rig, alone, Bundle(pose[None], expression[None], person), prior).information
+
+    # One by one: batches of factorisations can stand still on two cores.
+    information = jax.lax.map(one, (window.views, window.poses, window.expressions))
+    return window._replace(information=information)
+
+
+def uncertainty(
+    face: MultilinearFace, window: Window, response: Float[Array, "m d"], options: MonoOptions
+) -> Float[Array, "m m"]:
+    """Covariance of what responds to identity and offset, by what is not known of them."""
+    total = _known(face, options) + jnp.sum(window.information, axis=0)
+    root = jnp.linalg.cholesky(total)
+    part = jax.scipy.linalg.solve_triangular(root, response.T, lower=True)
+    return jnp.matmul(part.T, part, precision="highest")
+
+
+def choose(
+    face: MultilinearFace, window: Window, frame: Frame, options: MonoOptions
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Which frame of the window the new one replaces, and whether it does."""
+    may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
+    if options.selection == "information":
+        place, gain = by_information(window.information, frame.told.information, _known(face, options), may_go)
+        return place, gain > LEAST_GAIN
+    if options.selection == "angles":
+        place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
+        return place, jnp.ones((), bool)
+    return jnp.argmax(jnp.where(may_go, window.ages, -1)), jnp.ones((), bool)
+
+
+def adjusted(
+    face: MultilinearFace,
+    rig: CameraRig,
+    state: MonoState,
+    frame: Frame,
+    place: Int[Array, ""],
+    options: MonoOptions,
+) -> MonoState:
+    """The state after an adjustment to the window with a new frame; not finite if that came to nothing."""
+    window = _with(state.window, frame, place)
+    start = state.person
+    if options.is_published:
+        start = start._replace(identity=_average(state))
+    losses = (square, square) if options.is_published else (huber, cauchy)
+    bundle, info = adjust(
+        face, rig, window.views, window.bundle(start), options.prior, options.reach, steps=STEPS, losses=losses
+    )
+    window = window._replace(poses=bundle.poses, expressions=bundle.expressions)
+    person = bundle.person._replace(identity=jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan))
+    state = state._replace(
+        window=informed(face, rig, window, person, options.prior),
+        identities=jnp.concatenate([person.identity[None], state.identities[:-1]]),
+        num_adjusted=state.num_adjusted + 1,
+    )
+    if options.is_published:
+        person = person._replace(identity=_average(state))
+    model, modes = model_of(face, person, state.registered.templates)
+    x = jnp.concatenate([bundle.poses[place], modes.coefficients(face, bundle.expressions[place])])
+    state = _at(state._replace(person=person, modes=modes), x, model)
+    return state if options.is_published else _registered_anew(face, rig, state, bundle)
+
+
+def _at(state: MonoState, x: Array, model) -> MonoState:
+    """Particles and belief moved to the adjusted pose and expression, in the modes of the adjusted face.
+
+    Particles go by the correction of the estimate. Their velocity stays: that a face turns out larger is no motion.
+    """
+    product = lambda a, b: jnp.matmul(a, b, precision="highest")
+    turning = jax.scipy.linalg.block_diag(jnp.eye(POSE, dtype=x.dtype), product(model.basis.T, state.model.basis))
+    covariance = product(product(turning, state.belief.covariance), turning.T)
+    turned = product(turning, state.search.particles)
+    moved = turned + (x - product(turning, state.belief.mean))[:, None]
+    search = state.search._replace(particles=moved, estimate=x)
+    return state._replace(model=model, belief=Gaussian(x, covariance), search=search)
+
+
+def _registered_anew(face: MultilinearFace, rig: CameraRig, state: MonoState, bundle: Bundle) -> MonoState:
+    """The patches of the first frame, on the skin of the adjusted face."""
+    old = state.registered
+    pose, expression = bundle.poses[0], bundle.expressions[0]
+    shape = posed_shape(face, bundle.person, expression)
+    seen = patches_of(old.wide, shape, pose, rig, old.patches.normals)
+    return state._replace(registered=old._replace(patches=seen))
+
+
+def _with(window: Window, frame: Frame, place: Array) -> Window:
+    put = lambda old, new: old.at[place].set(new)
+    views = jax.tree.map(lambda old, new: put(old, new[0]), window.views, frame.view)
+    return Window(
+        views,
+        put(window.poses, frame.pose),
+        put(window.expressions, frame.expression),
+        put(window.ages, jnp.zeros((), window.ages.dtype)),
+        put(window.information, frame.told.information),
+    )
+
+
+def _average(state: MonoState) -> Array:
+    """Mean of the last identities ([4.36])."""
+    used = jnp.arange(len(state.identities)) < state.num_adjusted
+    return jnp.sum(jnp.where(used[:, None], state.identities, 0.0), axis=0) / jnp.sum(used)
+
+
+def _known(face: MultilinearFace, options: MonoOptions) -> Array:
+    """Information about identity and offset beforehand, in standard deviations."""
+    std = face.identity_std
+    identity = options.prior_weight**2 * std[:, None] * jnp.linalg.inv(face.identity_covariance) * std
+    if not options.prior_weight:
+        # The box of two deviations to either side is all that is known: as much as its variance of 4 / 3.
+        identity = 0.75 * jnp.eye(std.size, dtype=std.dtype)
+    offset = jnp.eye(3 * face.num_landmarks, dtype=std.dtype) * (options.offset_std > 0)
+    both = jax.scipy.linalg.block_diag(identity, offset) + _of_eyes(face, options)
+    return both + UNKNOWN * jnp.eye(len(both), dtype=std.dtype)
+
+
+def _of_eyes(face: MultilinearFace, options: MonoOptions) -> Array | float:
+    """What the distance between the eyes tells of the person, where it is known."""
+    if not options.prior.eyes_apart_std:
+        return 0.0
+
+    def apart(y: Array) -> Array:
+        identity = face.identity_mean + face.identity_std * y[: face.num_identities]
+        offset = options.offset_std * y[face.num_identities :].reshape(face.mean.shape)
+        return eyes_apart(face, Person(identity, offset))
+
+    slope = jax.grad(apart)(jnp.zeros(face.num_identities + face.mean.size)) / options.prior.eyes_apart_std
+    return slope[:, None] * slope

@@ -1,0 +1,169 @@
+"""What one image says of pose and expression of a person who is known so far, and where it shows the landmarks."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters import weights
+from jaxfilters.adaptive import AdaptiveState
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.face.alignment import Alignment, align, relocated
+from jaxfilters.models.face.bundle import Views
+from jaxfilters.models.face.patches import Slopes, learn_slopes
+from jaxfilters.models.face.point_recalculation import point_windows, recalculate_points
+from jaxfilters.models.face.refinement import LEAST_SCORE, PIXEL_FLOOR, refine
+from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+from jaxfilters.models.face.shape_model import shape
+from jaxfilters.trackers.head import recent
+from jaxfilters.trackers.head.estimate import FEWEST_SEEN, LOOSENESS, MEMORY, MISFIT, UNLEARNT_STD
+from jaxfilters.trackers.head.search import KAPPA
+from jaxfilters.trackers.head.state import POSE, Recent
+from jaxfilters.trackers.head_mono.state import MonoState
+
+RECALCULATED_PX = 1.0
+"""Standard deviation of a recalculated landmark."""
+
+
+class Estimate(NamedTuple):
+    """What one frame says."""
+
+    belief: Gaussian
+    """Of pose and mode coefficients, if the person is as believed."""
+    view: Views
+    """The landmarks in this one frame."""
+    is_found: Bool[Array, ""]
+    num_anchored: Float[Array, ""]
+    """Landmarks that look as registered, and are where the model has them."""
+    recent: Recent
+    windows: Float[Array, "1 K T T"]
+    """Grey levels about the landmarks."""
+    slopes: Slopes
+    looseness: Float[Array, " K"]
+    misfit: Float[Array, ""]
+
+
+def aligned(
+    search: AdaptiveState,
+    state: MonoState,
+    images: Float[Array, "1 rows cols"],
+    rig: CameraRig,
+    moved: Float[Array, " 6"],
+) -> Estimate:
+    """The best fit of the person's face to aligned landmarks near the particles' mode.
+
+    Args:
+        search: After this frame's update.
+        state: Before this frame.
+        images: Grey levels.
+        rig: One camera.
+        moved: What the head was predicted to move since the last estimate, millimetres and radians.
+    """
+    prior = _prior(search, state, moved)
+    loose = state.looseness[:, None, None] * jnp.eye(3)
+    x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
+    found, _, _ = _aligned(align, state, images, rig, x)
+    x = refine(prior, found, state.slopes, state.model, loose, rig, x).belief.mean
+    found, anchored, is_followed = _aligned(_anywhere, state, images, rig, x)
+    fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
+    M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
+    sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
+    drift = recent.drifted(state.recent, is_followed)
+    seen = recent.as_seen(found, anchored, M, pose, images, rig, drift)
+    by_shape = jnp.where(found.seen[..., None, None], jacobian(rig, M, pose)[0], 0.0)
+    by_slope = jnp.einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
+    spread = jnp.einsum("ckix,k,ckjx->ckij", by_shape, state.looseness, by_shape)
+    covariance = found.covariance + by_slope + spread + PIXEL_FLOOR**2 * jnp.eye(2)
+    return Estimate(
+        fit.belief,
+        # What is followed from the last frame is some other point of the skin, and says nothing of the person.
+        Views(found.uv, covariance, found.seen & (found.score > LEAST_SCORE) & ~is_followed),
+        sound & (fit.num_seen >= FEWEST_SEEN),
+        jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
+        seen,
+        state.windows,
+        learn_slopes(state.slopes, found.slope_information, found.slope_score),
+        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * fit.excess, *LOOSENESS),
+        jnp.clip(state.misfit * (1 + (1 - MEMORY) * fit.misfit_share * (fit.misfit - 1)), *MISFIT),
+    )
+
+
+def recalculated(
+    search: AdaptiveState,
+    state: MonoState,
+    images: Float[Array, "1 rows cols"],
+    rig: CameraRig,
+    moved: Float[Array, " 6"],
+) -> Estimate:
+    """The particles' estimate, with landmarks recalculated from grey levels; arguments are those of `aligned`."""
+    rough = projected(search, state, images, rig, moved)
+    m, templates = rough.view.uv[0], state.registered.templates[0]
+    previous = jnp.where(state.is_fresh, state.windows[0], templates)
+    uv, info = recalculate_points(m, m, images[0], previous, templates)
+    windows = point_windows(images[0], uv, size=templates.shape[-1])[None]
+    # A window beyond the border leaves the point where it was: that is no measurement.
+    seen = rough.view.seen & jnp.isfinite(info.residual)
+    return rough._replace(view=rough.view._replace(uv=uv[None], seen=seen), windows=windows)
+
+
+def projected(
+    search: AdaptiveState,
+    state: MonoState,
+    images: Float[Array, "1 rows cols"],
+    rig: CameraRig,
+    moved: Float[Array, " 6"],
+) -> Estimate:
+    """The particles' estimate and its own projections for landmarks; arguments are those of `aligned`."""
+    del images, moved
+    belief = around_mode(search)
+    x = belief.mean
+    uv, in_front = project_shape(rig, shape(state.model, x[POSE:]), x[:POSE])
+    covariance = RECALCULATED_PX**2 * jnp.tile(jnp.eye(2, dtype=uv.dtype), (*uv.shape[:2], 1, 1))
+    view = Views(jnp.where(in_front[..., None], uv, 0.0), covariance, in_front)
+    every = jnp.full((), float(uv.shape[1]), x.dtype)
+    return Estimate(
+        belief,
+        view,
+        jnp.all(jnp.isfinite(x)),
+        every,
+        state.recent,
+        state.windows,
+        state.slopes,
+        state.looseness,
+        state.misfit,
+    )
+
+
+def around_mode(search: AdaptiveState) -> Gaussian:
+    """The mean around the particles' mode, with the spread of the particles."""
+    x = search.estimate
+    apart = jnp.where(jnp.isfinite(search.log_weights), search.particles - x[:, None], 0.0)
+    return Gaussian(x, jnp.matmul(apart * weights.linear(search.log_weights), apart.T, precision="highest"))
+
+
+def _anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
+    found = align(patches, slopes, images, uv, M, pose, rig)
+    return relocated(patches, slopes, images, found, uv, M, pose, rig)
+
+
+def _aligned(way, state: MonoState, images: Array, rig: CameraRig, x: Array) -> tuple[Alignment, Array, Array]:
+    """Landmarks in the image, which of them look as registered, and which are followed from the last frame."""
+    M = shape(state.model, x[POSE:])
+    uv, _ = project_shape(rig, M, x[:POSE])
+    found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
+    anchored = recent.is_anchored(found)
+    found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
+    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
+    return found._replace(covariance=state.misfit * found.covariance + drift), anchored, is_followed
+
+
+def _prior(search: AdaptiveState, state: MonoState, moved: Array) -> Gaussian:
+    """Of this frame before its image: the last belief, moved on, and no expression too strong."""
+    before, deviation = state.belief, state.model.deviation
+    pose_covariance = before.covariance[:POSE, :POSE] + jnp.diag(jnp.square(search.spread[:POSE]))
+    usual = jnp.square(jnp.where(deviation > 0, deviation, UNLEARNT_STD))
+    walked = jnp.maximum(jnp.diagonal(before.covariance)[POSE:], 0.0) + KAPPA**2 * usual
+    variance = 1 / (1 / walked + 1 / usual)
+    mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])
+    covariance = jnp.zeros_like(before.covariance).at[:POSE, :POSE].set(pose_covariance)
+    return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))

@@ -1,0 +1,213 @@
+"""The one-camera head tracker from the first image on: waiting for a face, following it, finding it again."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxfilters.models.face.bundle import Person
+from jaxfilters.models.face.landmarks import NUM_LANDMARKS
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.trackers.head.following import Beginning, Following
+from jaxfilters.trackers.head.state import INITIALISING, POSE
+from jaxfilters.trackers.head_mono.detections import Collector, Detections, check_points
+from jaxfilters.trackers.head_mono.start import Start, begin, initialise, search_of, with_person
+from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
+from jaxfilters.trackers.head_mono.track import System, advance
+
+MOST_REPROJECTION = 0.05
+"""Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
+DEPTH_MM = (100.0, 5000.0)
+"""In which a face may be."""
+SAME_PERSON = 2.0
+"""Mahalanobis distance between two identities, in the covariance of people, up to which they are taken for one person.
+
+Of 30 people of the general model, with landmarks to 1 px, starts of the same person were .7 to 2.0 apart, of strangers
+2.0 to 4.3 (5 % and 95 %); the specification's 3 (section 1) takes half of all strangers for the same.
+"""
+_begun = jax.jit(begin, static_argnames="options")
+
+
+class _Found:
+    """What a track begins with."""
+
+    def __init__(self, detections: Detections, start: Start) -> None:
+        self.detections, self.start = detections, start
+        turned = np.abs(np.asarray(start.bundle.poses[:, 4:])).sum(axis=1)
+        self.frame = int(turned.argmin())
+        """The one most turned to the camera."""
+
+
+class MonoSession:
+    """Tracks one head through frames of one camera that are handed over in pieces."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        face: MultilinearFace,
+        options: MonoOptions | None = None,
+        points: Float[np.ndarray, "K 2"] | None = None,
+        *,
+        detections: Detections | None = None,
+    ) -> None:
+        """A session before its first frame.
+
+        Args:
+            rig: One camera.
+            face: Model of ten landmarks.
+            options: Constants.
+            points: The ten landmarks in the first image, pixels, (u, v); detected in several images where not given.
+            detections: Landmarks that were found otherwise in several images, the last of which is still to come.
+
+        Raises:
+            ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks, or
+                `points` are not ten finite pixels.
+        """
+        if rig.num_cameras != 1:
+            raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
+        if np.any(np.asarray(rig.rotation[0]) != np.eye(3)) or np.any(np.asarray(rig.translation[0]) != 0):
+            raise ValueError("rig must have its camera at the origin, without a rotation: its frame is the world.")
+        if face.num_landmarks != NUM_LANDMARKS:
+            raise ValueError(f"face must have {NUM_LANDMARKS} landmarks; got {face.num_landmarks}.")
+        check_points(points)
+        self._tracker = _MonoTracker(rig, face, options or MonoOptions(), points, detections)
+        self._following = Following(self._tracker)
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """(frame index, what happened), in order."""
+        return self._following.events
+
+    @property
+    def model(self) -> FaceModel | None:
+        """The person's face as adjusted so far; `None` before there was one."""
+        return None if self._following.state is None else self._following.state.model
+
+    @property
+    def person(self) -> Person | None:
+        """Who it is, as adjusted so far; `None` before there was a face."""
+        return None if self._following.state is None else self._following.state.person
+
+    def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
+        """Track of the next frames, a row each.
+
+        Args:
+            images: Grey, without lens distortion.
+            times: Seconds, growing.
+
+        Raises:
+            ValueError: if images or times do not fit the rig and each other.
+        """
+        return self._following.process(images, times)
+
+
+class _MonoTracker:
+    """What `Following` asks of a tracker."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        face: MultilinearFace,
+        options: MonoOptions,
+        points: np.ndarray | None,
+        detections: Detections | None,
+    ) -> None:
+        self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self._face, self._options, self._points, self._detections = face, options, points, detections
+        # What is compiled knows its options, but need not be compiled anew for another seed.
+        self._compiled = replace(options, seed=0)
+        self._system = System(face, rig, search_of(rig, options))
+        self._collector = Collector()
+
+    def search(self, images: np.ndarray, time: float) -> tuple[_Found | None, list[str]]:
+        collector = self._collector
+        if self._points is not None:
+            points, self._points = self._points, None
+            return self._checked(collector.given(points, images[0], time))
+        if self._detections is not None:
+            if time < self._detections.time:
+                return None, []
+            detections, self._detections = self._detections, None
+            return self._checked(detections)
+        gathered = collector.update(images[0], time)
+        wrong = [collector.reason] if collector.reason else []
+        if collector.several:
+            wrong.append(f"{collector.several} faces; the largest is taken")
+        if gathered is None:
+            return None, wrong
+        found, more = self._checked(gathered)
+        return found, wrong + more
+
+    def forget(self) -> None:
+        # Not cleared: a search beside the tracking may be at work with the old one.
+        self._collector = Collector()
+
+    def begin(self, found: _Found, old: MonoState | None, frame: int) -> Beginning:
+        key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
+        start, detections, what = found.start, found.detections, "registered"
+        if old is not None and self._is_same(start.bundle.person, old.person):
+            start, what = self._known(start, detections, old.person), "registered, a face that is known"
+        images, points = detections.images[[found.frame, -1]], jnp.asarray(detections.points, float)
+        std_px = jnp.asarray(detections.std_px, points.dtype)
+        zero = jnp.zeros((), points.dtype)
+        state = _begun(
+            key,
+            self._face,
+            self.rig,
+            start,
+            points,
+            jnp.asarray(found.frame),
+            images,
+            zero,
+            options=self._compiled,
+            detected_px=std_px,
+        )
+        return Beginning(state, detections.time, what)
+
+    def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
+        return advance(self._system, state, images, clock, is_frame, self._compiled)
+
+    def empty(self, count: int) -> MonoTrack:
+        nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)
+        return MonoTrack(
+            pose=nothing(POSE),
+            pose_std=nothing(POSE),
+            deformation=nothing(self._face.num_expressions),
+            shape=nothing(NUM_LANDMARKS, 3),
+            image_points=nothing(1, NUM_LANDMARKS, 2),
+            score=nothing(),
+            effective_sample_size=np.zeros(count, np.float32),
+            identity=nothing(self._face.num_identities),
+            offset=nothing(NUM_LANDMARKS, 3),
+            is_adjusted=np.zeros(count, bool),
+            status=np.full(count, INITIALISING, np.int32),
+        )
+
+    def _checked(self, detections: Detections) -> tuple[_Found | None, list[str]]:
+        """A start, if the landmarks are those of a face before the camera."""
+        points = jnp.asarray(detections.points, float)
+        start = initialise(self._face, self.rig, points, self._options.prior, detected_px=detections.std_px)
+        eyes = detections.points[:, :4].reshape(-1, 2, 2, 2).mean(axis=2)
+        apart = float(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=-1).mean())
+        error, depth = float(start.adjustment.reprojection_px), np.asarray(start.bundle.poses[:, 2])
+        if not math.isfinite(float(start.adjustment.energy)):
+            return None, ["the face cannot be fitted: the model's covariances are singular, or the prior's scale is"]
+        if not math.isfinite(error) or error > MOST_REPROJECTION * apart:
+            return None, [f"the points are no face's: the best one is {error:.1f} px from them"]
+        if depth.min() < DEPTH_MM[0] or depth.max() > DEPTH_MM[1]:
+            return None, [f"the face would be {depth.mean():.0f} mm away"]
+        return _Found(detections, start), []
+
+    def _known(self, start: Start, detections: Detections, person: Person) -> Start:
+        points = jnp.asarray(detections.points, float)
+        return with_person(self._face, self.rig, points, start, person, self._options.prior)
+
+    def _is_same(self, one: Person, other: Person) -> bool:
+        apart = np.asarray(one.identity - other.identity, float)
+        covariance = np.asarray(self._face.identity_covariance, float)
+        return bool(apart @ np.linalg.solve(covariance, apart) < SAME_PERSON**2)

@@ -1,0 +1,238 @@
+"""The start of a track: landmarks that were detected in a few frames become a person, and where the head was."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Num
+
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.face.bundle import (
+    Adjustment,
+    Bundle,
+    Person,
+    Prior,
+    Reach,
+    Views,
+    adjust,
+    posed_shape,
+    projected,
+)
+from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.patches import SIZE, SKIN_NORMALS, WIDE_SIZE, patches_of, unknown_slopes, windows
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.recent import nothing_changed
+from jaxfilters.trackers.head.search import Searches, searches
+from jaxfilters.trackers.head.search import start as start_search
+from jaxfilters.trackers.head.state import POSE, HeadOptions
+from jaxfilters.trackers.head_mono.adjustment import informed
+from jaxfilters.trackers.head_mono.person import model_of
+from jaxfilters.trackers.head_mono.state import AVERAGED, MonoOptions, MonoState, Registered, Window
+from jaxfilters.typing import AnyKey
+
+STEPS = (10, 10)
+"""Of both stages of the first adjustment (specification, section 3)."""
+MOST_TURNED = np.radians(60.0)
+WIDE = Reach(pose=np.array([300.0, 300.0, 400.0, *[MOST_TURNED] * 3]), expression=4.0, identity=4.0, deviations=2.0)
+"""Of the first adjustment."""
+DETECTED_PX = 1.0
+"""Standard deviation of a detected landmark."""
+ANCHORED_PX = 0.1
+"""Of a landmark in the frame whose picture defines it."""
+MOST_UNEVEN = np.radians(6.0)
+"""Standard deviation of the directions of left-right pairs from which on a detection is a mistake (section 1)."""
+PUBLISHED_SIGMA = 1.0
+"""Of the sum of the scores ([4.41])."""
+FIRST_LOOSENESS = 0.5**2
+"""mm^2."""
+FIRST_STD = np.array([1.0, 1.0, 3.0, 0.02, 0.05, 0.05])
+"""Of the pose at the start, millimetres and radians, if the person is as believed."""
+_PAIRS = np.array([(EYES[0], EYES[3]), (EYES[1], EYES[2]), MOUTH, NOSTRILS, BROWS])
+
+
+class Start(NamedTuple):
+    """What several frames of detected landmarks say."""
+
+    bundle: Bundle
+    adjustment: Adjustment
+    uv: Float[Array, "n K 2"]
+    """The landmarks as adjusted, pixels."""
+
+
+def is_symmetric(points: Float[np.ndarray, "K 2"], most: float = MOST_UNEVEN) -> bool:
+    """Whether the segments between left and right landmarks have about one direction (specification, section 1)."""
+    right, left = points[_PAIRS[:, 0]], points[_PAIRS[:, 1]]
+    across = left - right
+    return bool(np.std(np.arctan2(across[:, 1], across[:, 0])) <= most)
+
+
+def initialise(
+    face: MultilinearFace,
+    rig: CameraRig,
+    points: Float[Array, "n K 2"],
+    prior: Prior,
+    *,
+    detected_px: float = DETECTED_PX,
+) -> Start:
+    """Person and poses from detected landmarks, from heads that look into the camera on the ray of their middle.
+
+    Args:
+        face: Model.
+        rig: One camera, which is the world.
+        points: Landmarks in n frames, pixels.
+        prior: What holds the face.
+        detected_px: Standard deviation of each coordinate of the points.
+    """
+    n = len(points)
+    person = Person(face.identity_mean, jnp.zeros_like(face.mean))
+    expressions = jnp.tile(face.expression_mean, (n, 1))
+    mean = posed_shape(face, person, face.expression_mean)
+    poses = jax.vmap(lambda uv: _facing(rig, mean, uv))(points)
+    return _fitted(face, rig, points, Bundle(poses, expressions, person), prior, WIDE, detected_px)
+
+
+def with_person(
+    face: MultilinearFace, rig: CameraRig, points: Float[Array, "n K 2"], start: Start, person: Person, prior: Prior
+) -> Start:
+    """The start with a person who is known: poses and expressions anew, and what the offset makes of it.
+
+    Heads begin as much farther away as that face is larger. Arguments are those of `initialise`.
+    """
+    size = lambda who: jnp.sqrt(jnp.sum(jnp.square(posed_shape(face, who, face.expression_mean))))
+    poses = start.bundle.poses.at[:, :3].multiply(size(person) / size(start.bundle.person))
+    known = WIDE._replace(identity=0.0)
+    return _fitted(face, rig, points, Bundle(poses, start.bundle.expressions, person), prior, known, DETECTED_PX)
+
+
+def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
+    numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, points.dtype), tree)
+    return _adjusted(face, rig, points, bundle, numbers(prior), numbers(reach), numbers(detected_px))
+
+
+@jax.jit
+def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
+    covariance = detected_px**2 * jnp.tile(jnp.eye(2), (*points.shape[:2], 1, 1))
+    views = Views(points, covariance, jnp.ones(points.shape[:2], bool))
+    found, info = adjust(face, rig, views, bundle, prior, reach, steps=STEPS)
+    return Start(found, info, projected(face, rig, found))
+
+
+def begin(
+    key: AnyKey,
+    face: MultilinearFace,
+    rig: CameraRig,
+    start: Start,
+    points: Float[Array, "n K 2"],
+    frame: Int[ArrayLike, ""],
+    images: Num[Array, "2 rows cols"],
+    time: Float[Array, ""],
+    options: MonoOptions,
+    detected_px: Float[ArrayLike, ""] = DETECTED_PX,
+) -> MonoState:
+    """State in the last frame of the start, with templates from one of its frames.
+
+    Args:
+        key: Random key; it lives in the state from here on.
+        face: Model.
+        rig: One camera.
+        start: From `initialise`.
+        points: That it was made from, pixels.
+        frame: Which of its frames the templates are taken from: the one most turned to the camera.
+        images: That frame, and the last one.
+        time: Of the last frame, seconds.
+        options: Constants.
+        detected_px: Standard deviation of each coordinate of the points.
+    """
+    bundle, uv = start.bundle, start.uv[frame]
+    person, pose, expression = bundle.person, bundle.poses[frame], bundle.expressions[frame]
+    first, last = jnp.asarray(images, pose.dtype)[:, None]
+    wide = windows(first, uv[None])
+    border = (WIDE_SIZE - SIZE) // 2
+    templates = wide[..., border:-border, border:-border]
+    model, modes = model_of(face, person, templates)
+    shape = posed_shape(face, person, expression)
+    seen = patches_of(wide, shape, pose, rig, jnp.asarray(SKIN_NORMALS, pose.dtype))
+    here, expressed = bundle.poses[-1], bundle.expressions[-1]
+    x = jnp.concatenate([here, modes.coefficients(face, expressed)])
+    variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
+    window = _first_window(bundle, points, uv, frame, options, detected_px)
+    window = informed(face, rig, window, person, options.prior)
+    size = window.information.shape[-1]
+    return MonoState(
+        search=start_search(x, search_options(options)),
+        belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
+        person=person,
+        model=model,
+        modes=modes,
+        response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
+        registered=Registered(wide, templates, seen),
+        window=window,
+        identities=jnp.tile(person.identity, (AVERAGED, 1)),
+        num_adjusted=jnp.ones((), jnp.int32),
+        recent=nothing_changed(last, posed_shape(face, person, expressed), here, rig),
+        windows=templates,
+        is_fresh=jnp.zeros((), bool),
+        slopes=unknown_slopes(len(shape)),
+        looseness=jnp.full(len(shape), FIRST_LOOSENESS, x.dtype),
+        misfit=jnp.ones((), x.dtype),
+        last_good=x,
+        misses=jnp.zeros((), jnp.int32),
+        strange=jnp.zeros((), jnp.int32),
+        time=jnp.asarray(time, x.dtype),
+        key=key,
+    )
+
+
+def search_options(options: MonoOptions) -> HeadOptions:
+    """Of the particle filter, which is that of the tracker with several cameras."""
+    return HeadOptions(num_particles=options.num_particles)
+
+
+def search_of(rig: CameraRig, options: MonoOptions) -> Searches:
+    """The particle filters for a camera; for the published tracker with its standard deviation of the scores."""
+    usual = searches(rig, search_options(options))
+    if not options.is_published:
+        return usual
+
+    def sharper(filter: Filter) -> Filter:
+        likelihood = replace(filter.params.log_likelihood, sigma=PUBLISHED_SIGMA)
+        return replace(filter, params=replace(filter.params, log_likelihood=likelihood))
+
+    return Searches(*map(sharper, usual))
+
+
+def _first_window(
+    bundle: Bundle, points: Array, uv: Array, frame: Int[ArrayLike, ""], options: MonoOptions, detected_px: ArrayLike
+) -> Window:
+    """The frames of the start; that of the templates comes first, where they are exact by definition."""
+    n, K, _ = points.shape
+    order = jnp.arange(n).at[0].set(frame).at[frame].set(0)
+    covariance = jnp.square(detected_px) * jnp.tile(jnp.eye(2), (n, K, 1, 1))
+    points = points[order]
+    if not options.is_published:
+        points = points.at[0].set(uv)
+        covariance = covariance.at[0].set(ANCHORED_PX**2 * jnp.eye(2))
+    views = Views(points, covariance, jnp.ones((n, K), bool))
+    size = bundle.person.identity.size + bundle.person.offset.size
+    return Window(
+        views,
+        bundle.poses[order],
+        bundle.expressions[order],
+        jnp.arange(n)[::-1][order],
+        jnp.zeros((n, size, size)),
+    )
+
+
+def _facing(rig: CameraRig, shape: Array, uv: Array) -> Array:
+    """The pose of a head that looks into the camera where its landmarks are on average, as large as they spread."""
+    rays = (uv - rig.center[0]) / rig.focal[0]
+    middle = jnp.mean(rays, axis=0)
+    spread = lambda points: jnp.sqrt(jnp.sum(jnp.square(points - jnp.mean(points, axis=0))))
+    z = spread(shape[:, :2]) / spread(rays)
+    in_camera = z * jnp.append(middle, 1.0) - jnp.mean(shape, axis=0)
+    return jnp.concatenate([in_camera, jnp.zeros(3, in_camera.dtype)])

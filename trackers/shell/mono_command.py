@@ -1,0 +1,82 @@
+"""`jaxfilters track head-mono`."""
+
+import argparse
+import dataclasses
+from functools import partial
+
+import numpy as np
+
+from jaxfilters.models.face.bundle import eyes_apart
+from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.trackers.head_mono.session import MonoSession
+from jaxfilters.trackers.head_mono.state import MonoOptions
+from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.face_model_files import FaceModelFile, default_face_model, load_face_model
+from jaxfilters.trackers.shell.head_input import place_of_one
+from jaxfilters.trackers.shell.head_outcome import finite, run_report, told
+from jaxfilters.trackers.shell.head_run import HeadRun, warn
+from jaxfilters.trackers.shell.head_summary import Labels, write_summary
+from jaxfilters.trackers.shell.head_table import STATUS_WORDS
+from jaxfilters.trackers.shell.mono_table import mono_table
+from jaxfilters.trackers.shell.track_command import given, refusing
+from jaxfilters.trackers.shell.video_input import LiveCamera
+
+LABELS = Labels("expression, standard deviations", "a", "mode ", "how this face changes with expressions")
+"""Of the summary: what is a parameter of the expression, and what moves the most."""
+
+
+def track_mono(options: argparse.Namespace) -> str:
+    """Follow a head, leave the results in `options.out`, and say in a few lines what came of it.
+
+    Raises:
+        InputError: the source, a file or an option cannot be used. What was tracked before is written.
+        OutputError: the results cannot be written.
+        KeyboardInterrupt: before anything was tracked.
+    """
+    settings = refusing(partial(given, MonoOptions, options))
+    model = _model(options)
+    place = place_of_one(options)
+    if any(isinstance(source, LiveCamera) for source in place.sources):
+        settings = dataclasses.replace(settings, chunk=1, live=True)
+    session = refusing(lambda: MonoSession(place.rig, model.model, settings, place.points))
+    run = HeadRun(options, place, session, mono_table(model.model), chunk=settings.chunk)
+    if place.note:
+        warn(f"{place.note}: distances are wrong in proportion")
+    followed = run.follow()
+    person = session.person
+    report = run_report(run, followed) | {
+        "focal_length_px": np.asarray(place.rig.focal[0], float).tolist(),
+        "is_focal_length_assumed": place.truth is None and options.camera is None,
+        "eyes_apart_mm": None if person is None else finite(float(eyes_apart(model.model, person))),
+        "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
+        "face_model": {"source": model.source, "parameters": model.parameters},
+        "config": dataclasses.asdict(settings),
+        "options": {
+            name: str(value) if value is not None else None
+            for name, value in (("model", options.model), ("camera", options.camera), ("points", options.points))
+        },
+    }
+    run.writer.finish(report, **_learnt(session))
+    truth = None if place.truth is None else place.truth.poses
+    write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
+    run.conclude(followed)
+    return told(report, options)
+
+
+def _model(options: argparse.Namespace) -> FaceModelFile:
+    file = default_face_model() if options.model is None else load_face_model(options.model)
+    if file.names != NAMES:
+        other = next((name for name in NAMES if name not in file.names), "their order")
+        raise InputError(
+            f"{options.model}: {len(file.names)} landmarks, which differ in {other}; the tracker follows the "
+            f"{len(NAMES)} that `jaxfilters fit face-model --points 10` makes a model of."
+        )
+    return file
+
+
+def _learnt(session: MonoSession) -> dict[str, np.ndarray]:
+    """What `track.npz` holds beside the track."""
+    learnt = {"status_names": np.asarray(STATUS_WORDS)}
+    if session.person is not None:
+        learnt |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
+    return learnt
