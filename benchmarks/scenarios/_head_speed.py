@@ -18,7 +18,8 @@ from jaxfilters.trackers.head.estimate import refined
 from jaxfilters.trackers.head.registration import register
 from jaxfilters.trackers.head.search import Searches, at, searches
 from jaxfilters.trackers.head.state import POSE, HeadOptions, HeadState
-from jaxfilters.trackers.head.track import LEARNING, SHARPENING, advance, begin
+from jaxfilters.trackers.head.track import SHARPENING, advance, begin
+from jaxfilters.trackers.head.ways import WAYS
 
 BATCH = 8
 """Frames in one call."""
@@ -161,10 +162,15 @@ def _refined(rig, state: HeadState, images: Array, search):
 def _learnt(state: HeadState, images: Array, shape: Array):
     del images
     windows, always = state.learner.windows, jnp.ones((), bool)
-    return learning.learnt(state.learner, state.model, shape, windows, always, *LEARNING["modern"])
+    return learning.learnt(state.learner, state.model, shape, windows, always, *_way("modern"))
 
 
 def _recalculated(rig, state: HeadState, images: Array, x: Array):
     estimated = state.model.mean + (state.model.basis @ x[POSE:]).reshape(state.model.mean.shape)
     shape, windows = learning.recalculated(state.learner, estimated, images, state.model.templates, x[:POSE], rig)
-    return learning.learnt(state.learner, state.model, shape, windows, jnp.ones((), bool), *LEARNING["paper"])
+    return learning.learnt(state.learner, state.model, shape, windows, jnp.ones((), bool), *_way("paper"))
+
+
+def _way(mode: str):
+    way = WAYS[mode]
+    return way.follow, way.still

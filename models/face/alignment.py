@@ -1,27 +1,29 @@
 """Where each landmark is in each image, to a fraction of a pixel: its patch of the first images, turned with the head.
 
 A few Gauss-Newton steps in the inverse compositional form (S. Baker, I. Matthews, "Lucas-Kanade 20 years on", 2004),
-free of gain and offset, find the shift that the predicted pose leaves. What the turned plane does not explain stays in
-the residual, and the covariance is that of the shift under such a residual: part of it white, part of it as smooth as
-the residual itself turns out to be. The same residual says how the plane is inclined.
+free of gain and offset, find the shift that the predicted pose leaves. What the turned surface does not explain stays
+in the residual, and the covariance is that of the shift under a residual that is correlated over neighbouring pixels
+as this one is. The same residual says how the surface is inclined and curved.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.face.correlation import score_map
 from jaxfilters.models.face.patches import (
     SIZE,
-    SMOOTHNESS_PX,
     Patches,
     Slopes,
+    bend,
+    lagged,
+    relief,
     slope_of_grey,
     stretch,
     turned,
+    window_grid,
     without_light,
 )
 from jaxfilters.models.face.rig import CameraRig, jacobian
@@ -51,10 +53,10 @@ class Alignment(NamedTuple):
     """Normalised correlation there, -1 to 1."""
     seen: Bool[Array, "C K"]
     """Whether the patch faces the camera and lies inside the image."""
-    by_slope: Float[Array, "C K 2 2"]
+    by_slope: Float[Array, "C K 2 S"]
     """How far the place moves, in pixels, with slopes that the skin has beyond those assumed."""
-    slope_information: Float[Array, "K 2 2"]
-    slope_score: Float[Array, "K 2"]
+    slope_information: Float[Array, "K S S"]
+    slope_score: Float[Array, "K S"]
     """What the residual says of the slopes, as `learn_slopes` takes it."""
 
 
@@ -73,9 +75,7 @@ def align(
     is_facing = facing(patches, by_shape)
     affine = jnp.where(is_facing[..., None, None], affine, jnp.eye(2))
     by_shape = jnp.where(is_facing[..., None, None], by_shape, 0.0)
-    reach = jnp.arange(SIZE) - (SIZE - 1) / 2
-    grid = jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
-    offsets = jnp.einsum("ckij,pj->ckpi", affine, grid)
+    offsets = jnp.einsum("ckij,pj->ckpi", affine, window_grid()) + bend(patches, slopes, by_shape)
 
     def iterate(_: Array | int, uv: Array) -> Array:
         shift = _look(patches, images, uv[:, :, None] + offsets)[0]
@@ -88,7 +88,9 @@ def align(
     seen = is_facing & _inside(images.shape[1:], found, affine) & jnp.isfinite(score)
     covariance, variance = _covariance(patches, residual, affine)
     teaching = seen & (score > LEAST_TEACHING_SCORE)
-    by_slope, information, slope_score = _slopes(patches, grid, residual, variance, affine, by_shape, teaching)
+    by_slope, information, slope_score = _slopes(
+        patches, slopes.mean.shape[1], residual, variance, affine, by_shape, teaching
+    )
     return Alignment(found, covariance, score, seen, by_slope, information, slope_score)
 
 
@@ -162,31 +164,31 @@ def _look(patches: Patches, images: Array, points: Array) -> tuple[Array, Array,
 
 
 def _covariance(patches: Patches, residual: Array, affine: Array) -> tuple[Array, Array]:
-    """Of the shift; and the variance of a white residual that would say as little, grey levels squared."""
-    C, K = residual.shape[:2]
+    """Of the shift; and the variance of a white residual that would say as little, grey levels squared.
+
+    `Q (sum_pq g_p g_q^T c(p - q)) Q` for the gradient g, whose moments have the inverse Q, and the residual's own
+    correlation c, which counts the less the farther two pixels are apart (W. Newey, K. West, "A simple, positive
+    semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", 1987).
+    """
+    C, K, pixels = residual.shape
     square = residual.reshape(C, K, SIZE, SIZE)
-    variance = jnp.maximum(jnp.mean(square * square, axis=(2, 3)), 1e-6)
-    across = jnp.mean(square[:, :, :, 1:] * square[:, :, :, :-1], axis=(2, 3))
-    down = jnp.mean(square[:, :, 1:] * square[:, :, :-1], axis=(2, 3))
-    of_neighbours = float(np.exp(-0.5 / SMOOTHNESS_PX**2))
-    share = jnp.clip(0.5 * (across + down) / (variance * of_neighbours), 0.0, 1.0)
-    white = jnp.linalg.inv(patches.inverse)
-    mixed = (1 - share)[..., None, None] * white + share[..., None, None] * patches.smooth
+    correlation = lagged(square, square) / pixels
+    moments = jnp.einsum("ckvu,ckvuij->ckij", correlation, patches.overlap)
+    moments += 1e-6 * jnp.linalg.inv(patches.inverse)
     per_moment = jnp.einsum("ckij,ckjl->ckil", affine, patches.inverse)
-    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", per_moment, variance[..., None, None] * mixed, per_moment)
-    pixels_a_number = 1 + share * (2 * np.pi * SMOOTHNESS_PX**2 - 1)
-    return covariance, variance * pixels_a_number
+    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", per_moment, moments, per_moment)
+    return covariance, 0.5 * jnp.einsum("ckij,ckji->ck", patches.inverse, moments)
 
 
 def _slopes(
-    patches: Patches, grid: Array, residual: Array, variance: Array, affine: Array, by_shape: Array, teaching: Array
+    patches: Patches, terms: int, residual: Array, variance: Array, affine: Array, by_shape: Array, teaching: Array
 ) -> tuple[Array, Array, Array]:
     """Effect of the slopes on the place, and what the residual says of them once the shift has had its part."""
     rising = jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)
     rising = jnp.linalg.solve(affine, rising[..., None])[..., 0]
     # Gain and offset explain some of the picture's change, but only once every pixel has changed as far as it rises.
     along = jnp.einsum("ckpi,cki->ckp", slope_of_grey(patches), rising)
-    columns = without_light(patches.template, -along[..., None] * jnp.einsum("ckij,pj->ckpi", patches.plan, grid))
+    columns = without_light(patches.template, -along[..., None] * relief(patches, terms))
     shift = jnp.einsum("ckij,ckpj,ckps->ckis", patches.inverse, patches.gradient, columns)
     left = columns - jnp.einsum("ckpi,ckis->ckps", patches.gradient, shift)
     per_variance = jnp.where(teaching, 1 / variance, 0.0)

@@ -47,7 +47,7 @@ def log_weights(
     deviation: Float[Array, " B"],
     *,
     num_scores: int,
-    sigma: float = 3.0,
+    sigma: float | Float[Array, ""] = 3.0,
 ) -> Float[Array, " N"]:
     """Log weights, not normalised: `-(n - c)^2 / (2 sigma^2) - sum_b (a_b / mu_b)^2 / 2` ([P17], [S3.27]).
 
@@ -61,7 +61,7 @@ def log_weights(
     Raises:
         ValueError: if `sigma` or `num_scores` is not positive.
     """
-    if num_scores <= 0 or sigma <= 0:
+    if num_scores <= 0 or (not isinstance(sigma, jax.core.Tracer) and sigma <= 0):
         raise ValueError(f"num_scores and sigma must be positive; got {num_scores} and {sigma}.")
     learnt = deviation > 0
     relative = jnp.where(learnt[:, None], deformation / jnp.where(learnt, deviation, 1.0)[:, None], 0.0)

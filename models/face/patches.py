@@ -1,8 +1,8 @@
 """Patches of skin as the cameras saw them at registration, and how their pictures change when the head turns.
 
-A patch is taken for a small plane. From the pose follows how its picture is stretched and turned, an affine map for
-each camera and landmark. How the plane is inclined is known only roughly at first, from an average head; what a turned
-head shows of it is learnt (`Slopes`).
+A patch is taken for a small piece of a curved surface. From the pose follows how its picture is stretched and turned,
+an affine map for each camera and landmark, and how it bends. How the surface is inclined is known only roughly at
+first, from an average head, and how it is curved not at all; what a turned head shows of both is learnt (`Slopes`).
 """
 
 from dataclasses import dataclass
@@ -27,13 +27,18 @@ SKIN_NORMALS = np.array(
 R. Li et al., "Learning formation of physically-based face attributes", 2020)."""
 SIZE, WIDE_SIZE = 16, 24
 """Pixels of a window; of what is kept of the first image, so that a window is still full when its picture shrinks."""
-SMOOTHNESS_PX = 2.0
-"""Standard deviation of the Gaussian correlation that the smooth part of a residual is given."""
+REACH_PX = 6
+"""Lag from which on the residual at two pixels counts as uncorrelated."""
 SLOPE_STD = 0.35
 """Of the slopes before the head has turned: skin is within some 20 degrees of where it is on the mean head."""
-LEAST_SLOPE_STD = 0.03
-"""Skin is no plane."""
+LEAST_SLOPE_STD = 0.02
+"""Skin is no smooth surface."""
 STEEPEST = 1.0
+CURVATURE_STD = 0.04
+"""1/mm, of the curvatures before the head has turned: a ball of 25 mm."""
+LEAST_CURVATURE_STD, MOST_CURVED = 0.001, 0.12
+NUM_RELIEF = 5
+"""Two slopes, and the curvatures along the first direction, across, and along the second one."""
 
 
 @jax.tree_util.register_dataclass
@@ -50,8 +55,9 @@ class Patches:
     """Of the template along (u, v), without what gain and offset could explain."""
     inverse: Float[Array, "C K 2 2"]
     """Inverse of the gradient's second moments: shift for each unit of correlation with the gradient."""
-    smooth: Float[Array, "C K 2 2"]
-    """Second moments of the gradient under a residual of unit variance that is correlated over neighbouring pixels."""
+    overlap: Float[Array, "C K lags lags 2 2"]
+    """Sum over all pixels of the gradient there times that some pixels further on, by (v, u) lags from `-REACH_PX + 1`
+    to `REACH_PX - 1`; the larger the lag, the less it counts (Bartlett)."""
     tangents: Float[Array, "C K 3 2"]
     """Millimetres on the skin, in the model frame, for each pixel of the template."""
     lift: Float[Array, "C K 3"]
@@ -63,11 +69,15 @@ class Patches:
 
 
 class Slopes(NamedTuple):
-    """How the skin is inclined to the plane that was assumed for it, learnt while the head turns."""
+    """How the skin rises out of the plane that was assumed for it, learnt while the head turns.
 
-    mean: Float[Array, "K 2"]
-    """Millimetres out of the plane for each millimetre along the two directions within it."""
-    covariance: Float[Array, "K 2 2"]
+    At a mm along the first direction within the plane and b mm along the second one it rises by
+    `s_1 a + s_2 b + s_3 a^2 / 2 + s_4 a b + s_5 b^2 / 2` mm.
+    """
+
+    mean: Float[Array, "K S"]
+    """Slopes, and curvatures in 1/mm."""
+    covariance: Float[Array, "K S S"]
 
 
 def patches(
@@ -103,22 +113,23 @@ def patches_of(
     normals: Float[Array, "K 3"],
 ) -> Patches:
     """Patches from `windows` of a posed shape; the other arguments are those of `patches`."""
-    template, gradient, inverse, smooth = _moments(_middle(wide), _grey_slope(wide))
+    template, gradient, inverse, overlap = _moments(_middle(wide), _grey_slope(wide))
     by_shape, _ = jacobian(rig, shape, pose)
     unit = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*wide.shape[:2], 1, 3))], axis=2)
     # Two columns keep within the plane; the third, of no pixels, goes along the line of sight.
     columns = jnp.linalg.inv(frame)
     plan = jnp.einsum("kxi,ckxj->ckij", _within(unit), columns[..., :2])
-    return Patches(wide, template, gradient, inverse, smooth, columns[..., :2], columns[..., 2], plan, unit)
+    return Patches(wide, template, gradient, inverse, overlap, columns[..., :2], columns[..., 2], plan, unit)
 
 
 def unknown_slopes(num_landmarks: int) -> Slopes:
     """Slopes before the head has turned."""
-    return Slopes(jnp.zeros((num_landmarks, 2)), jnp.tile(SLOPE_STD**2 * jnp.eye(2), (num_landmarks, 1, 1)))
+    variance = jnp.array([SLOPE_STD**2] * 2 + [CURVATURE_STD**2] * 3)
+    return Slopes(jnp.zeros((num_landmarks, NUM_RELIEF)), jnp.tile(jnp.diag(variance), (num_landmarks, 1, 1)))
 
 
-def learn_slopes(slopes: Slopes, information: Float[Array, "K 2 2"], score: Float[Array, "K 2"]) -> Slopes:
+def learn_slopes(slopes: Slopes, information: Float[Array, "K S S"], score: Float[Array, "K S"]) -> Slopes:
     """Slopes after another view, by Bayes' rule.
 
     Args:
@@ -126,28 +137,63 @@ def learn_slopes(slopes: Slopes, information: Float[Array, "K 2 2"], score: Floa
         information: Of the view, about the slopes.
         score: That information times how much they differ from what was assumed.
     """
-    eye = jnp.eye(2, dtype=information.dtype)
-    covariance = jnp.linalg.inv(jnp.linalg.inv(slopes.covariance) + information)
-    mean = slopes.mean + jnp.einsum("kij,kj->ki", covariance, score)
-    lacking = jnp.maximum(LEAST_SLOPE_STD**2 - jnp.diagonal(covariance, axis1=1, axis2=2), 0.0)
-    return Slopes(jnp.clip(mean, -STEEPEST, STEEPEST), covariance + lacking[..., None] * eye)
+    return learn_slopes_again(slopes, slopes, information, score)
+
+
+def learn_slopes_again(
+    before: Slopes, assumed: Slopes, information: Float[Array, "K S S"], score: Float[Array, "K S"]
+) -> Slopes:
+    """Slopes after another view that was taken with others assumed than those that were known before it.
+
+    Args:
+        before: What is known without the view.
+        assumed: With what the view was taken, as its linear equations have it.
+        information: Of the view, about the slopes.
+        score: That information times how much they differ from what was assumed.
+    """
+    eye = jnp.eye(score.shape[-1], dtype=information.dtype)
+    prior = jnp.linalg.inv(before.covariance)
+    covariance = jnp.linalg.inv(prior + information)
+    pull = score + jnp.einsum("kij,kj->ki", prior, before.mean - assumed.mean)
+    mean = assumed.mean + jnp.einsum("kij,kj->ki", covariance, pull)
+    # Everything that follows is relative: slopes and curvatures have units of their own.
+    least = _of_terms(LEAST_SLOPE_STD, LEAST_CURVATURE_STD, mean)
+    most = _of_terms(STEEPEST, MOST_CURVED, mean)
+    lacking = jnp.maximum(least**2 - jnp.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    return Slopes(jnp.clip(mean, -most, most), covariance + lacking[..., None] * eye)
 
 
 def stretch(patches: Patches, slopes: Slopes, by_shape: Float[Array, "C K 2 3"]) -> Float[Array, "C K 2 2"]:
     """Pixels of an image for each pixel of the template, for a head whose pixels have the derivatives `by_shape`."""
-    rise = jnp.einsum("ki,ckij->ckj", slopes.mean, patches.plan)
+    rise = jnp.einsum("ki,ckij->ckj", slopes.mean[:, :2], patches.plan)
     tangents = patches.tangents + patches.lift[..., None] * rise[:, :, None]
     return jnp.einsum("ckix,ckxj->ckij", by_shape, tangents)
 
 
+def bend(patches: Patches, slopes: Slopes, by_shape: Float[Array, "C K 2 3"]) -> Float[Array, "C K TT 2"]:
+    """Pixels by which the curvatures move what each pixel of the template shows, beyond the affine `stretch`."""
+    rise = jnp.einsum("ks,ckps->ckp", slopes.mean[:, 2:], relief(patches, slopes.mean.shape[1])[..., 2:])
+    return rise[..., None] * jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)[:, :, None]
+
+
+def relief(patches: Patches, terms: int) -> Float[Array, "C K TT S"]:
+    """Millimetres that the skin rises at each pixel of the template for a unit of each of the first `terms` slopes."""
+    a, b = jnp.moveaxis(jnp.einsum("ckij,pj->ckpi", patches.plan, window_grid()), -1, 0)
+    return jnp.stack([a, b, 0.5 * a * a, a * b, 0.5 * b * b][:terms], axis=-1)
+
+
+def window_grid() -> Float[Array, "TT 2"]:
+    """(u, v) of a window's pixels from its middle, row by row."""
+    reach = jnp.arange(SIZE) - (SIZE - 1) / 2
+    return jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
+
+
 def turned(patches: Patches, affine: Float[Array, "C K 2 2"]) -> Float[Array, "C K T T"]:
     """Templates as a head would show them that stretches them by `affine`, at most half a window beyond its border."""
-    reach = jnp.arange(SIZE) - (SIZE - 1) / 2
-    grid = jnp.stack(jnp.meshgrid(reach, reach, indexing="xy"), axis=-1).reshape(-1, 2)
     usable = jnp.abs(jnp.linalg.det(affine)) > 0.05
     inverse = jnp.linalg.inv(jnp.where(usable[..., None, None], affine, jnp.eye(2)))
     middle = (WIDE_SIZE - 1) / 2
-    points = jnp.clip(jnp.einsum("ckij,pj->ckpi", inverse, grid) + middle, 0.0, WIDE_SIZE - 1.001)
+    points = jnp.clip(jnp.einsum("ckij,pj->ckpi", inverse, window_grid()) + middle, 0.0, WIDE_SIZE - 1.001)
     corner = jnp.floor(points)
     a, b = points[..., 0] - corner[..., 0], points[..., 1] - corner[..., 1]
     flat = patches.wide.reshape(*patches.wide.shape[:2], -1)
@@ -170,6 +216,10 @@ def without_light(template: Float[Array, "C K TT"], columns: Float[Array, "C K T
     return columns - template[..., None] * gain[:, :, None]
 
 
+def _of_terms(slope: float, curvature: float, mean: Array) -> Array:
+    return jnp.array([slope] * 2 + [curvature] * 3, mean.dtype)[: mean.shape[-1]]
+
+
 def _middle(wide: Array) -> Array:
     border = (WIDE_SIZE - SIZE) // 2
     return wide[:, :, border:-border, border:-border]
@@ -181,16 +231,39 @@ def _grey_slope(wide: Array) -> Array:
 
 
 def _moments(window: Array, gradient: Array) -> tuple[Array, Array, Array, Array]:
-    """Template, gradient free of gain and offset, inverse of its moments, and moments under a smooth residual."""
+    """Template, gradient free of gain and offset, inverse of its moments, and their sums over lagged pixels."""
     C, K, size = window.shape[:3]
     flat = (window - jnp.mean(window, axis=(2, 3), keepdims=True)).reshape(C, K, size * size)
     columns = without_light(flat, gradient)
     inverse = jnp.linalg.inv(jnp.einsum("ckpi,ckpj->ckij", columns, columns) + 1e-3 * jnp.eye(2))
-    distance = jnp.arange(size)[:, None] - jnp.arange(size)
-    correlation = jnp.exp(-0.5 * (distance / SMOOTHNESS_PX) ** 2)
-    square = columns.reshape(C, K, size, size, 2)
-    blurred = jnp.einsum("rs,ckstd,tu->ckrud", correlation, square, correlation).reshape(columns.shape)
-    return flat, columns, inverse, jnp.einsum("ckpi,ckpj->ckij", columns, blurred)
+    squares = lambda a: a.reshape(*a.shape[:2], size, size, -1).transpose(0, 1, 4, 2, 3)
+    slopes = squares(columns)
+    weight = 1 - np.abs(np.arange(1 - REACH_PX, REACH_PX)) / REACH_PX
+    near = np.outer(weight, weight) * lagged(slopes[:, :, :, None], slopes[:, :, None])
+    overlap = jnp.moveaxis(near, (2, 3), (4, 5))
+    # A residual is free of what the fit has taken: shift, gain and offset. White noise less these has the correlation
+    # `taken` beside that of no lag, which would make the covariance too small.
+    light = squares(
+        jnp.stack(
+            [
+                flat / jnp.sqrt(jnp.maximum(jnp.sum(flat * flat, axis=2, keepdims=True), 1e-6)),
+                jnp.full_like(flat, 1 / size),
+            ],
+            axis=-1,
+        )
+    )
+    whole = lagged(slopes[:, :, :, None], slopes[:, :, None])
+    taken = jnp.einsum("ckij,ckijvu->ckvu", inverse, whole) + jnp.sum(lagged(light, light), axis=2)
+    share = jnp.einsum("ckvu,ckvuij,ckji->ck", taken / size**2, overlap, inverse) / 2
+    return flat, columns, inverse, overlap / jnp.maximum(1 - share, 0.3)[..., None, None, None, None]
+
+
+def lagged(a: Float[Array, "*a T T"], b: Float[Array, "*b T T"]) -> Float[Array, "*c lags lags"]:
+    """Sum over all pixels of one square times the other some pixels further on, by lag below `REACH_PX`."""
+    size = a.shape[-1] + REACH_PX
+    product = jnp.conj(jnp.fft.rfft2(a, s=(size, size))) * jnp.fft.rfft2(b, s=(size, size))
+    lags = jnp.roll(jnp.fft.irfft2(product, s=(size, size)), REACH_PX - 1, axis=(-2, -1))
+    return lags[..., : 2 * REACH_PX - 1, : 2 * REACH_PX - 1]
 
 
 def _within(normals: Array) -> Array:

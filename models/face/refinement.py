@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.face.alignment import Alignment
@@ -27,8 +27,8 @@ LEAST_SCORE = 0.5
 PIXEL_FLOOR = 0.01
 """Standard deviation, pixels, that no alignment is better than: the grid on which grey values were sampled."""
 MOST_DISTANCE = 9.0
-"""Squared deviations a row beyond which a landmark is mistaken, and says nothing more about the noise."""
-COMMON_BIAS_PX = 0.006
+"""Squared deviations a row beyond which a landmark is mistaken, and says nothing more about its place."""
+COMMON_BIAS_PX = 0.004
 """Standard deviation, pixels, of what all landmarks of one image are off alike: interpolation favours some phases of
 the grid, and the landmarks of two images share their phase of depth."""
 UNSEEN = 1e4
@@ -47,7 +47,9 @@ class Refined(NamedTuple):
     trust: Float[Array, " K"]
     """Weight in the last iteration: about 1 for a landmark that fits, towards 0 for one that does not."""
     misfit: Float[Array, ""]
-    """Squared residuals over what their covariances lead to expect; 1 in the mean if those are right."""
+    """Squared errors of the alignments over what they claim, as this frame has it; 1 in the mean if they are right."""
+    misfit_share: Float[Array, ""]
+    """How far this frame can tell, 0 to 1: the share of the alignments' errors in what residuals are expected."""
     num_seen: Float[Array, ""]
     """Landmarks that at least one camera sees."""
 
@@ -60,8 +62,13 @@ def refine(
     looseness: Float[Array, "K 3 3"],
     rig: CameraRig,
     start: Float[Array, " n"],
+    is_own: Bool[Array, "C K"] | None = None,
 ) -> Refined:
     """Posterior mode and its covariance.
+
+    The covariance is the inverse of the expected information of Student's t (K. Lange, R. Little, J. Taylor, "Robust
+    statistical modeling using the t distribution", 1989): `(nu + p) / (nu + p + 2)` of that of the last weights, for a
+    landmark of p rows.
 
     Args:
         prior: Of pose and mode coefficients before the frame.
@@ -71,6 +78,7 @@ def refine(
         looseness: Covariance of each landmark about the model, model frame, mm^2.
         rig: Cameras.
         start: Where the iteration begins.
+        is_own: Landmarks whose covariances are those of alignments alone; all if none. Only these tell the misfit.
     """
     seen = found.seen & (found.score > LEAST_SCORE)
     precision = jnp.linalg.inv(prior.covariance)
@@ -92,23 +100,47 @@ def refine(
 
     x = jax.lax.fori_loop(0, ITERATIONS, iterate, start)
     residual, H, S, by_shape, distance, trust = pieces(x)
-    information = precision + jnp.einsum("k,kia,kib->ab", trust, _solve(S, H), H)
-    covariance = jnp.linalg.inv(information)
-    by_bias = covariance @ jnp.einsum("k,kia->ai", trust, _solve(S, H))
+    SH = _solve(S, H)
+    information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
+    expected = trust * (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + per_landmark + 2)
+    covariance = jnp.linalg.inv(precision + jnp.einsum("k,kia,kib->ab", expected, SH, H))
+    by_bias = jnp.linalg.solve(information, jnp.einsum("k,kia->ai", trust, SH))
     covariance += COMMON_BIAS_PX**2 * by_bias @ by_bias.T
     off = x - prior.mean
     log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + 0.5 * (
         jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off
     )
-    count = jnp.sum(seen)
+    own = seen if is_own is None else seen & is_own
+    misfit, share = _misfit(jnp.where(own[..., None, None], found.covariance, 0.0), residual, S, SH, trust, information)
     return Refined(
         belief=Gaussian(x, 0.5 * (covariance + covariance.T)),
         log_evidence=log_evidence,
         excess=_excess(found, seen, residual, S, by_shape, x.size),
         trust=trust,
-        misfit=jnp.sum(jnp.minimum(distance, MOST_DISTANCE * per_landmark)) / jnp.maximum(2.0 * count - x.size, 2.0),
+        misfit=misfit,
+        misfit_share=share,
         num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
     )
+
+
+def _misfit(own, residual, S, SH, trust, information):
+    """Factor that the alignments' covariances `own` (C, K, 2, 2) lack, and how far the residuals can tell.
+
+    Restricted maximum likelihood of a variance component (H. Patterson, R. Thompson, 1971): with `P` the inverse of S
+    less what the fit has taken, `r^T S^-1 own S^-1 r / tr(P own)`.
+    """
+    C = own.shape[0]
+    white = jnp.moveaxis(_solve(S, residual).reshape(-1, C, 2), 1, 0)
+    square = jnp.einsum("k,cki,ckij,ckj->", trust, white, own, white)
+    inverse = jnp.linalg.inv(S)
+    block = lambda c: slice(2 * c, 2 * c + 2)
+    blocks = jnp.stack([inverse[:, block(c), block(c)] for c in range(C)])
+    expected = jnp.einsum("ckij,ckji->", blocks, own)
+    by_rows = jnp.moveaxis(SH.reshape(-1, C, 2, SH.shape[-1]), 1, 0)
+    taken = jnp.einsum("k,ckia,ckij,ckjb->ab", trust, by_rows, own, by_rows)
+    left = expected - jnp.trace(jnp.linalg.solve(information, taken))
+    rows = 2.0 * jnp.sum(own[..., 0, 0] > 0)
+    return square / jnp.maximum(left, 0.1 * expected + 1e-6), expected / jnp.maximum(rows, 1.0)
 
 
 def _excess(found, seen, residual, S, by_shape, size):
@@ -153,7 +185,7 @@ def _rows(x, M, found, slopes, seen, model, looseness, rig):
     noise = jnp.where(mask, found.covariance + PIXEL_FLOOR**2 * jnp.eye(2), UNSEEN**2 * jnp.eye(2))
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(K, 2 * C, 3)
     S = jnp.einsum("kix,kxy,kjy->kij", stacked, looseness, stacked)
-    inclined = jnp.moveaxis(jnp.where(mask, found.by_slope, 0.0), 1, 0).reshape(K, 2 * C, 2)
+    inclined = jnp.moveaxis(jnp.where(mask, found.by_slope, 0.0), 1, 0).reshape(K, 2 * C, -1)
     S += jnp.einsum("kix,kxy,kjy->kij", inclined, slopes.covariance, inclined)
     for camera in range(C):
         rows = slice(2 * camera, 2 * camera + 2)

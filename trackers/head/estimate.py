@@ -1,8 +1,8 @@
 """From particles to an estimate: the mean around their mode, or the best fit near it.
 
-The fit is made twice, for a face at rest (the registered shape, held tightly) and for one that may deform (the learnt
-model, each landmark as loose as it has proved to be). Their evidences say how far each is to be believed; a face
-that rests keeps the accuracy of a rigid one.
+The fit is made for a face at rest (the registered shape, held tightly) and for one that may deform (the learnt model,
+each landmark as loose as it has proved to be, or as expressions of several strengths make it). Their evidences say how
+far each is to be believed; a face that rests keeps the accuracy of a rigid one.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState, Recent
 
 FEWEST_SEEN = 4
 """Landmarks without which there is no fit."""
-RESTING_STD = 0.02
+RESTING_STD = 0.012
 """Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
 UNLEARNT_STD = 0.01
 """Millimetres: of the coefficient of a mode that is not learnt, or not used."""
@@ -36,6 +36,11 @@ MEMORY = 0.95
 """Of the running variances, a frame."""
 LOOSENESS = (0.02**2, 10.0**2)
 MISFIT = (0.05, 20.0)
+STRENGTHS = (0.0, 1.0, 3.0)
+"""Of expressions that no mode describes, in those of `EXPRESSION_STD`."""
+ALIKE, ALIKE_ANEW = 4.0, 2.0
+"""The landmarks of a face move together in an expression: ten of them say no more than some three would; and as much
+again that the next frame, with another expression, is not told."""
 ORDINARY_EXPRESSION = float(np.linalg.norm(EXPRESSION_STD))
 """Millimetres, root of the sum over all landmarks."""
 MEASURED_STD = 10.0
@@ -47,6 +52,8 @@ class Estimate(NamedTuple):
 
     belief: Gaussian
     """Of pose and mode coefficients."""
+    doubt: Float[Array, "6 6"]
+    """Covariance of the pose beside that of the belief, which the next frame does not start from."""
     shape: Float[Array, "K 3"]
     """Landmarks in the model frame, millimetres."""
     measured: Float[Array, "K 3"]
@@ -70,7 +77,8 @@ def around_mode(search: AdaptiveState, state: HeadState, model: FaceModel) -> Es
     found = jnp.ones((), bool)
     all_of_them = jnp.full((), float(len(M)), x.dtype)
     belief = Gaussian(x, covariance)
-    return Estimate(belief, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
+    doubt = jnp.zeros((POSE, POSE), x.dtype)
+    return Estimate(belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
 
 
 def refined(
@@ -91,40 +99,64 @@ def refined(
         rig: Cameras.
         moved: What the head was predicted to move since the last estimate, millimetres and radians.
     """
-    loose_prior = _prior(search, state, model, moved)
-    loose = state.registered.covariance + state.looseness[:, None, None] * jnp.eye(3)
-    x = jnp.concatenate([search.estimate[:POSE], loose_prior.mean[POSE:]])
-    found, _ = _aligned(align, state, model, images, rig, x)
-    x = refine(loose_prior, found, state.slopes, model, loose, rig, x).belief.mean
-    found, anchored = _aligned(_align_anywhere, state, model, images, rig, x)
-    free = refine(loose_prior, found, state.slopes, model, loose, rig, x)
-    x = free.belief.mean
+    prior = _prior(search, state, model, moved)
+    x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
+    found, _, _ = _aligned(align, state, model, images, rig, x)
+    x = refine(prior, found, state.slopes, model, _looseness(state, 1.0), rig, x).belief.mean
+    found, anchored, is_followed = _aligned(_align_anywhere, state, model, images, rig, x)
 
-    rest, rest_belief = _at_rest(loose_prior, found, state, model, rig, x)
-    resting = jax.nn.sigmoid(rest.log_evidence - free.log_evidence)
-    resting = jnp.where(jnp.isfinite(resting), resting, 0.0)
-    M = resting * state.registered.shape + (1 - resting) * shape(model, x[POSE:])
-    belief = _with_gauge(_mixed(resting, rest_belief, free.belief), M - state.registered.shape, model)
-    measured = displaced(x, found, state.slopes, model, MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1)), rig)
+    fit = lambda strength: refine(prior, found, state.slopes, model, _looseness(state, strength), rig, x, ~is_followed)
+    # One by one: batches of factorisations can stand still on two cores.
+    fits = jax.lax.map(fit, jnp.asarray(STRENGTHS, x.dtype))
+    rest, rest_belief = _at_rest(prior, found, state, model, rig, x, ~is_followed)
+    evidence = jnp.append(fits.log_evidence, rest.log_evidence)
+    share = jax.nn.softmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
+    share = jnp.where(jnp.all(jnp.isfinite(share)), share, jnp.zeros_like(share).at[0].set(1.0))
+    moving, resting = share[:-1], share[-1]
+    among = moving / jnp.maximum(jnp.sum(moving), 1e-12)
+    average = lambda values: jnp.tensordot(among, values, 1)
+    is_unknown = jnp.asarray(STRENGTHS) > 0
+    doubt = ALIKE_ANEW * (1 - resting) * jnp.tensordot(among * is_unknown, fits.belief.covariance, 1)[:POSE, :POSE]
+    alike = jnp.where(is_unknown, ALIKE, 1.0)[:, None, None]
+    free = _mixed(among, Gaussian(fits.belief.mean, alike * fits.belief.covariance))
+    M = resting * state.registered.shape + (1 - resting) * shape(model, free.mean[POSE:])
+    beliefs = jax.tree.map(lambda a, b: jnp.stack([a, b]), rest_belief, free)
+    belief = _mixed(jnp.stack([resting, 1 - resting]), beliefs)
+    belief = _with_gauge(belief, M - state.registered.shape, model)
+    R = rotation(belief.mean[3:POSE])
+    covariance = belief.covariance.at[:3, :3].add(R @ state.registered.alike @ R.T)
+    belief = Gaussian(belief.mean, covariance)
+    wide = MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1))
+    measured = displaced(free.mean, found, state.slopes, model, wide, rig)
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
-    is_found = sound & (free.num_seen >= FEWEST_SEEN)
-    misfit = resting * rest.misfit + (1 - resting) * free.misfit
-    seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig)
+    is_found = sound & (rest.num_seen >= FEWEST_SEEN)
+    lacking = lambda fit: fit.misfit_share * (fit.misfit - 1)
+    misfit = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
+    drift = recent.drifted(state.recent, is_followed)
+    seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
     return Estimate(
         belief,
+        doubt,
         M,
         measured,
         is_found,
         jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
         seen,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
-        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * free.excess, *LOOSENESS),
-        jnp.clip(state.misfit * (MEMORY + (1 - MEMORY) * misfit), *MISFIT),
+        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * average(fits.excess), *LOOSENESS),
+        jnp.clip(state.misfit * (1 + (1 - MEMORY) * misfit), *MISFIT),
     )
 
 
+def _looseness(state: HeadState, strength: Array | float) -> Array:
+    """Covariance of each landmark about the model of a face whose expression is so strong, mm^2."""
+    expression = jnp.asarray(EXPRESSION_STD**2, state.looseness.dtype)
+    learnt = jnp.minimum(state.looseness[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
+    return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learnt, strength**2 * expression))
+
+
 def _at_rest(
-    prior: Gaussian, found: Alignment, state: HeadState, model: FaceModel, rig: CameraRig, x: Array
+    prior: Gaussian, found: Alignment, state: HeadState, model: FaceModel, rig: CameraRig, x: Array, is_own: Array
 ) -> tuple[Refined, Gaussian]:
     """The fit of the registered face, and its belief with the mode coefficients of that face."""
     face = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
@@ -132,7 +164,7 @@ def _at_rest(
     covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
     covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
     prior = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
-    rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0))
+    rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0), is_own)
     a = model.basis.T @ (state.registered.shape - model.mean).ravel()
     return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
 
@@ -144,15 +176,15 @@ def _align_anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
 
 def _aligned(
     way, state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array
-) -> tuple[Alignment, Array]:
-    """Landmarks in the images, and which of them look as registered."""
+) -> tuple[Alignment, Array, Array]:
+    """Landmarks in the images, which of them look as registered, and which are followed from the last frame."""
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
     found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
     anchored = recent.is_anchored(found)
     found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
-    drift = jnp.where(is_followed[..., None, None], recent.DRIFT_PX**2 * jnp.eye(2), 0.0)
-    return found._replace(covariance=state.misfit * found.covariance + drift), anchored
+    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
+    return found._replace(covariance=state.misfit * found.covariance + drift), anchored, is_followed
 
 
 def _prior(search: AdaptiveState, state: HeadState, model: FaceModel, moved: Array) -> Gaussian:
@@ -178,8 +210,9 @@ def _with_gauge(belief: Gaussian, deformation: Array, model: FaceModel) -> Gauss
     return Gaussian(belief.mean, belief.covariance.at[:POSE, :POSE].add(extra))
 
 
-def _mixed(share: Array, first: Gaussian, second: Gaussian) -> Gaussian:
-    """One Gaussian with the moments of two."""
-    mean = share * first.mean + (1 - share) * second.mean
-    spread = lambda one: one.covariance + jnp.outer(one.mean - mean, one.mean - mean)
-    return Gaussian(mean, share * spread(first) + (1 - share) * spread(second))
+def _mixed(shares: Array, each: Gaussian) -> Gaussian:
+    """One Gaussian with the moments of several."""
+    mean = shares @ each.mean
+    off = each.mean - mean
+    spread = each.covariance + off[:, :, None] * off[:, None]
+    return Gaussian(mean, jnp.tensordot(shares, spread, 1))

@@ -20,8 +20,9 @@ CLEARLY_BETTER = 0.1
 """By how much it must then resemble the last frame better."""
 ANCHORED_SCORE = 0.5
 """Normalised correlation from which on a landmark looks as registered."""
-DRIFT_PX = 0.3
-"""Standard deviation of what following from frame to frame adds."""
+DRIFT_PX, MOST_DRIFT_PX = 0.3, 4.0
+"""Standard deviation of what following adds with every frame; at most; so far is a landmark that the model alone has
+placed."""
 FAR_PX = 3.0
 """How far a landmark is from the model's that has left its place."""
 
@@ -32,7 +33,8 @@ def nothing_changed(
     """What is known at registration, of a shape posed in these images."""
     uv, _ = project_shape(rig, shape, pose)
     seen = windows(images, uv)
-    return Recent(seen, jnp.zeros_like(uv), seen, jnp.zeros(uv.shape[:2], bool), shape, pose)
+    none = jnp.zeros(uv.shape[:2], uv.dtype)
+    return Recent(seen, jnp.zeros_like(uv), seen, none, none > 0, shape, pose)
 
 
 def followed(
@@ -79,14 +81,32 @@ def as_seen(
     pose: Float[Array, " 6"],
     images: Float[Array, "C rows cols"],
     rig: CameraRig,
+    drift: Float[Array, "C K"] | None = None,
 ) -> Recent:
-    """What the next frame is compared with: where landmarks were `found` beside those of the posed shape."""
+    """What the next frame is compared with: where landmarks were `found` beside those of the posed shape.
+
+    Args:
+        found: Landmarks in the images.
+        anchored: Which of them look as registered.
+        shape: Model frame, millimetres.
+        pose: Millimetres and radians.
+        images: Grey levels.
+        rig: Cameras.
+        drift: Variance of landmarks that were followed, pixels squared, 0 of the others; none was if not given.
+    """
     uv, _ = project_shape(rig, shape, pose)
     uv = jnp.where(jnp.isfinite(uv), uv, 0.0)
     is_there = found.seen & (found.score > CHANGED_SCORE)
     apart = jnp.where(is_there[..., None], found.uv - uv, 0.0)
     has_left = jnp.linalg.norm(apart, axis=-1) > FAR_PX
-    return Recent(windows(images, uv + apart), apart, windows(images, uv), ~anchored | has_left, shape, pose)
+    drift = jnp.zeros_like(found.score) if drift is None else drift
+    drift = jnp.where(is_there & (drift > 0), drift, jnp.where(anchored, 0.0, MOST_DRIFT_PX**2))
+    return Recent(windows(images, uv + apart), apart, windows(images, uv), drift, ~anchored | has_left, shape, pose)
+
+
+def drifted(recent: Recent, is_followed: Bool[Array, "C K"]) -> Float[Array, "C K"]:
+    """Variance of the landmarks that are followed from the last frame on, pixels squared; 0 of the others."""
+    return jnp.where(is_followed, jnp.minimum(recent.drift + DRIFT_PX**2, MOST_DRIFT_PX**2), 0.0)
 
 
 def latest_templates(

@@ -43,6 +43,8 @@ class FaceLikelihood:
     model: FaceModel
     templates: Float[Array, "C K T T"]
     rig: CameraRig
+    sigma: float | Float[Array, ""] = 3.0
+    """Standard deviation of the sum of the scores."""
 
     def __call__(self, particles: Float[Array, "d n"], images: Num[Array, "C rows cols"]) -> Float[Array, " n"]:
         """Log weights."""
@@ -53,7 +55,7 @@ class FaceLikelihood:
         uv = jax.vmap(project, in_axes=-1, out_axes=-1)(particles)
         found = scores(images, self.templates, uv)
         total, size = jnp.sum(found, axis=(0, 1)), found.shape[0] * found.shape[1]
-        return log_weights(total, particles[POSE:], self.model.deviation, num_scores=size)
+        return log_weights(total, particles[POSE:], self.model.deviation, num_scores=size, sigma=self.sigma)
 
 
 class Searches(NamedTuple):
@@ -115,8 +117,14 @@ def gathered(search: AdaptiveState, x: Float[Array, " d"]) -> AdaptiveState:
     return search._replace(particles=particles, log_weights=weights.uniform(particles.shape[1], particles.dtype))
 
 
-def start(x: Float[Array, " d"], options: HeadOptions) -> AdaptiveState:
-    """The state at registration: the place is known, and counts as the first estimate."""
+def start(x: Float[Array, " d"], options: HeadOptions, fit: DiffusionFit | None = None) -> AdaptiveState:
+    """The state at registration: the place is known, and counts as the first estimate.
+
+    Args:
+        x: Pose and mode coefficients.
+        options: Constants.
+        fit: The diffusion; that of the options if none.
+    """
     n = options.num_particles
     return AdaptiveState(
         particles=jnp.broadcast_to(x[:, None], (x.size, n)),
@@ -127,18 +135,20 @@ def start(x: Float[Array, " d"], options: HeadOptions) -> AdaptiveState:
         velocity=jnp.zeros(POSE, x.dtype),
         elapsed=jnp.zeros((), x.dtype),
         num_estimates=jnp.ones((), jnp.int32),
-        fit=first_diffusion(options),
+        fit=first_diffusion(options) if fit is None else fit,
     )
 
 
 def score_at(
     model: FaceModel, templates: Float[Array, "C K T T"], rig: CameraRig, x: Float[Array, " d"], images: Array
 ) -> Float[Array, ""]:
-    """Mean correlation of all templates at one state, -1 where a window leaves the image."""
+    """Mean correlation of the templates at one state, -1 where a window leaves the image; flat ones do not count."""
     uv, _ = project_shape(rig, shape(model, x[POSE:]), x[:POSE])
 
     at_one = lambda image, template, point: score_points(image, template, point[None])[0]
-    return jnp.mean(jax.vmap(jax.vmap(at_one, (None, 0, 0)))(images, templates, uv))
+    found = jax.vmap(jax.vmap(at_one, (None, 0, 0)))(images, templates, uv)
+    is_visible = jnp.max(templates, axis=(2, 3)) > jnp.min(templates, axis=(2, 3))
+    return jnp.sum(jnp.where(is_visible, found, 0.0)) / jnp.maximum(jnp.sum(is_visible), 1)
 
 
 def _no_prior(key: AnyKey) -> Array:

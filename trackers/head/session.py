@@ -2,7 +2,6 @@
 
 import math
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -16,10 +15,20 @@ from jaxfilters.models.face.rigid import align
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.corners import eye_centers
-from jaxfilters.trackers.head.detect import StableDetector, complete, detect
+from jaxfilters.trackers.head.detect import detect
+from jaxfilters.trackers.head.finders import FINDERS, Finder
 from jaxfilters.trackers.head.registration import Registration, RegistrationError, register, register_monocular
-from jaxfilters.trackers.head.search import searches
-from jaxfilters.trackers.head.state import INITIALISING, LOST, NUM_MODES, POSE, HeadOptions, HeadState, HeadTrack
+from jaxfilters.trackers.head.search import first_diffusion, searches
+from jaxfilters.trackers.head.state import (
+    INITIALISING,
+    LOST,
+    NUM_MODES,
+    POSE,
+    HeadOptions,
+    HeadState,
+    HeadTrack,
+    compiled,
+)
 from jaxfilters.trackers.head.track import advance, begin
 
 SAME_FACE_MM = 4.0
@@ -70,17 +79,18 @@ class HeadSession:
 
         Raises:
             ValueError: if `points` are not ten finite pixels.
+            ImportError: if the detector of the options is not installed.
         """
         if points is not None and (np.shape(points) != (NUM_LANDMARKS, 2) or not np.all(np.isfinite(points))):
             raise ValueError(f"points must be ({NUM_LANDMARKS}, 2) finite pixels; got shape {np.shape(points)}.")
         self.events: list[tuple[int, str]] = []
         self._rig, self._options = rig, options or HeadOptions()
-        # What is compiled knows its options, but need not be compiled anew for another seed.
-        self._compiled = replace(self._options, seed=0)
+        self._compiled = compiled(self._options)
+        self._diffusion = first_diffusion(self._options)
         self._points = points
         self._searches = searches(rig, self._options)
         self._state: HeadState | None = None
-        self._detector = StableDetector()
+        self._finder: Finder = FINDERS[self._options.detector]()
         self._frames, self._is_lost, self._time = 0, False, 0.0
         self._pool = ThreadPoolExecutor(1) if self._options.live else None
         self._wait: _Wait | None = None
@@ -168,7 +178,8 @@ class HeadSession:
             stop = min(start + self._options.chunk, len(times))
             track = self._follow(images[start:stop], times[start:stop])
             if not self._is_lost:
-                self._wait, self._detector = None, StableDetector()
+                self._wait = None
+                self._finder.reset()
                 return track
             self._frames -= stop - start
         else:
@@ -198,17 +209,10 @@ class HeadSession:
         return None if registration is None else _Found(registration, wait.images, wait.time)
 
     def _searched(self, images: np.ndarray) -> Registration | None:
-        found = self._detector.update(images[0])
-        if found is None:
-            self._complain(self._detector.reason)
-            return None
-        if found.num_faces > 1:
-            self._complain(f"{found.num_faces} faces; the largest is taken")
-        points = complete(images[0], found.points)
-        if points is None:
-            self._complain("nostrils or brows are not seen")
-            return None
-        return self._try(images, points)
+        points = self._finder.find(images[0])
+        for complaint in self._finder.complaints:
+            self._complain(complaint)
+        return None if points is None else self._try(images, points)
 
     def _try(self, images: np.ndarray, points: np.ndarray) -> Registration | None:
         try:
@@ -224,10 +228,12 @@ class HeadSession:
         old, face = self._state, found.registration
         pose = jnp.asarray(face.pose, float)
         self._time, start = found.time, jnp.zeros((), pose.dtype)
-        self._state = _begun(key, face.model, pose, found.images, start, self._rig, options=self._compiled)
+        self._state = _begun(
+            key, face.model, pose, found.images, start, self._rig, options=self._compiled, diffusion=self._diffusion
+        )
         self._is_lost, self._is_refuted, self._said = False, False, set()
         self._looked, self._contradictions = found.time, 0
-        self._detector = StableDetector()
+        self._finder.reset()
         kept = False
         if old is not None:
             self._state, kept = _with_known_face(self._state, old)
@@ -249,8 +255,8 @@ class HeadSession:
         )
 
     def _complain(self, reason: str) -> None:
-        """Says once in every search why there is no face; a detection that is not steady yet is no reason."""
-        if reason not in self._said and not reason.endswith("px"):
+        """Says once in every search why there is no face."""
+        if reason not in self._said:
             self._say(0, reason)
         self._said.add(reason)
 

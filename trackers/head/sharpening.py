@@ -7,13 +7,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
 from jaxfilters.models.face.alignment import align
-from jaxfilters.models.face.patches import SKIN_NORMALS, Slopes, patches
+from jaxfilters.models.face.patches import (
+    SKIN_NORMALS,
+    Slopes,
+    learn_slopes_again,
+    patches,
+    unknown_slopes,
+)
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 
 PLACED_PX = 0.01
 """Standard deviation of a landmark in the first camera, where it is by definition: what sampling adds."""
 MOST_CHANGE_PX = 1.0
 """A patch that would go farther is not the one that was matched."""
+LOOKS = 4
+"""Rounds until slopes and pictures agree."""
+SAME_SKIN, MISMATCH_PX = 0.995, 8.0
+"""Normalised correlation below which two cameras see different things, such as a face and what is behind it; standard
+deviation for what is lacking, in windows that have nothing in common."""
 UNSEEN_DEPTH_MM = 6.0
 """Standard deviation, along the line of sight, of a landmark that one camera registered: faces differ."""
 
@@ -25,6 +36,8 @@ class Sharpened(NamedTuple):
     """Model frame, millimetres."""
     covariance: Float[Array, "K 3 3"]
     """Of each landmark, mm^2."""
+    alike: Float[Array, "3 3"]
+    """Of what all landmarks are off alike beside that, mm^2: faces are convex, and their pictures err to one side."""
 
 
 def sharpened(
@@ -32,7 +45,6 @@ def sharpened(
     shape: Float[Array, "K 3"],
     pose: Float[Array, " 6"],
     slopes: Slopes,
-    misfit: Float[Array, ""],
     rig: CameraRig,
 ) -> Sharpened:
     """The shape with depths found anew, with the skin inclined as has been learnt.
@@ -47,7 +59,6 @@ def sharpened(
         shape: As registered, or sharpened before.
         pose: Of the head in these images, millimetres and radians.
         slopes: Of the skin, as known by now.
-        misfit: Squared error of alignments over what they claim, as known by now.
         rig: Cameras.
     """
     normals = jnp.asarray(SKIN_NORMALS, shape.dtype)
@@ -56,16 +67,48 @@ def sharpened(
     first = patches(images[:1], shape, pose, _one(rig, 0), normals)
     sampled = PLACED_PX**2 * jnp.eye(2, dtype=shape.dtype)
     places, covariances = [uv[0]], [jnp.tile(sampled, (len(shape), 1, 1))]
+    lacking = jnp.zeros((1, len(shape)), shape.dtype)
     for c in range(1, rig.num_cameras):
         found = align(first, slopes, images[c : c + 1], uv[c : c + 1], shape, pose, _one(rig, c))
         near = found.seen[0] & (jnp.linalg.norm(found.uv[0] - uv[c], axis=-1) < MOST_CHANGE_PX)
         inclined = jnp.einsum("kis,kst,kjt->kij", found.by_slope[0], slopes.covariance, found.by_slope[0])
         places.append(jnp.where(near[:, None], found.uv[0], uv[c]))
-        covariances.append(misfit * found.covariance[0] + inclined + sampled)
-    return _along_rays(shape, pose, jnp.stack(places), jnp.stack(covariances), rig)
+        mismatch = MISMATCH_PX * jnp.maximum(SAME_SKIN - found.score, 0.0)
+        lacking = jnp.concatenate([lacking, mismatch])
+        sampled_there = sampled + jnp.square(mismatch[0])[:, None, None] * jnp.eye(2, dtype=shape.dtype)
+        covariances.append(found.covariance[0] + inclined + sampled_there)
+    return _along_rays(shape, pose, jnp.stack(places), jnp.stack(covariances), lacking, rig)
 
 
-def _along_rays(shape: Array, pose: Array, uv: Array, covariance: Array, rig: CameraRig) -> Sharpened:
+def first_slopes(
+    images: Num[Array, "C rows cols"], shape: Float[Array, "K 3"], pose: Float[Array, " 6"], rig: CameraRig
+) -> Slopes:
+    """What the pictures of one moment say of the skin's slopes: patches of the first camera as the others see them.
+
+    Args:
+        images: Grey levels at registration.
+        shape: As registered.
+        pose: Of the head in these images, millimetres and radians.
+        rig: Cameras.
+    """
+    unknown = unknown_slopes(len(shape))
+    images = jnp.asarray(images, shape.dtype)
+    uv, _ = project_shape(rig, shape, pose)
+    first = patches(images[:1], shape, pose, _one(rig, 0), jnp.asarray(SKIN_NORMALS, shape.dtype))
+
+    def again(_: Array | int, assumed: Slopes) -> Slopes:
+        looks = [
+            align(first, assumed, images[c : c + 1], uv[c : c + 1], shape, pose, _one(rig, c))
+            for c in range(1, rig.num_cameras)
+        ]
+        information = sum((look.slope_information for look in looks), jnp.zeros_like(unknown.covariance))
+        score = sum((look.slope_score for look in looks), jnp.zeros_like(unknown.mean))
+        return learn_slopes_again(unknown, assumed, information, score)
+
+    return jax.lax.fori_loop(0, LOOKS, again, unknown)
+
+
+def _along_rays(shape: Array, pose: Array, uv: Array, covariance: Array, lacking: Array, rig: CameraRig) -> Sharpened:
     """Points moved along their lines of sight of the first camera to where the other cameras have them."""
     projected, _ = project_shape(rig, shape, pose)
     by_shape, _ = jacobian(rig, shape, pose)
@@ -79,7 +122,10 @@ def _along_rays(shape: Array, pose: Array, uv: Array, covariance: Array, rig: Ca
     # A match as far as it may be from where it was: depth is nearly linear in the shift.
     shape = shape + sight * (pull / jnp.maximum(information, prior))[:, None]
     total = jnp.einsum("ckix,ckij,ckjy->kxy", by_shape, precision, by_shape)
-    return Sharpened(shape, jnp.linalg.inv(total + prior * jnp.eye(3, dtype=shape.dtype)))
+    middle = jnp.mean(sight, axis=0)
+    reach = jnp.maximum(jnp.sum(along**2), 1e-6)
+    alike = jnp.sum(lacking**2) / reach * jnp.outer(middle, middle)
+    return Sharpened(shape, jnp.linalg.inv(total + prior * jnp.eye(3, dtype=shape.dtype)), alike)
 
 
 def _one(rig: CameraRig, camera: int) -> CameraRig:

@@ -18,12 +18,18 @@ HEAD_STATUS = ("initialising", "rigid", "deformable", "lost")
 INITIALISING, RIGID, DEFORMABLE, LOST = range(4)
 FRAME_S = 1 / 30
 """Seconds: the step of time in which velocities and diffusion are counted."""
+PATIENCE = 10
+"""Frames in a row in which the face is not found before it counts as lost."""
 NUM_MODES = 5
 POSE = 6
 DEGREE = math.radians(1.0)
 UNITS = np.array([1.0, 1.0, 1.0, DEGREE, DEGREE, DEGREE])
 """Of pose, in which the paper counts velocity and diffusion: a millimetre, a degree."""
-CHOICES = {"mode": ("modern", "paper"), "diffusion": ("proportional", "learnt", "fixed")}
+CHOICES = {
+    "mode": ("modern", "paper"),
+    "diffusion": ("proportional", "learnt", "fixed"),
+    "detector": ("cascades", "mediapipe"),
+}
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,8 @@ class HeadOptions:
     """Whether the face may deform; with one camera it never does."""
     rigid_frames: int = 120
     """Frames after registration in which deformations are learnt but not yet used."""
+    detector: str = "cascades"
+    """What finds the landmarks at the start: OpenCV's `cascades` and corners, or the face mesh of `mediapipe`."""
     chunk: int = 8
     """Frames in one compiled call; 1 for live cameras."""
     live: bool = False
@@ -59,6 +67,17 @@ class HeadOptions:
             raise ValueError(f"fixed_diffusion must be positive; got {self.fixed_diffusion}.")
         if self.rigid_frames < 0:
             raise ValueError(f"rigid_frames must be 0 or more; got {self.rigid_frames}.")
+
+
+def compiled(options: HeadOptions) -> HeadOptions:
+    """What of the options a compiled program knows: those that differ only in numbers share one.
+
+    The diffusion is among the filters and in the state, but for whether it is learnt.
+    """
+    learns = "learnt" if options.diffusion == "learnt" else "proportional"
+    return HeadOptions(
+        options.mode, options.num_particles, diffusion=learns, learn=options.learn, rigid_frames=options.rigid_frames
+    )
 
 
 class Learner(NamedTuple):
@@ -82,6 +101,8 @@ class Registered(NamedTuple):
     """Neutral, model frame, millimetres."""
     covariance: Float[Array, "K 3 3"]
     """Of each landmark's place, model frame, mm^2."""
+    alike: Float[Array, "3 3"]
+    """Of what all of them are off alike beside that, model frame, mm^2."""
     patches: Patches
     pose: Float[Array, " 6"]
     """Of the head at registration, millimetres and radians."""
@@ -98,6 +119,8 @@ class Recent(NamedTuple):
     """From the model's landmarks to there, pixels."""
     expected: Float[Array, "C K W W"]
     """Grey levels about the model's landmarks."""
+    drift: Float[Array, "C K"]
+    """Variance of where landmarks were found about those that were registered, pixels squared, from following."""
     has_changed: Bool[Array, "C K"]
     """Which landmarks do not look as registered, or are not where the model has them."""
     shape: Float[Array, "K 3"]
@@ -123,6 +146,8 @@ class HeadState(NamedTuple):
     misfit: Float[Array, ""]
     """Squared error of the alignments over what they claim."""
     learner: Learner
+    last_good: Float[Array, " d"]
+    """The estimate of the last frame in which the face was found."""
     misses: Int[Array, ""]
     """Frames in a row in which the face was not found."""
     strange: Int[Array, ""]

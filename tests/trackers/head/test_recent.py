@@ -67,3 +67,30 @@ def test_templates_are_renewed_only_where_the_looks_have_changed(scene):
     np.testing.assert_array_equal(new[:, others], templates[:, others])
     window = np.asarray(last.expected)[:, CHANGED, 4:-4, 4:-4]
     np.testing.assert_allclose(new[:, CHANGED], window, atol=1.0)
+
+
+def test_a_landmark_drifts_with_every_frame_until_it_is_anchored_again(scene):
+    rig, registered, shape, pose, uv, (before, after) = scene
+    slopes = unknown_slopes(len(shape))
+    found = jax.jit(align)(registered, slopes, after, uv, shape, pose, rig)
+    anchored, last = recent.is_anchored(found), recent.nothing_changed(before, shape, pose, rig)
+    again, is_followed = jax.jit(recent.followed)(last, found, slopes, after, uv, shape, pose, rig)
+    variances = []
+    for _ in range(3):
+        drift = recent.drifted(last, is_followed)
+        last = recent.as_seen(again, anchored, shape, pose, after, rig, drift)
+        variances.append(np.asarray(last.drift))
+        np.testing.assert_array_equal(drift, last.drift)
+    step = recent.DRIFT_PX**2
+    np.testing.assert_allclose(np.array(variances)[:, :, CHANGED], np.outer([1, 2, 3], [step, step]), rtol=1e-5)
+    assert not np.delete(variances[-1], CHANGED, axis=1).any()
+    grown = last._replace(drift=jnp.full_like(last.drift, 1e3))
+    np.testing.assert_allclose(recent.drifted(grown, is_followed)[:, CHANGED], recent.MOST_DRIFT_PX**2)
+    # Where nothing is found the model alone says where the landmark is; as registered again, it is known.
+    hidden = again._replace(score=jnp.zeros_like(again.score))
+    nowhere = recent.as_seen(
+        hidden, jnp.zeros_like(anchored), shape, pose, after, rig, recent.drifted(last, is_followed)
+    )
+    np.testing.assert_array_equal(nowhere.drift, recent.MOST_DRIFT_PX**2)
+    back = recent.as_seen(again, jnp.ones_like(anchored), shape, pose, after, rig, jnp.zeros_like(last.drift))
+    np.testing.assert_array_equal(back.drift, 0.0)

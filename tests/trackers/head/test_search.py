@@ -15,9 +15,19 @@ from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.head import search as module
 from jaxfilters.trackers.head.registration import register
-from jaxfilters.trackers.head.search import HIGH, KAPPA, LEAST_DEVIATION, LOW, FaceLikelihood, at, gathered, searches
+from jaxfilters.trackers.head.search import (
+    HIGH,
+    KAPPA,
+    LEAST_DEVIATION,
+    LOW,
+    FaceLikelihood,
+    at,
+    first_diffusion,
+    gathered,
+    searches,
+)
 from jaxfilters.trackers.head.search import start as start_search
-from jaxfilters.trackers.head.state import NUM_MODES, POSE, UNITS, HeadOptions
+from jaxfilters.trackers.head.state import NUM_MODES, POSE, UNITS, HeadOptions, compiled
 
 N = 300
 OPTIONS = HeadOptions(num_particles=N)
@@ -61,6 +71,18 @@ def test_the_registered_face_scores_nearly_all_there_is(face):
     assert float(score_at(face.rigid, face.rigid.templates, face.rig, outside, face.images)) == -1
     behind = face.x.at[2].set(-650.0)
     assert float(score_at(face.rigid, face.rigid.templates, face.rig, behind, face.images)) == -1
+
+
+def test_landmarks_that_are_turned_away_have_no_part_in_the_score(face):
+    """They have flat templates; the score is the mean of the others, also with none left."""
+    whole = float(score_at(face.rigid, face.rigid.templates, face.rig, face.x, face.images))
+    hidden = face.rigid.templates.at[:, 3:].set(0.0)
+    some = float(score_at(face.rigid, hidden, face.rig, face.x, face.images))
+    uv, _ = project_shape(face.rig, face.rigid.mean, face.x[:POSE])
+    expected = np.mean([float(_score(face.images[c], hidden[c, k], uv[c, k])) for c, k in np.ndindex(2, 3)])
+    assert some == pytest.approx(expected, abs=1e-5)
+    assert some > 0.9 * whole
+    assert float(score_at(face.rigid, 0 * hidden, face.rig, face.x, face.images)) == 0
 
 
 def particles_about(face, deformed=1.0, n=N):
@@ -150,6 +172,16 @@ def test_a_fixed_diffusion_does_not_care_for_speed(face, fixed, expected):
         state = start_search(face.x, options)._replace(velocity=jnp.asarray(speed * UNITS, float))
         spread = step(filter, jax.random.key(0), state, 1.0).spread[:POSE]
         np.testing.assert_allclose(spread, HIGH if expected is None else expected * UNITS, rtol=1e-5)
+
+
+def test_options_that_differ_in_numbers_share_a_program():
+    """The diffusion is a leaf of filters and state, not a constant of what is compiled."""
+    fixed = [HeadOptions(diffusion="fixed", fixed_diffusion=value, seed=i) for i, value in enumerate((1.0, 5.0))]
+    assert compiled(fixed[0]) == compiled(fixed[1]) == compiled(HeadOptions())
+    assert compiled(HeadOptions(diffusion="learnt")) != compiled(HeadOptions())
+    assert compiled(HeadOptions(mode="paper")) != compiled(HeadOptions())
+    one, two = (jax.tree.structure(first_diffusion(options)) for options in fixed)
+    assert one == two
 
 
 def test_the_filter_is_fitted_to_the_model_of_the_day(face):

@@ -10,8 +10,9 @@ import pytest
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic.face_sequence import sequence
+from jaxfilters.trackers.head import mesh
 from jaxfilters.trackers.head import session as module
-from jaxfilters.trackers.head.detect import STABLE_FRAMES
+from jaxfilters.trackers.head.detect import STABLE_FRAMES, Detection
 from jaxfilters.trackers.head.session import HeadSession
 from jaxfilters.trackers.head.state import DEFORMABLE, INITIALISING, LOST, NUM_MODES, RIGID, HeadOptions
 from jaxfilters.trackers.head.track import PATIENCE
@@ -184,11 +185,72 @@ def test_a_rig_that_contradicts_the_images_is_an_event(drawn):
     assert "epipolar" in session.events[0][1]
 
 
+def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
+    """Looks once a second: elsewhere twice, once where the track is, then elsewhere three times in a row."""
+    images, points = drawn(9)
+    away = np.array([0.0, 2 * EYES_APART])
+    elsewhere, same = (
+        Detection(p, np.zeros(4), np.zeros((2, 4)), np.zeros(4), 1) for p in (points[:6] + away, points[:6])
+    )
+    answers = [elsewhere, elsewhere, same, None, elsewhere, None, elsewhere, elsewhere]
+    asked = []
+
+    def look(image, near):
+        asked.append(near)
+        return answers[len(asked) - 1] if len(asked) <= len(answers) else None
+
+    monkeypatch.setattr(module, "detect", look)
+    session = HeadSession(nominal(), points=points)
+    # A frame every half second, so that every other one is looked at.
+    statuses = [session.process(images[:1], np.array([0.0])).status[0]]
+    for i in range(1, 17):
+        statuses.append(session.process(images[i % 9][None], np.array([0.5 * i])).status[0])
+    assert statuses[:17] == [INITIALISING] + [RIGID] * 16
+    np.testing.assert_allclose(asked, np.tile(points.mean(axis=0), (8, 1)), atol=1)
+    assert session.events[-1] == (16, "lost: the face is seen elsewhere")
+    # It is not the old place that counts now, but what the detector sees.
+    again = [session.process(images[i][None], np.array([9.0 + i])).status[0] for i in range(6)]
+    assert again == [LOST] * STABLE_FRAMES + [RIGID]
+    assert said(session)[-1].startswith("registered")
+
+
+def test_a_live_session_follows_and_registers_anew_beside_the_frames(drawn):
+    """Frame by frame: lost behind noise, found elsewhere by a search whose answer comes some frames later."""
+    start, points = drawn(4)
+    session = HeadSession(nominal(), HeadOptions(live=True), points=points)
+    rows = [session.process(start[i : i + 1], times(1, i)) for i in range(4)]
+    assert [row.status[0] for row in rows] == [INITIALISING] + [RIGID] * 3
+    np.testing.assert_allclose(rows[-1].image_points[0, 0, :4].mean(axis=0), MIDDLE, atol=1)
+    for i in range(4, 4 + PATIENCE):
+        rows.append(session.process(snow(1, i), times(1, i)))
+    assert rows[-1].status[0] == LOST
+    place = (MIDDLE[0] - 60, MIDDLE[1] + 90)
+    moved, _ = drawn(9, place, seed=3)
+    for i in range(14, 1000):
+        rows.append(session.process(moved[i % 9][None], times(1, i)))
+        if rows[-1].status[0] == RIGID:
+            break
+        assert rows[-1].status[0] == LOST
+        assert np.all(np.isnan(rows[-1].pose))
+        time.sleep(0.01)
+    np.testing.assert_allclose(rows[-1].image_points[0, 0, :4].mean(axis=0), place, atol=2)
+    assert said(session)[-1] == "registered, a face that is known"
+
+
+def test_a_detector_that_is_not_installed_is_refused(monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(mesh, "import_module", missing)
+    with pytest.raises(ImportError, match=r"mediapipe==0\.10\.14"):
+        HeadSession(nominal(), HeadOptions(detector="mediapipe"))
+
+
 def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
     """It is registered in the images that were searched, of their time, though others have come meanwhile."""
     begun = []
 
-    def begin(key, model, pose, images, time, rig, *, options):
+    def begin(key, model, pose, images, time, rig, *, options, diffusion):
         begun.append(images)
         return SimpleNamespace(model=model)
 
@@ -228,6 +290,7 @@ def test_images_that_do_not_fit_the_rig_are_refused():
     [
         ({"mode": "fast"}, "mode must be one of modern, paper"),
         ({"diffusion": "none"}, "diffusion must be one of"),
+        ({"detector": "eyes"}, "detector must be one of cascades, mediapipe"),
         ({"num_particles": 0}, "num_particles must be at least 1"),
         ({"chunk": 0}, "chunk must be at least 1"),
         ({"fixed_diffusion": 0.0}, "fixed_diffusion must be positive"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.face.patches import SKIN_NORMALS, unknown_slopes
+from jaxfilters.models.face.patches import CURVATURE_STD, SKIN_NORMALS, unknown_slopes
 from jaxfilters.models.face.rig import monocular, project_shape
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
@@ -15,9 +15,10 @@ from jaxfilters.trackers.head import sharpening
 from jaxfilters.trackers.head.registration import register, register_monocular
 from jaxfilters.trackers.head.sharpening import UNSEEN_DEPTH_MM
 
-sharpened = jax.jit(sharpening.sharpened)
+sharpened, first_slopes = jax.jit(sharpening.sharpened), jax.jit(sharpening.first_slopes)
 SEEDS = range(8)
-KNOWN = 0.05
+FLAT = np.array([0.05, 0.05, 0.001, 0.001, 0.001])
+"""How well the slopes and curvatures of planes are known."""
 
 
 def slopes_of_the_planes():
@@ -30,7 +31,9 @@ def slopes_of_the_planes():
     lift = sight / (unit @ sight)[:, None]
     mean = -np.einsum("kx,kxi->ki", NORMALS, within) / np.einsum("kx,kx->k", NORMALS, lift)[:, None]
     slopes = unknown_slopes(10)
-    return slopes._replace(mean=jnp.asarray(mean, float), covariance=jnp.tile(KNOWN**2 * jnp.eye(2), (10, 1, 1)))
+    return slopes._replace(
+        mean=slopes.mean.at[:, :2].set(mean), covariance=jnp.tile(jnp.diag(jnp.asarray(FLAT**2)), (10, 1, 1))
+    )
 
 
 class Start:
@@ -46,7 +49,7 @@ class Start:
 
     def sharpened(self, slopes, images=None):
         images = self.images if images is None else images
-        return sharpened(images, self.shape, self.pose, slopes, jnp.ones(()), self.rig)
+        return sharpened(images, self.shape, self.pose, slopes, self.rig)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +103,7 @@ def test_landmarks_stay_where_they_are_in_the_first_image(starts):
 def test_a_second_time_changes_little(starts):
     slopes = slopes_of_the_planes()
     once = starts[0].sharpened(slopes)
-    twice = sharpened(starts[0].images, once.shape, starts[0].pose, slopes, jnp.ones(()), starts[0].rig)
+    twice = sharpened(starts[0].images, once.shape, starts[0].pose, slopes, starts[0].rig)
     first, second = (np.abs(b - a)[:, 2].max() for a, b in ((starts[0].shape, once.shape), (once.shape, twice.shape)))
     assert second < 0.25 * first
 
@@ -118,19 +121,40 @@ def test_what_is_not_found_stays_where_it_was(starts):
     assert depths[0] > 2 * depths[1]
 
 
-def test_errors_that_were_larger_than_claimed_make_depths_less_certain(starts):
+def test_pictures_that_differ_make_depths_less_certain(starts):
+    """Something else behind the edge of a face, say: noise in one window of the second image."""
     one, slopes = starts[2], slopes_of_the_planes()
-    sure = one.sharpened(slopes)
-    unsure = sharpened(one.images, one.shape, one.pose, slopes, 9 * jnp.ones(()), one.rig)
-    np.testing.assert_allclose(unsure.shape, sure.shape, atol=0.05)
-    assert np.all(np.asarray(unsure.covariance)[:, 2, 2] > np.asarray(sure.covariance)[:, 2, 2])
+    u, v = np.round(np.asarray(one.uv)[1, 4]).astype(int)
+    images = one.images.copy()
+    window = images[1, v - 8 : v + 8, u - 8 : u + 8]
+    images[1, v - 8 : v + 8, u - 8 : u + 8] = window + np.random.default_rng(0).integers(-10, 11, window.shape)
+    sure, unsure = one.sharpened(slopes), one.sharpened(slopes, images)
+    ratio = np.sqrt(np.asarray(unsure.covariance)[:, 2, 2] / np.asarray(sure.covariance)[:, 2, 2])
+    assert ratio[4] > 1.5
+    np.testing.assert_allclose(np.delete(ratio, 4), 1, atol=0.05)
+
+
+def test_pictures_of_one_moment_tell_the_slopes(starts):
+    """Closer to those of the planes than an average head's, and no curvature; depths become better by as much."""
+    true = np.asarray(slopes_of_the_planes().mean)
+    found = [first_slopes(one.images, one.shape, one.pose, one.rig) for one in starts]
+    off = np.stack([np.asarray(slopes.mean) - true for slopes in found])
+    claimed = np.stack([np.diagonal(slopes.covariance, axis1=1, axis2=2) for slopes in found])
+    assert np.sqrt(np.mean(off[..., :2] ** 2)) < 0.7 * np.sqrt(np.mean(true[:, :2] ** 2))
+    assert np.mean(off**2 / claimed) < 1.3
+    assert np.all(np.sqrt(claimed[..., 2:]) < CURVATURE_STD)
+    depths = [
+        depth([np.asarray(one.sharpened(s).shape) - one.true for one, s in zip(starts, chosen, strict=True)])
+        for chosen in (found, [unknown_slopes(10)] * len(starts))
+    ]
+    assert depths[0] < 0.8 * depths[1]
 
 
 def test_one_camera_knows_nothing_of_depth(starts):
     rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
     image, points = starts[0].images[0], starts[0].points
     model, pose, _ = register_monocular(image, points, rig)
-    found = sharpened(image[None], model.mean, pose, unknown_slopes(10), jnp.ones(()), rig)
+    found = sharpened(image[None], model.mean, pose, unknown_slopes(10), rig)
     np.testing.assert_allclose(found.shape, model.mean, atol=1e-4)
     largest = np.sqrt(np.linalg.eigvalsh(found.covariance)[:, -1])
     np.testing.assert_allclose(largest, UNSEEN_DEPTH_MM, rtol=0.01)

@@ -10,8 +10,8 @@ from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
 from jaxfilters.trackers.head import track as module
 from jaxfilters.trackers.head.registration import register
-from jaxfilters.trackers.head.search import searches
-from jaxfilters.trackers.head.state import LOST, NUM_MODES, RIGID, UNITS, HeadOptions
+from jaxfilters.trackers.head.search import first_diffusion, searches
+from jaxfilters.trackers.head.state import LOST, NUM_MODES, RIGID, UNITS, HeadOptions, compiled
 
 CHUNK = 8
 MODERN, PAPER = HeadOptions(), HeadOptions(mode="paper")
@@ -31,7 +31,8 @@ class Video:
     def begin(self, options, seed=0):
         model, pose, _ = self.registration
         time = jnp.asarray(self.video.times[0], float)
-        return begin(jax.random.key(seed), model, pose, self.images[0], time, self.video.rig, options=options)
+        arguments = jax.random.key(seed), model, pose, self.images[0], time, self.video.rig
+        return begin(*arguments, options=compiled(options), diffusion=first_diffusion(options))
 
     def advance(self, state, start, stop, options, filters=None, chunk=CHUNK):
         """State after the frames `start` to `stop`, at most a chunk, and their rows."""
@@ -39,10 +40,8 @@ class Video:
         images[: stop - start] = self.images[start:stop]
         times = np.resize(self.video.times[start:stop], chunk).astype(np.float32)
         filters = searches(self.video.rig, options) if filters is None else filters
-        # The diffusion is in the filters and in the state: one program serves all of them.
-        mode = MODERN if options.mode == "modern" else PAPER
         is_frame = np.arange(chunk) < stop - start
-        state, track = module.advance(self.video.rig, filters, state, images, times, is_frame, mode)
+        state, track = module.advance(self.video.rig, filters, state, images, times, is_frame, compiled(options))
         return state, jax.tree.map(lambda a: np.asarray(a)[: stop - start], track)
 
     def track(self, options):
@@ -173,14 +172,27 @@ def test_a_face_behind_noise_is_missed_and_then_lost(videos):
     state, _ = video.advance(video.begin(MODERN), 1, 6, MODERN)
     hidden = Video.__new__(Video)
     hidden.video = video.video
-    hidden.images = np.random.default_rng(0).integers(0, 256, (20, 2, 480, 640), np.uint8)
+    hidden.images = np.random.default_rng(0).integers(0, 256, (30, 2, 480, 640), np.uint8)
     after, first = hidden.advance(state, 6, 14, MODERN)
     np.testing.assert_array_equal(first.status, RIGID)
     assert int(after.misses) == 8
     assert np.all(first.score < module.LEAST_SCORE)
     assert np.all(first.pose_std[-1] > first.pose_std[0])
-    after, second = hidden.advance(after, 12, 20, MODERN)
+    after, second = hidden.advance(after, 14, 22, MODERN)
     np.testing.assert_array_equal(second.status, [RIGID] * (module.PATIENCE - 9) + [LOST] * (17 - module.PATIENCE))
+    # Particles gather where the face was last seen, ever farther around, and find it when it shows again.
+    kept = np.asarray(state.belief.mean)
+    np.testing.assert_array_equal(after.last_good, kept)
+    after, third = hidden.advance(after, 22, 30, MODERN)
+    np.testing.assert_array_equal(third.status, LOST)
+    off = (np.asarray(after.search.particles)[:6] - kept[:6, None]) / UNITS[:, None]
+    assert np.all(np.abs(off.mean(axis=1)) < module.MOST_ASTRAY)
+    assert np.all(off.std(axis=1) < 2 * module.MOST_ASTRAY)
+    assert off.std(axis=1).max() > 1
+    back, found = video.advance(after, 30, 38, MODERN)
+    assert found.status[-1] == RIGID
+    np.testing.assert_allclose(found.pose[-1], video.video.poses[37], atol=0.5)
+    assert int(back.misses) == 0
     # What was learnt of the face stays as it was.
     for name in ("slopes", "looseness", "misfit", "registered"):
         jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(state, name))
