@@ -276,21 +276,19 @@ def run_people(
         if runs.desks is not None:
             furniture = (patch_depth(scene.cameras[0], jnp.asarray(runs.desks[number])),)
         begin = known_people(scene.config, jnp.asarray(start, jnp.float32), start_sd_m, height)
-        foreground = jnp.asarray(straightened(calibration, masks))
-        found.append(_people_run(replace(scene, furniture=furniture), begin, foreground))
+        found.append(_people_run(replace(scene, furniture=furniture), begin, straightened(calibration, masks)))
     return _estimates(found, runs.starts.shape[1])
 
 
-@jax.jit
-def _people_run(scene: PeopleScene, people: People, foreground):
-    image = jnp.zeros((*SHAPE, 3), jnp.uint8)
-
-    def advance(people, mask):
-        people, report = tracker.step(scene, people, (CameraFrame(mask, image, jnp.asarray(True)),), FRAME_S)
-        return people, report
-
-    _, reports = jax.lax.scan(advance, people, foreground)
-    return reports.xy, reports.score[-1], reports.flatness[-1], reports.sd_radial[-1]
+def _people_run(scene: PeopleScene, people: People, foreground: UInt8[np.ndarray, "frames rows cols"]):
+    """One frame after the other: one program serves all rooms and numbers of frames."""
+    image, reports = np.zeros((*SHAPE, 3), np.uint8), []
+    for mask in foreground:
+        frame = CameraFrame(mask, image, np.bool_(True))
+        people, report = tracker.step(scene, people, (frame,), np.float32(FRAME_S))
+        reports.append(report)
+    last = reports[-1]
+    return np.stack(jax.device_get([report.xy for report in reports])), last.score, last.flatness, last.sd_radial
 
 
 def known_people(config: PeopleConfig, xy: Float[Array, "people 2"], sd: float, height: tuple[float, float]) -> People:

@@ -9,8 +9,10 @@ given with `--out` receives `tracks.csv` and `floor_plan.png`.
 """
 
 import csv
+import itertools
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +25,7 @@ from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
 from jaxfilters.benchmarks.scenarios._pets import Pets, images, load_pets, probability
 from jaxfilters.trackers.background import background
+from jaxfilters.trackers.people.following import follow
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import start, step
@@ -57,7 +60,7 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     pets = load_pets(recording_folder("pets09_s2l1_view001"), PeopleConfig())
     path = truth or pets.folder / "gt_0_399.csv"
     annotated = read_truth(path, pets)
-    followed = follow(pets, QUICK_FRAMES if quick else None)
+    followed = follow_video(pets, QUICK_FRAMES if quick else None)
     last = min(int(annotated.frame[-1]), len(followed.tracking_s) - 1)
     if annotated.frame[0] > last:
         raise RecordingError(f"{path} begins with frame {annotated.frame[0]}, but only {last + 1} were tracked.")
@@ -77,33 +80,35 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     return metrics
 
 
-def follow(pets: Pets, frames: int | None) -> Followed:
+def follow_video(pets: Pets, frames: int | None) -> Followed:
     """The whole pipeline over the first frames of the video; over all without a number."""
     subtraction = background("median")
     subtraction.prime(image for i, image in enumerate(images(pets)) if i % PRIME_EVERY == 0)
-    people, recorder = start(pets.scene), Recorder()
+    recorder, clocks = Recorder(), []
     confirmed: list[tuple[int, int, float, float]] = []
-    seconds = []
-    jax.block_until_ready(step(pets.scene, people, (_nothing(pets),), np.float32(0)))
-    before = time.perf_counter()
-    for i, image in enumerate(images(pets)):
-        if i == frames:
-            break
-        clock = [before, time.perf_counter()]
-        foreground = probability(subtraction, image)
-        clock.append(time.perf_counter())
-        frame = CameraFrame(foreground, image, np.bool_(True))
-        people, report = jax.block_until_ready(step(pets.scene, people, (frame,), np.float32(1 / FRAMES_PER_SECOND)))
-        clock.append(time.perf_counter())
-        known, said = jax.device_get((people, report))
-        added = recorder.add(i, i / FRAMES_PER_SECOND, known, said)
-        confirmed += [(i, who, float(seen.mean[0]), float(seen.mean[1])) for who, seen in added if seen.frame == i]
-        seconds.append(np.diff(clock))
-        if i % 100 == 99:
-            sys.stderr.write(f"  {i + 1} frames\n")
+    tracking = []
+
+    def moments() -> Iterator[tuple[float, tuple[CameraFrame, ...]]]:
         before = time.perf_counter()
-    inputs, subtracting, tracking = np.transpose(seconds)
-    return Followed(confirmed, recorder.tracks, tracking, subtracting, inputs)
+        for i, image in enumerate(itertools.islice(images(pets), frames)):
+            clock = [before, time.perf_counter()]
+            seen = probability(subtraction, image)
+            clocks.append(np.diff([*clock, time.perf_counter()]))
+            yield i / FRAMES_PER_SECOND, (CameraFrame(seen, image, np.bool_(True)),)
+            before = time.perf_counter()
+
+    jax.block_until_ready(step(pets.scene, start(pets.scene), (_nothing(pets),), np.float32(0)))
+    for now in follow(pets.scene, moments(), recorder):
+        confirmed += [
+            (now.frame, who, float(seen.mean[0]), float(seen.mean[1]))
+            for who, seen in now.added
+            if seen.frame == now.frame
+        ]
+        tracking.append(now.seconds)
+        if now.frame % 100 == 99:
+            sys.stderr.write(f"  {now.frame + 1} frames\n")
+    inputs, subtracting = np.transpose(clocks)
+    return Followed(confirmed, recorder.tracks, np.array(tracking), subtracting, inputs)
 
 
 def read_truth(path: Path, pets: Pets) -> FloorTracks:

@@ -85,9 +85,16 @@ def outline(P: Float[Array, "3 4"], body: Ellipsoid) -> Outline:
 
 
 def _code(P, body, depth, reach):
-    away = (-jnp.linalg.solve(P[:, :3], P[:, 3]) - body.center) / body.semi_axes
+    away = (_position(P) - body.center) / body.semi_axes
     crossing = jnp.where(depth**2 > reach, jnp.where(depth > 0, VISIBLE, BEHIND), CROSSING)
     return jnp.where(jnp.sum(away**2) <= 1, INSIDE, crossing)
+
+
+def _position(P):
+    """Of the camera, metres; by Cramer's rule, which needs no call for every body."""
+    first, second, third = P[:, :3]
+    adjugate = jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)])
+    return -(P[:, 3] @ adjugate) / (first @ adjugate[0])
 
 
 def outline_radius(seen: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:

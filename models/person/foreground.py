@@ -13,6 +13,7 @@ the others do not explain: people who hide each other, and blobs of several peop
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
@@ -95,11 +96,16 @@ def presence(
         spread_px: How far silhouettes reach beyond their edges, pixels.
     """
     height, width = jnp.asarray(height), jnp.asarray(width)
+    center, half_height, radius, _, _ = jnp.array(PARTS).T
+    outlines = jax.vmap(lambda part: grown(outline(P, part), spread_px))(
+        Ellipsoid(
+            jnp.stack([*jnp.broadcast_to(xy[:, None], (2, len(PARTS))), center * height], axis=-1),
+            jnp.stack([radius * width, radius * width, half_height * height], axis=-1),
+        )
+    )
     absent = jnp.ones(uv.shape[:-1])
-    for part in PARTS:
-        radius = part.radius * width
-        body = Ellipsoid(jnp.append(xy, part.center * height), jnp.stack([radius, radius, part.half_height * height]))
-        squared = outline_radius(grown(outline(P, body), spread_px), uv)
+    for number, part in enumerate(PARTS):
+        squared = outline_radius(jax.tree.map(lambda leaf, number=number: leaf[number], outlines), uv)
         absent = absent * (1 - part.presence / (1 + squared**part.falloff))
     return 1 - absent
 

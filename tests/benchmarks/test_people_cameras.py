@@ -6,12 +6,21 @@ import pytest
 from jaxfilters.benchmarks.multi_object import floor_tracks
 from jaxfilters.benchmarks.scenarios import _pom, people_cameras
 from jaxfilters.benchmarks.scenarios.people_cameras import SETUPS, Setup, handovers, joined, sees_whole, truth
+from jaxfilters.trackers.people import demo_room as demo
 from jaxfilters.trackers.people.demo_room import demo_room
 
 
 @pytest.fixture(scope="module")
 def room():
     return demo_room(0, cameras=4, frames=150)
+
+
+@pytest.fixture
+def half_size(monkeypatch):
+    """Images of half the width and height, drawn in a quarter of the time."""
+    rows, cols = demo.SHAPE
+    monkeypatch.setattr(demo, "SHAPE", (rows // 2, cols // 2))
+    monkeypatch.setattr(demo, "FOCAL_PX", demo.FOCAL_PX / 2)
 
 
 def test_cameras_deliver_as_their_setup_says():
@@ -57,13 +66,12 @@ def test_recordings_are_kept_apart():
     np.testing.assert_array_equal(both.xy_m[2:], one.xy_m)
 
 
+@pytest.mark.usefixtures("half_size")
 def test_every_metric_of_a_setup_is_there(monkeypatch, capsys):
-    """One camera, a few frames, no recordings."""
+    """All cameras, as in the next test with one program for both; a few frames, no recordings."""
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
-    monkeypatch.setattr(people_cameras, "SETUPS", {"": Setup((0,))})
-    monkeypatch.setattr(people_cameras, "NUM_CAMERAS", 1)
+    monkeypatch.setattr(people_cameras, "SETUPS", {"": SETUPS[""]})
     monkeypatch.setattr(people_cameras, "QUICK_FRAMES", 30)
-    monkeypatch.setattr(people_cameras, "CAPACITY", 3)
     metrics = people_cameras.run(quick=True, seed=0, out=None)
     names = {"mota", "idf1", "id_switches", "mean_error_m", "false_positives", "misses", "handovers"}
     assert set(metrics) == names
@@ -73,6 +81,7 @@ def test_every_metric_of_a_setup_is_there(monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("half_size")
 def test_nobody_is_lost_between_four_cameras(monkeypatch):
     monkeypatch.setattr(people_cameras, "SETUPS", {name: SETUPS[name] for name in ("_narrow", "_rates")})
     tracks = people_cameras.room_tracks(1, 120)

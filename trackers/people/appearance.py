@@ -50,10 +50,10 @@ def _in_camera(scene, camera, furniture, frame, places, active):
         def hide(turn, free):
             other = order[turn]
             ahead = (outlines.depth[other] < seen.depth) & (other != k)
-            return free * (1 - presence_of(scene.config, camera, places[other], window.uv) * ahead)
+            return free * (1 - presence_of(scene.config, camera.P, places[other], window.uv) * ahead)
 
         free = jax.lax.fori_loop(0, num_active, hide, window.inside * (seen.depth < furniture.ravel()[window.pixel]))
-        mine = presence_of(scene.config, camera, places[k], window.uv) * shown * (mask[window.pixel] / 255)
+        mine = presence_of(scene.config, camera.P, places[k], window.uv) * shown * (mask[window.pixel] / 255)
         histogram, enough = _histogram(image[window.pixel], mine * free, window.uv[:, 1] < seen.center[1])
         return found[0].at[k].set(histogram), found[1].at[k].set(enough)
 

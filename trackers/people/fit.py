@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people.silhouettes import (
@@ -17,7 +16,7 @@ from jaxfilters.trackers.people.silhouettes import (
     place_of,
     share_seen,
     unexplained_of,
-    view_of,
+    views_of,
 )
 from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleScene
 
@@ -40,6 +39,8 @@ NEAR_M = 1.5
 """Two who are nearer may be one."""
 BETWEEN = 5
 """Places from one to the other at which one alone is tried."""
+
+_FAR_M = 1e6
 
 
 class Fit(NamedTuple):
@@ -78,18 +79,12 @@ def fit_people(
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
     """
-    config = scene.config
     start = place_of(predicted.mean)
     prior = _prior(predicted)
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
     reach = _reach(predicted, axes)
-    views = tuple(
-        jax.vmap(view_of, in_axes=(None, None, None, None, 0, 0, 0))(
-            config, camera, furniture, frame, start, axes, reach
-        )
-        for camera, furniture, frame in zip(scene.cameras, scene.furniture, frames, strict=True)
-    )
-    order = _nearest_first(scene.cameras[0], start, active)
+    views = jax.vmap(views_of, in_axes=(None, None, 0, 0, 0))(scene, frames, start, axes, reach)
+    order = _nearest_first(scene, views, start, active)
 
     def one_person(turn, places):
         k = order[turn % num_active]
@@ -105,16 +100,24 @@ def fit_people(
             nearest_first = jnp.argsort(jnp.sum(offsets**2, axis=-1))
             return candidates[nearest_first[jnp.argmax(total[nearest_first])]]
 
-        steps = jnp.concatenate([reach[k] / 2, jnp.array([HEIGHT_STEP_M, 0.0])])
-        wide = foreground.lattice(2, 2) @ jnp.eye(2, 4)
-        place = jax.lax.cond(turn < num_active, lambda p: best(p, wide * steps), lambda p: p, places[k])
-        for shrink in (2, 4):
-            place = best(place, foreground.lattice(3) @ jnp.eye(3, 4) * steps / shrink)
+        offsets = lattices * jnp.append(reach[k] / 2, jnp.array([HEIGHT_STEP_M, 0.0]))
+        widest = jnp.where(turn < num_active, 0, 1)
+        place = jax.lax.fori_loop(widest, len(lattices), lambda i, p: best(p, offsets[i]), places[k])
         return places.at[k].set(place)
 
-    num_active = jnp.sum(active)
+    lattices, num_active = _lattices(), jnp.sum(active)
     places = jax.lax.fori_loop(0, PASSES * num_active, one_person, start)
     return _curvature(scene, places, active, seniority, views, axes, _steps(scene, start))
+
+
+def _lattices():
+    """(3, 27, 4): candidates of a wide search, for the first pass only, and two narrow ones, in first steps along axes.
+
+    All are as many, so that one program serves them: the wide one has its middle three times.
+    """
+    wide, narrow = (foreground.lattice(n, reach) @ jnp.eye(n, 4) for n, reach in ((2, 2), (3, 1)))
+    middle = jnp.zeros((len(narrow) - len(wide), 4))
+    return jnp.stack([jnp.concatenate([wide, middle]), narrow / 2, narrow / 4])
 
 
 def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
@@ -225,6 +228,12 @@ def _reach(predicted, axes):
     return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
 
 
-def _nearest_first(camera: FloorCamera, places, active) -> Int32[Array, " slots"]:
-    distance = jnp.sum((places[:, :2] - camera.position()[:2]) ** 2, axis=-1)
-    return jnp.argsort(jnp.where(active, distance, jnp.inf))
+def _nearest_first(scene, views, places, active) -> Int32[Array, " slots"]:
+    """By the distance from the nearest camera that sees each: who is in front hides others, and is searched for first.
+
+    Whoever no camera sees comes after all who are seen.
+    """
+    distance = jnp.linalg.norm(places[:, None, :2] - scene.centers(), axis=-1)
+    seen = jnp.any(views.visible > 0, axis=-1)
+    nearest = jnp.min(jnp.where(seen, distance, _FAR_M), axis=-1)
+    return jnp.argsort(jnp.where(active, nearest, jnp.inf))

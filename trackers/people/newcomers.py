@@ -1,5 +1,6 @@
 """People nobody knows yet: foreground that nobody explains, looked for at floor points half a step apart."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,9 @@ MARGIN = 1.25
 LEAST_SHARE = 0.5
 """Of the samples that an image must show for somebody to be found there."""
 
+LEAST_CELLS = 1024
+"""A room of 90 square metres."""
+
 
 class Newcomer(NamedTuple):
     """Where somebody may have come in this frame."""
@@ -43,19 +47,29 @@ def cells_of(
     low, high = floor.min(axis=0), floor.max(axis=0)
     axes = [np.arange(a + config.cell_m / 2, b, config.cell_m) for a, b in zip(low, high, strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
-    xy = jnp.asarray(points[np.asarray(walkable(jnp.asarray(floor), jnp.asarray(points)))], jnp.float32)
-    offsets = _offsets()
-    looks = [_look(camera, depth, config, xy, offsets) for camera, depth in zip(cameras, furniture, strict=True)]
-    kept = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE if len(xy) else np.zeros(0, bool)
-    if not kept.any():
+    xy = jnp.asarray(_filled(points), jnp.float32)
+    looks = [_look(camera, depth, config, xy) for camera, depth in zip(cameras, furniture, strict=True)]
+    seen = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE
+    (kept,) = np.nonzero((seen & np.asarray(walkable(jnp.asarray(floor), xy)))[: len(points)])
+    if not len(kept):
         raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
-    return Cells(
-        xy[kept],
-        tuple(look.pixels[kept] for look in looks),
-        tuple(look.presence[kept] for look in looks),
-        tuple(look.share[kept] for look in looks),
-        tuple(look.area[kept] for look in looks),
-    )
+    pixels, presence, share, area = zip(*(_rows(look, kept) for look in looks), strict=True)
+    return Cells(_rows(xy, kept), pixels, presence, share, area)
+
+
+def _rows(tree, kept: np.ndarray):
+    """Of all leaves; by NumPy, as there is a new number of them for every floor."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[kept]), tree)
+
+
+def padded(cells: Cells) -> Cells:
+    """The same cells and some that no camera sees: one compilation for each power of two, not for each number."""
+    return jax.tree.map(lambda leaf: jnp.asarray(_filled(np.asarray(leaf))), cells)
+
+
+def _filled(rows: np.ndarray) -> np.ndarray:
+    more = max(LEAST_CELLS, 1 << (len(rows) - 1).bit_length()) - len(rows)
+    return np.pad(rows, [(0, more), *[(0, 0)] * (rows.ndim - 1)])
 
 
 def _offsets():
@@ -77,7 +91,9 @@ class _Look(NamedTuple):
     area: Float[Array, " cells"]
 
 
-def _look(camera, furniture, config, xy, offsets):
+@partial(jax.jit, static_argnums=2)
+def _look(camera, furniture, config, xy):
+    offsets = _offsets()
     rows, cols = camera.shape
     step = stride(camera.shape)
     reduced_rows, reduced_cols = -(-rows // step), -(-cols // step)
@@ -94,7 +110,7 @@ def _look(camera, furniture, config, xy, offsets):
         index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
         return _Look(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(seen) / step**2)
 
-    return jax.jit(jax.vmap(one))(xy)
+    return jax.vmap(one)(xy)
 
 
 def newcomer(
@@ -133,7 +149,7 @@ def _reduced_contrast(scene, camera, furniture, places, active, frame):
     def cover(turn, unexplained):
         place = places[order[turn]]
         ahead = outline(camera.P, body_of(place)).depth < depth
-        return unexplained * (1 - presence_of(scene.config, camera, place, uv) * ahead)
+        return unexplained * (1 - presence_of(scene.config, camera.P, place, uv) * ahead)
 
     free = jnp.full(reduced.shape, 1 - foreground.CLUTTER)
     return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))

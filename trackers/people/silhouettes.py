@@ -15,10 +15,14 @@ from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, P
 MARGIN = 0.3
 """Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
 LEAST_SIZE_M = 0.1
+SINK = 0.023
+"""Of the height, over a step: hips, at 0.53 of it, sink by 1 - cos a where legs swing to a, up to 0.42 radians."""
+STANDING_M_PER_S, WALKING_M_PER_S = 0.25, 0.75
+"""Up to the first, speed is taken for error; from the second on, strides are full ones."""
 
 
 class View(NamedTuple):
-    """One person's window in one camera."""
+    """One person's window in one camera; in `views` one row a camera."""
 
     window: Window
     foreground: Float[Array, " samples"]
@@ -32,8 +36,15 @@ class View(NamedTuple):
 
 
 def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
-    """X, Y, height and width of a state."""
-    return mean[..., jnp.array(PLACE)]
+    """X, Y, height and width of what a state looks like: somebody who walks is lower than the same one at rest."""
+    return mean[..., jnp.array(PLACE)].at[..., 2].multiply(stature(mean))
+
+
+def stature(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots"]:
+    """Height as it appears, in heights of a body of which half the frames show a stride, as those behind `presence`."""
+    speed = jnp.linalg.norm(mean[..., 2:4], axis=-1)
+    stride = (speed - STANDING_M_PER_S) / (WALKING_M_PER_S - STANDING_M_PER_S)
+    return 1 + SINK * (0.5 - jnp.clip(stride, 0.0, 1.0))
 
 
 def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
@@ -42,11 +53,11 @@ def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
 
 
 def presence_of(
-    config: PeopleConfig, camera: FloorCamera, place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
+    config: PeopleConfig, P: Float[Array, "3 4"], place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
 ) -> Float[Array, "*pixels"]:
-    """`presence` of X, Y, height and width in a camera."""
+    """`presence` of X, Y, height and width in the camera of a projection matrix."""
     height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
-    return presence(camera.P, place[:2], height, width, uv, config.spread_px)
+    return presence(P, place[:2], height, width, uv, config.spread_px)
 
 
 def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -85,6 +96,21 @@ def view_of(
     return View(window, probability, depth, visible, area_of(outline(camera.P, body)))
 
 
+def views_of(
+    scene: PeopleScene,
+    frames: tuple[CameraFrame, ...],
+    place: Float[Array, " 4"],
+    axes: Float[Array, "4 4"],
+    reach: Float[Array, " 2"],
+) -> View:
+    """The windows of somebody in all cameras, one row a camera."""
+    views = [
+        view_of(scene.config, camera, furniture, frame, place, axes, reach)
+        for camera, furniture, frame in zip(scene.cameras, scene.furniture, frames, strict=True)
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+
+
 def area_of(seen: Outline) -> Float[Array, ""]:
     """Of an outline, square pixels; one at least."""
     (a, b), (_, c) = seen.shape
@@ -92,53 +118,47 @@ def area_of(seen: Outline) -> Float[Array, ""]:
 
 
 def unexplained_of(
-    scene: PeopleScene, places: Float[Array, "slots 4"], others: Bool[Array, " slots"], views: tuple[View, ...]
-) -> tuple[Float[Array, " samples"], ...]:
-    """Probability that neither clutter nor any of the others makes the samples of a window foreground, by camera."""
+    scene: PeopleScene, places: Float[Array, "slots 4"], others: Bool[Array, " slots"], views: View
+) -> Float[Array, "cameras samples"]:
+    """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
     order = jnp.argsort(~others)
 
-    def in_camera(camera, view):
+    def in_camera(P, view):
         def hide(turn, free):
             place = places[order[turn]]
-            ahead = outline(camera.P, body_of(place)).depth < view.depth
-            return free * (1 - presence_of(scene.config, camera, place, view.window.uv) * ahead)
+            ahead = outline(P, body_of(place)).depth < view.depth
+            return free * (1 - presence_of(scene.config, P, place, view.window.uv) * ahead)
 
         free = jnp.full(view.foreground.shape, 1 - foreground.CLUTTER)
         return jax.lax.fori_loop(0, jnp.sum(others), hide, free)
 
-    return tuple(in_camera(camera, view) for camera, view in zip(scene.cameras, views, strict=True))
+    return jax.vmap(in_camera)(scene.projections(), views)
 
 
-def contrasts_of(
-    views: tuple[View, ...], unexplained: tuple[Float[Array, " samples"], ...]
-) -> tuple[Float[Array, " samples"], ...]:
+def contrasts_of(views: View, unexplained: Float[Array, "cameras samples"]) -> Float[Array, "cameras samples"]:
     """What candidates are compared with in each camera; 0 where the person would not be seen."""
-    return tuple(contrast(view.foreground, free) * view.visible for view, free in zip(views, unexplained, strict=True))
+    return contrast(views.foreground, unexplained) * views.visible
 
 
 def log_likelihood(
-    scene: PeopleScene,
-    place: Float[Array, " 4"],
-    views: tuple[View, ...],
-    contrasts: tuple[Float[Array, " samples"], ...],
+    scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
 ) -> Float[Array, ""]:
     """Log likelihood of somebody at a place over that of nobody, over all cameras, as of independent looks."""
-    total = jnp.zeros(())
-    for camera, view, b in zip(scene.cameras, views, contrasts, strict=True):
-        ratio = log_likelihood_ratio(presence_of(scene.config, camera, place, view.window.uv), b)
-        total += ratio * view.window.area / view.area
-    return scene.config.independent_patches * total
+
+    def in_camera(P, view, b):
+        ratio = log_likelihood_ratio(presence_of(scene.config, P, place, view.window.uv), b)
+        return ratio * view.window.area / view.area
+
+    return scene.config.independent_patches * jnp.sum(jax.vmap(in_camera)(scene.projections(), views, contrasts))
 
 
 def share_seen(
-    scene: PeopleScene,
-    place: Float[Array, " 4"],
-    views: tuple[View, ...],
-    unexplained: tuple[Float[Array, " samples"], ...],
+    scene: PeopleScene, place: Float[Array, " 4"], views: View, unexplained: Float[Array, "cameras samples"]
 ) -> Float[Array, ""]:
     """Of the silhouette, how much is in the image and hidden by nobody and nothing; the largest over the cameras."""
-    shares = []
-    for camera, view, free in zip(scene.cameras, views, unexplained, strict=True):
-        mine = presence_of(scene.config, camera, place, view.window.uv)
-        shares.append(jnp.sum(mine * free * view.visible) / jnp.maximum(jnp.sum(mine), 1e-6))
-    return jnp.max(jnp.stack(shares))
+
+    def in_camera(P, view, free):
+        mine = presence_of(scene.config, P, place, view.window.uv)
+        return jnp.sum(mine * free * view.visible) / jnp.maximum(jnp.sum(mine), 1e-6)
+
+    return jnp.max(jax.vmap(in_camera)(scene.projections(), views, unexplained))

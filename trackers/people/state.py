@@ -96,6 +96,10 @@ class PeopleScene:
     cells: "Cells"
     config: PeopleConfig = field(metadata=dict(static=True))
 
+    def projections(self) -> Float[Array, "cameras 3 4"]:
+        """The matrices of the cameras."""
+        return jnp.stack([camera.P for camera in self.cameras])
+
     def centers(self) -> Float[Array, "cameras 2"]:
         """Where the cameras are above the floor, metres."""
         return jnp.stack([camera.position()[:2] for camera in self.cameras])
@@ -111,7 +115,7 @@ class Cells(NamedTuple):
     presence: tuple[Float[Array, "cells samples"], ...]
     """Of a person at the samples."""
     share: tuple[Float[Array, " cells"], ...]
-    """Of the samples that lie in each image and in front of furniture."""
+    """Of the samples that lie in each image and in front of furniture; 0 for cells that only fill up their number."""
     area: tuple[Float[Array, " cells"], ...]
     """Of a person's outline, in pixels of the reduced images."""
 

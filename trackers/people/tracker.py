@@ -17,8 +17,8 @@ from jaxfilters.trackers.people.appearance import appearances
 from jaxfilters.trackers.people.exchange import after_meetings
 from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.newcomers import cells_of, newcomer
-from jaxfilters.trackers.people.silhouettes import body_of, place_of
+from jaxfilters.trackers.people.newcomers import cells_of, newcomer, padded
+from jaxfilters.trackers.people.silhouettes import body_of, place_of, stature
 from jaxfilters.trackers.people.state import (
     HEIGHT,
     PLACE,
@@ -80,7 +80,7 @@ def people_scene(
             f"got {[np.shape(depth) for depth in depths]}."
         )
     images = tuple(jnp.asarray(depth, jnp.float32) for depth in depths)
-    cells = cells_of(tuple(cameras), images, corners, config)
+    cells = padded(cells_of(tuple(cameras), images, corners, config))
     return PeopleScene(tuple(cameras), images, jnp.asarray(corners, jnp.float32), cells, config)
 
 
@@ -132,7 +132,8 @@ def _updated(config: PeopleConfig, predicted: Gaussian, fit: Fit) -> tuple[Gauss
     in_state = jnp.eye(STATE)[jnp.array(PLACE)]
 
     def one(belief, y, H, R, seen, whole):
-        after, info = joseph.update(belief, y, H @ in_state, R, mask=seen)
+        H = (H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean))
+        after, info = joseph.update(belief, y, H, R, mask=seen)
         size = jnp.arange(STATE) >= HEIGHT
         return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
 

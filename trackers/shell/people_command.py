@@ -14,9 +14,10 @@ import numpy as np
 from jaxfilters.models.person.ellipsoid import VISIBLE
 from jaxfilters.trackers.background import Background, background
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
+from jaxfilters.trackers.people.following import follow
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleConfig, PeopleScene
-from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
+from jaxfilters.trackers.people.tracker import outlines, people_scene
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.camera_files import open_camera
 from jaxfilters.trackers.shell.people_draw import drawn, write_plan
@@ -133,30 +134,34 @@ def _demo_sources(room: DemoRoom) -> list[Any]:
 
 def _follow(place: Place, options: argparse.Namespace, table: TrackTableWriter) -> Followed:
     backgrounds = _backgrounds(place, options.background)
-    people, recorder = start(place.scene), Recorder()
-    empty = [np.zeros((*camera.shape, 3), np.uint8) for camera in place.scene.cameras]
+    recorder = Recorder()
+    images = [np.zeros((*camera.shape, 3), np.uint8) for camera in place.scene.cameras]
+    keep: list[np.ndarray | None] = [None] * len(images)
     total = max((getattr(source, "frames", 0) for source in place.sources), default=0)
-    video, ends, previous, keep = None, [], 0.0, None
+    video, ends = None, []
     interrupted, index = False, -1
+
+    def moments() -> Iterator[tuple[float, tuple[CameraFrame, ...]]]:
+        for moment in together(place.sources):
+            _straighten(place, moment, images)
+            yield moment.time_s, _frames(moment, images, backgrounds, keep)
+
     try:
         with ProgressLine("tracking", total or 1_000_000) as line:
-            for index, moment in enumerate(together(place.sources)):
-                images = _straightened(place, moment, empty)
-                frames = _frames(moment, images, backgrounds, keep)
-                people, report = step(place.scene, people, frames, np.float32(moment.time_s - previous))
-                shown = jax.tree.map(np.asarray, outlines(place.scene, people))
-                known, said = (jax.tree.map(np.asarray, tree) for tree in (people, report))
-                previous = moment.time_s
-                keep = [
-                    _occupied(outline, known, image.shape[:2]) for outline, image in zip(shown, images, strict=True)
+            for now in follow(place.scene, moments(), recorder):
+                index = now.frame
+                shown = jax.tree.map(np.asarray, outlines(place.scene, now.people))
+                keep[:] = [
+                    _occupied(outline, now.people, image.shape[:2])
+                    for outline, image in zip(shown, images, strict=True)
                 ]
-                table.append(recorder.add(index, moment.time_s, known, said))
+                table.append(now.added)
                 if options.video:
-                    video = _draw(video, options.out, place, images, shown, known, moment.time_s)
+                    video = _draw(video, options.out, place, images, shown, now.people, now.time_s)
                 ends.append(time.perf_counter())
-                inside = int(np.sum(known.mode == TRACKED))
+                inside = int(np.sum(now.people.mode == TRACKED))
                 line.show(min(index + 1, total or index + 1), f"{inside} {'person' if inside == 1 else 'people'}")
-                if options.seconds and moment.time_s >= options.seconds:
+                if options.seconds and now.time_s >= options.seconds:
                     break
     except KeyboardInterrupt:
         interrupted = True
@@ -177,12 +182,11 @@ def _backgrounds(place: Place, name: str) -> list[Background]:
     return made
 
 
-def _straightened(place: Place, moment: Moment, last: list[np.ndarray]) -> list[np.ndarray]:
-    """The images without lens distortion; the last ones where a camera has nothing new."""
+def _straighten(place: Place, moment: Moment, images: list[np.ndarray]) -> None:
+    """Put in the new images without lens distortion; the last ones stay where a camera has nothing new."""
     for i, (image, undistortion) in enumerate(zip(moment.images, place.undistortions, strict=True)):
         if image is not None:
-            last[i] = undistortion.apply(image)
-    return last
+            images[i] = undistortion.apply(image)
 
 
 def _frames(moment, images, backgrounds, keep) -> tuple[CameraFrame, ...]:
@@ -191,7 +195,7 @@ def _frames(moment, images, backgrounds, keep) -> tuple[CameraFrame, ...]:
         if new is None:
             frames.append(CameraFrame(np.zeros(image.shape[:2], np.uint8), image, np.bool_(False)))
             continue
-        probability = model.apply(image, keep=None if keep is None else keep[i])
+        probability = model.apply(image, keep=keep[i])
         frames.append(CameraFrame(cv2.convertScaleAbs(probability, alpha=255.0), image, np.bool_(True)))
     return tuple(frames)
 

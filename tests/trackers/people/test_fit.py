@@ -1,5 +1,7 @@
 """The joint search: people in drawn silhouettes, and readings from parabolas against the Gaussians they are of."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
-from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
+from jaxfilters.trackers.people.fit import Fit, _nearest_first, as_measurement, fit_people
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -133,3 +135,15 @@ def test_without_an_image_nothing_is_said(found):
     assert not fit.quadratic.curvature.any()
     expected = np.stack([np.array(PLACES[k][:2]) + OFF_M[k] for k in (0, 1)])
     np.testing.assert_allclose(fit.place[[0, 2], :2], expected, atol=1e-6)
+
+
+def test_people_are_searched_for_from_the_camera_that_sees_them_outwards():
+    """Two cameras, 10 m apart; the second sees nobody but the third person, and the last slot is free."""
+    scene = SimpleNamespace(centers=lambda: jnp.array([(0.0, 0.0), (10.0, 0.0)]))
+    places = jnp.array(
+        [(4.0, 0, 1.7, 0.4), (9.0, 0, 1.7, 0.4), (7.5, 0, 1.7, 0.4), (5.0, 0, 1.7, 0.4), (0, 0, 1.7, 0.4)]
+    )
+    seen = jnp.array([(1, 0), (1, 0), (1, 1), (0, 0), (1, 1)], float)
+    views = SimpleNamespace(visible=seen[..., None] * jnp.array([0.0, 1.0]))
+    order = _nearest_first(scene, views, places, jnp.array([True, True, True, True, False]))
+    assert order.tolist() == [2, 0, 1, 3, 4]

@@ -1,12 +1,14 @@
 """Newcomers: found where silhouettes are drawn, and not where somebody explains them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people.newcomers import LEAST_SHARE, cells_of, newcomer, stride
-from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.newcomers import LEAST_CELLS, LEAST_SHARE, cells_of, newcomer, padded, stride
+from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
 CONFIG = PeopleConfig(capacity=2)
@@ -73,6 +75,32 @@ def test_cells_are_those_of_the_floor_that_a_camera_sees(camera):
     rest = cells_of((camera,), (left_hidden,), triangle, CONFIG)
     assert np.asarray(rest.xy)[:, 0].min() > -0.5
     assert len(rest.xy) == pytest.approx(len(cells.xy) / 2, rel=0.15)
+
+
+def test_cells_that_only_fill_up_change_nothing(camera, draw, floor):
+    """A scene finds the same newcomers as with its own number of cells."""
+    scene = people_scene([camera], floor, config=CONFIG)
+    own = cells_of(scene.cameras, scene.furniture, np.asarray(floor, float), CONFIG)
+    assert 0 < len(own.xy) < LEAST_CELLS == len(scene.cells.xy)
+    places, nobody = jnp.tile(jnp.array([0.0, 0.0, 1.7, 0.45]), (2, 1)), jnp.zeros(2, bool)
+    both = draw(camera, [SOMEBODY, (-1.0, 0.2, 1.7, 0.45)])[0]
+    shown = [both, draw(camera, [SOMEBODY])[0], np.zeros_like(both)]
+    search = jax.jit(newcomer)
+    frames = [(CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True)),) for mask in shown]
+    filled, plain = (
+        [search(replace(scene, cells=cells), places, nobody, frame) for frame in frames] for cells in (scene.cells, own)
+    )
+    assert [bool(new.found) for new in plain] == [True, True, False]
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(filled), jax.tree.leaves(plain), strict=True))
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, 1024), (1024, 1024), (1025, 2048), (5000, 8192)])
+def test_cells_are_filled_up_to_a_few_numbers(count, expected):
+    ones = np.ones((count, 2), np.float32)
+    filled = padded(Cells(ones, (ones.astype(np.int32),), (ones,), (ones[:, 0],), (ones[:, 0],)))
+    assert {len(leaf) for leaf in jax.tree.leaves(filled)} == {expected}
+    assert all(np.all(np.asarray(leaf)[:count] == 1) for leaf in jax.tree.leaves(filled))
+    assert not np.asarray(filled.share[0])[count:].any()
 
 
 def test_a_floor_that_no_camera_sees_is_named(camera):
