@@ -65,7 +65,7 @@ class Track(NamedTuple):
 def evaluate(data: str, filter: str, seed: int, estimate: Estimate, truth: HandSequence) -> Run:
     """Errors of estimates against the truth of the same frames."""
     joints = 1e3 * np.linalg.norm(np.asarray(estimate.joints) - np.asarray(truth.joints), axis=-1)[SETTLED:]
-    pose_error = np.asarray(jax.vmap(local)(truth.poses, estimate.pose))[SETTLED:]
+    pose_error = np.asarray(_locals(truth.poses, estimate.pose))[SETTLED:]
     square = np.mean(pose_error**2, axis=0)
     wrist = 1e3 * np.sqrt(square[:3])
     return Run(
@@ -81,6 +81,11 @@ def evaluate(data: str, filter: str, seed: int, estimate: Estimate, truth: HandS
         angle_deg=float(np.degrees(np.sqrt(square[6:].mean()))),
         ess=float(np.mean(np.asarray(estimate.ess)[SETTLED:])),
     )
+
+
+@jax.jit
+def _locals(reference: Float[Array, "t 22"], poses: Float[Array, "t 22"]) -> Float[Array, "t 21"]:
+    return jax.vmap(local)(reference, poses)
 
 
 def run_all(

@@ -79,7 +79,8 @@ def box_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: A
     """Solutions and steps of this library."""
     solver = BoxLevenbergMarquardt(rtol=1e-12, atol=STATIONARY)
     options = {"lower": lower, "upper": upper}
-    found: Any = optimistix.least_squares(residuals, solver, start, (A, b, c), options, max_steps=MOST_STEPS, throw=False)
+    solve = partial(optimistix.least_squares, max_steps=MOST_STEPS, throw=False)
+    found: Any = solve(residuals, solver, start, (A, b, c), options)
     return found.value, found.stats["num_steps"]
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from jaxfilters.benchmarks.scenarios import _hand_filters as hand
-from jaxfilters.benchmarks.scenarios import pf_vs_rbpf
+from jaxfilters.benchmarks.scenarios import _step_time, pf_vs_rbpf
 from jaxfilters.benchmarks.scenarios._accuracy import Run, append_csv, evaluate, p_value_better
 from jaxfilters.benchmarks.scenarios._step_time import StepTimes
+from jaxfilters.filter import init
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.synthetic.hand import HandSequence
 
@@ -82,7 +83,7 @@ def test_time_metrics_take_the_median_of_the_ratios():
 
 def test_errors_are_those_of_a_known_shift():
     poses = jnp.tile(open_palm(jnp.array([0.0, 0.09, 0.7])), (30, 1))
-    joints = jax.vmap(lambda pose: forward_kinematics(pose, hand_geometry()).joints)(poses)
+    joints = jax.jit(jax.vmap(lambda pose: forward_kinematics(pose, hand_geometry()).joints))(poses)
     truth = HandSequence(poses, joints, jnp.zeros((0, 1, 1), jnp.uint16))
     shift = jnp.array([0.003, 0.0, 0.004]) * (jnp.arange(30) >= 10)[:, None]
     found = hand.Estimate(poses.at[:, :3].add(shift), joints + shift[:, None], jnp.full(30, 7.0))
@@ -108,7 +109,7 @@ def test_both_filters_start_from_the_same_particles_and_share_their_noise():
     setting = hand.improved()
     pf, rbpf = (build(setting, 16) for build in (hand.particle_filter, hand.rao_blackwellized))
     key = jax.random.key(0)
-    plain, marginal = (filter.init(filter.params, key) for filter in (pf, rbpf))
+    plain, marginal = (init(filter, key) for filter in (pf, rbpf))
     np.testing.assert_array_equal(plain.particles, marginal.particles)
     np.testing.assert_array_equal(plain.noise, marginal.noise)
 
@@ -124,9 +125,12 @@ def test_the_wide_filter_spreads_like_the_rao_blackwellized_one():
 
 @pytest.mark.slow
 def test_a_tiny_comparison_has_every_metric_of_the_issue(tmp_path, monkeypatch):
+    """Times and errors from recordings of one length: the same compiled simulation."""
+    num_frames = 3 * _step_time._Tracker.chunk
     monkeypatch.setattr(pf_vs_rbpf, "QUICK_COUNTS", (16,))
     monkeypatch.setattr(pf_vs_rbpf, "QUICK_ROUNDS", 2)
-    options = {"num_particles": 16, "num_seeds": 2, "num_frames": 12}
+    monkeypatch.setattr(_step_time, "NUM_FRAMES", num_frames)
+    options = {"num_particles": 16, "num_seeds": 2, "num_frames": num_frames}
     metrics = pf_vs_rbpf.run(quick=True, seed=0, out=tmp_path, **options)
     names = {f"{name}_{data}" for name in ("joint_error_mm_pf", "joint_error_mm_rbpf") for data in "ab"}
     names |= {"p_value_rbpf_better_b"}

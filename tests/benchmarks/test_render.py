@@ -41,7 +41,7 @@ def test_every_metric_is_there(monkeypatch):
 
 
 def test_without_embree_only_our_own_times_remain(monkeypatch, capsys):
-    monkeypatch.setattr(render, "NUM_POSES", 2)
+    monkeypatch.setattr(render, "NUM_POSES", 8)  # as above: the same programs
     monkeypatch.setattr(render, "QUICK_ROUNDS", 1)
     monkeypatch.setattr(render.importlib.util, "find_spec", lambda name: None)
     metrics = render.run(quick=True, seed=0, out=None)

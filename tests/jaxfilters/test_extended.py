@@ -257,9 +257,14 @@ def test_attitude_from_two_vectors_is_as_certain_as_it_says(arithmetic, lineariz
     filter = extended(
         prior, turn, noises[0], two_vectors, noises[1], linearize=linearize, arithmetic=arithmetic, manifold=ATTITUDE
     )
-    follow = jax.vmap(lambda y: run(filter, KEY, y, jnp.full(steps, dt), collect=keep_all))
-    last, (_, infos) = follow(jnp.asarray(ys, jnp.float32))
-    errors = jax.vmap(ATTITUDE.local)(last.mean, jnp.asarray(ends, jnp.float32))
+
+    @jax.jit
+    @jax.vmap
+    def follow(y, end):
+        last, (_, infos) = run(filter, KEY, y, jnp.full(steps, dt), collect=keep_all)
+        return last, infos, ATTITUDE.local(last.mean, end)
+
+    last, infos, errors = follow(jnp.asarray(ys, jnp.float32), jnp.asarray(ends, jnp.float32))
     nees = np.einsum("ri,rij,rj->r", errors, np.linalg.inv(covariance_of(last)), errors)
     # Means over the runs of chi-squared numbers with 3 and 6 degrees of freedom, at four standard errors.
     assert abs(nees.mean() - 3) < 4 * math.sqrt(2 * 3 / runs)
@@ -269,17 +274,24 @@ def test_attitude_from_two_vectors_is_as_certain_as_it_says(arithmetic, lineariz
 
 def test_the_gradient_is_that_of_the_exact_evidence(x64):
     def exact(F):
-        mean, P = jnp.asarray(MEAN), jnp.asarray(ROOT_P @ ROOT_P.T)
-        means, roots, maps, noises, map_ = [], [], [], [], jnp.eye(N)
-        for dt in DTS:
+        # Everything that is random, one below the other: the first state, and the noise of each step.
+        P, size = jnp.asarray(ROOT_P @ ROOT_P.T), N * (T + 1)
+        scales = jnp.asarray(np.append(1.0, DTS))
+        covariances = jnp.where(jnp.arange(T + 1)[:, None, None] == 0, P, ROOT_Q @ ROOT_Q.T) * scales[:, None, None]
+        random = jax.scipy.linalg.block_diag(*covariances)
+
+        def ahead(carry, inputs):
+            mean, weights = carry
+            dt, own_noise = inputs
             A = jnp.eye(N) + dt * F
-            maps, noises = [A @ one for one in maps] + [jnp.eye(N)], [*noises, dt * ROOT_Q @ ROOT_Q.T]
-            map_, mean = A @ map_, A @ mean
-            means.append(H @ mean)
-            roots.append([H @ map_, *(H @ one for one in maps)])
-        blocks = [[sum(a @ C @ b.T for a, b, C in zip(x, y, [P, *noises], strict=False)) for y in roots] for x in roots]
-        covariance = jnp.block(blocks) + jnp.kron(jnp.eye(T), ROOT_R @ ROOT_R.T)
-        return jax.scipy.stats.multivariate_normal.logpdf(YS.ravel(), jnp.concatenate(means), covariance)
+            mean, weights = A @ mean, A @ weights + own_noise
+            return (mean, weights), (H @ mean, H @ weights)
+
+        enters = jnp.eye(size).reshape(T + 1, N, size)
+        _, (means, weights) = jax.lax.scan(ahead, (jnp.asarray(MEAN), enters[0]), (jnp.asarray(DTS), enters[1:]))
+        weights = weights.reshape(T * M, size)
+        covariance = weights @ random @ weights.T + jnp.kron(jnp.eye(T), ROOT_R @ ROOT_R.T)
+        return jax.scipy.stats.multivariate_normal.logpdf(YS.ravel(), means.ravel(), covariance)
 
     def evidence(F, arithmetic):
         return loglikelihood(linear_filter(arithmetic, F), KEY, jnp.asarray(YS), jnp.asarray(DTS))
