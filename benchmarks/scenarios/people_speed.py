@@ -26,6 +26,7 @@ from jaxfilters.models.synthetic.room import floor_camera, looking, room_camera,
 from jaxfilters.models.synthetic.walkers import Walker
 from jaxfilters.trackers.background import Background, background
 from jaxfilters.trackers.people.fit import PASSES
+from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS
 from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody
 from jaxfilters.trackers.people.tracker import people_scene, step
 
@@ -137,9 +138,14 @@ def _image(seed, places, sizes, shape, with_people):
     room_key, noise_key = jax.random.split(jax.random.key(seed))
     room = room_camera(room_key, pinhole, transform, jnp.full(small, jnp.inf))
     turned = rng.uniform(0, 2 * np.pi, (2, count))
-    walkers = Walker(*(jnp.asarray(leaf, jnp.float32) for leaf in (places, *turned, np.ones(count), *sizes.T)))
-    clothes = jnp.asarray(rng.uniform(0, 100, (count, 2, 3)), jnp.float32)
-    image, _ = room_image(noise_key, room, walkers, clothes, jnp.full(count, with_people))
+    clothes = rng.uniform(0, 100, (count, 2, 3))
+    # One program for all numbers of people: the others are not there.
+    *leaves, clothes = (
+        jnp.asarray(np.resize(leaf, (CAPACITY, *leaf.shape[1:])), jnp.float32)
+        for leaf in (places, *turned, np.ones(count), *sizes.T, clothes)
+    )
+    here = (jnp.arange(CAPACITY) < count) & with_people
+    image, _ = room_image(noise_key, room, Walker(*leaves), clothes, here)
     return cv2.resize(np.asarray(image), shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
@@ -154,6 +160,6 @@ def _followed(config: PeopleConfig, places, sizes) -> People:
         belief=Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), empty.belief.covariance.shape)),
         mode=jnp.where(here, TRACKED, empty.mode),
         identity=jnp.where(here, jnp.arange(config.capacity, dtype=jnp.int32), empty.identity),
-        log_odds=jnp.where(here, 8.0, 0.0),
+        log_odds=jnp.where(here, MOST_LOG_ODDS, empty.log_odds),
         next_identity=jnp.asarray(count, jnp.int32),
     )

@@ -40,7 +40,12 @@ class FaceTracker(Protocol):
     chunk: int
     """Frames in one compiled call."""
     is_live: bool
-    """Whether frames cannot wait: a face is then searched for beside the tracking."""
+    """Whether frames cannot wait."""
+
+    @property
+    def can_wait(self) -> bool:
+        """Whether the next search goes on beside the frames; that for landmarks which a person gave must not."""
+        ...
 
     def search(self, images: np.ndarray, time: float) -> tuple[Any, list[str]]:
         """What is found in one moment's images (C, rows, cols), or `None`; and what is wrong with them."""
@@ -63,12 +68,6 @@ class FaceTracker(Protocol):
         ...
 
 
-class _Wait(NamedTuple):
-    """A search for a face that goes on beside the tracking."""
-
-    outcome: Future[tuple[Any, list[str]]]
-
-
 class Following:
     """Follows one head through frames that are handed over in pieces.
 
@@ -83,7 +82,8 @@ class Following:
         self._tracker = tracker
         self._frames, self._is_lost, self._time = 0, False, 0.0
         self._pool = ThreadPoolExecutor(1) if tracker.is_live else None
-        self._wait: _Wait | None = None
+        self._wait: Future[tuple[Any, list[str]]] | None = None
+        """A search for a face that goes on beside the tracking."""
         self._said: set[str] = set()
         self._looked, self._contradictions, self._is_refuted = -math.inf, 0, False
 
@@ -175,15 +175,15 @@ class Following:
 
     def _found(self, images: np.ndarray, time: float) -> Any:
         """What a track can begin with; in a live session that of earlier frames."""
-        if self._pool is None:
+        if self._pool is None or not self._tracker.can_wait:
             return self._told(self._tracker.search(images, time))
         if self._wait is None:
-            self._wait = _Wait(self._pool.submit(self._tracker.search, images.copy(), time))
+            self._wait = self._pool.submit(self._tracker.search, images.copy(), time)
             return None
-        if not self._wait.outcome.done():
+        if not self._wait.done():
             return None
         wait, self._wait = self._wait, None
-        return self._told(wait.outcome.result())
+        return self._told(wait.result())
 
     def _told(self, outcome: tuple[Any, list[str]]) -> Any:
         """What was found; each thing that is wrong is said once in every search."""

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.trackers.head.corners import eye_centers
 from jaxfilters.trackers.head.detect import complete, detect
 from jaxfilters.trackers.head_mono.start import DETECTED_PX, is_symmetric
@@ -105,13 +104,3 @@ class Collector:
         found = Detections(np.stack(self._points), np.stack(self._images), time)
         self.clear()
         return found
-
-
-def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:
-    """Whether landmarks given by a person can be used.
-
-    Raises:
-        ValueError: if they are not ten finite pixels.
-    """
-    if points is not None and (np.shape(points) != (NUM_LANDMARKS, 2) or not np.all(np.isfinite(points))):
-        raise ValueError(f"points must be ({NUM_LANDMARKS}, 2) finite pixels; got shape {np.shape(points)}.")

@@ -14,8 +14,9 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.following import Beginning, Following
+from jaxfilters.trackers.head.session import check_points
 from jaxfilters.trackers.head.state import INITIALISING, POSE
-from jaxfilters.trackers.head_mono.detections import Collector, Detections, check_points
+from jaxfilters.trackers.head_mono.detections import Collector, Detections
 from jaxfilters.trackers.head_mono.start import Start, begin, initialise, search_of, with_person
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head_mono.track import System, advance
@@ -123,6 +124,10 @@ class _MonoTracker:
         self._compiled = replace(options, seed=0)
         self._system = System(face, rig, search_of(rig, options))
         self._collector = Collector()
+
+    @property
+    def can_wait(self) -> bool:
+        return self.is_live and self._points is None and self._detections is None
 
     def search(self, images: np.ndarray, time: float) -> tuple[_Found | None, list[str]]:
         collector = self._collector

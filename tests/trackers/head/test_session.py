@@ -10,7 +10,7 @@ import pytest
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic.face_sequence import sequence
-from jaxfilters.trackers.head import mesh
+from jaxfilters.trackers.head import following, mesh
 from jaxfilters.trackers.head import session as module
 from jaxfilters.trackers.head.detect import STABLE_FRAMES, Detection
 from jaxfilters.trackers.head.session import HeadSession
@@ -148,11 +148,13 @@ def test_what_was_learnt_is_kept_for_a_known_face(drawn):
     images, points = drawn(2)
     session = HeadSession(nominal(), points=points)
     session.process(images, times(2))
-    state = session._state
+    state = session._following.state
     modes = np.linalg.qr(np.random.default_rng(0).normal(size=(30, NUM_MODES)))[0].astype(np.float32)
     subspace = state.learner.subspace._replace(vectors=jax.numpy.asarray(9 * modes.T))
     model = type(state.model)(state.model.mean, jax.numpy.asarray(modes), 3 * jax.numpy.ones(5), state.model.templates)
-    session._state = state._replace(model=model, learner=state.learner._replace(subspace=subspace), age=state.age + 500)
+    session._following.state = state._replace(
+        model=model, learner=state.learner._replace(subspace=subspace), age=state.age + 500
+    )
     assert session.contribution == 1
     lost = session.process(np.concatenate([snow(16), drawn(10, (MIDDLE[0] - 60, MIDDLE[1] + 90))[0]]), times(26, 2))
     assert said(session)[-1] == "registered, a face that is known"
@@ -199,7 +201,7 @@ def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
         asked.append(near)
         return answers[len(asked) - 1] if len(asked) <= len(answers) else None
 
-    monkeypatch.setattr(module, "detect", look)
+    monkeypatch.setattr(following, "detect", look)
     session = HeadSession(nominal(), points=points)
     # A frame every half second, so that every other one is looked at.
     statuses = [session.process(images[:1], np.array([0.0])).status[0]]
@@ -266,7 +268,7 @@ def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
         time.sleep(0.01)
     assert session.events == [(i, "registered")]
     assert begun[0][1, 0, 0] < i % 256
-    assert session._time == pytest.approx(begun[0][1, 0, 0] / 30)
+    assert session._following._time == pytest.approx(begun[0][1, 0, 0] / 30)
 
 
 @pytest.mark.parametrize("points", [np.zeros((9, 2)), np.full((10, 2), np.nan), np.full((10, 2), np.inf)])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.trackers.head.session import check_points
 from jaxfilters.trackers.head_mono import detections as module
-from jaxfilters.trackers.head_mono.detections import APART_S, STALE_S, Collector, check_points
+from jaxfilters.trackers.head_mono.detections import APART_S, STALE_S, Collector
 from jaxfilters.trackers.head_mono.start import is_symmetric
 from jaxfilters.trackers.head_mono.state import NUM_FRAMES
 
