@@ -8,6 +8,7 @@ normal equations are solved by the Schur complement of the frames' own variables
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -93,41 +94,64 @@ def solve_shared(
     flat, whole = _flattened(start)
     _, as_tree = ravel_pytree(start)
     low, high = (_flattened(as_tree(side))[0] for side in bounds_of({"lower": lower, "upper": upper}, start))
-    size = ravel_pytree(start.shared)[0].size
-    count = jax.tree.leaves(start.frames)[0].shape[0]
-    split = lambda x: (x[:size], x[size:].reshape(count, -1))
-    join = lambda s, f: jnp.concatenate([s, f.ravel()])
     problem = _problem(residuals, prior, start, data)
-    energy_at = lambda x: problem.energy(*split(x))
-
-    def step(carry: tuple) -> tuple:
-        x, energy, damping, growth, taken, _, _ = carry
-        blocks = _blocks(problem, *split(x))
-        gradient = join(blocks.shared, blocks.frames)
-        diagonal = join(jnp.diagonal(blocks.U), jnp.diagonal(blocks.V, axis1=1, axis2=2))
-        damping = jnp.where(damping > 0, damping, _FIRST_DAMPING * jnp.max(diagonal))
-        damping = jnp.maximum(damping, _SMALLEST)
-        free = ~held(x, gradient, low, high)
-        direction = join(*_step(blocks, damping, *split(free)))
-        # Rounding can take a nearly singular matrix below zero; the gradient then leads on.
-        direction = jnp.where(jnp.all(jnp.isfinite(direction)), direction, -jnp.where(free, gradient, 0.0) / damping)
-        product = lambda y: join(*blocks.product(*split(y)))
-        y, success, gain = searched(energy_at, x, direction, gradient, product, energy, low, high)
-        eased = damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-        finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(gradient))
-        moved = jnp.max(jnp.abs(y - x), initial=0.0) > rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
-        rest = jnp.max(jnp.abs(x - jnp.clip(x - gradient, low, high)), initial=0.0)
-        y = jnp.where(finite, y, x)
-        damping, growth = jnp.where(success, eased, damping * growth), jnp.where(success, 2.0, 2 * growth)
-        return y, energy_at(y), damping, growth, taken + 1, moved & (rest > atol) & finite, finite
-
+    advance = partial(_advance, problem, low, high, rtol, atol)
     x = jnp.clip(flat, low, high)
-    zero, yes = jnp.zeros((), x.dtype), jnp.ones((), bool)
-    begin = (x, energy_at(x), zero, zero + 2, jnp.zeros((), jnp.int32), yes, yes)
-    x, energy, _, _, taken, _, finite = jax.lax.while_loop(lambda c: c[5] & (c[4] < steps), step, begin)
-    blocks = _blocks(problem, *split(x))
-    rest = jnp.max(jnp.abs(x - jnp.clip(x - join(blocks.shared, blocks.frames), low, high)), initial=0.0)
-    return SharedSolution(whole(x), energy, rest, taken, finite)
+    zero = jnp.zeros((), x.dtype)
+    begin = _Walk(
+        x, problem.energy(x), zero, zero + 2, jnp.zeros((), jnp.int32), jnp.ones((), bool), jnp.ones((), bool)
+    )
+    end = jax.lax.while_loop(lambda walk: walk.goes_on & (walk.steps < steps), advance, begin)
+    blocks = _blocks(problem, end.x)
+    rest = _projected(end.x, problem.join(blocks.shared, blocks.frames), low, high)
+    return SharedSolution(whole(end.x), end.energy, rest, end.steps, end.finite)
+
+
+class _Walk(NamedTuple):
+    """Between two steps."""
+
+    x: Array
+    energy: Array
+    damping: Array
+    """0 before the first step."""
+    growth: Array
+    steps: Array
+    goes_on: Array
+    finite: Array
+
+
+def _advance(problem: "_Problem", low: Array, high: Array, rtol: float, atol: float, walk: _Walk) -> _Walk:
+    """One step of Levenberg-Marquardt within the bounds, or none if nothing decreases the energy."""
+    x, split, join = walk.x, problem.split, problem.join
+    blocks = _blocks(problem, x)
+    gradient = join(blocks.shared, blocks.frames)
+    diagonal = join(jnp.diagonal(blocks.U), jnp.diagonal(blocks.V, axis1=1, axis2=2))
+    damping = jnp.where(walk.damping > 0, walk.damping, _FIRST_DAMPING * jnp.max(diagonal))
+    damping = jnp.maximum(damping, _SMALLEST)
+    free = ~held(x, gradient, low, high)
+    direction = join(*_step(blocks, damping, *split(free)))
+    # Rounding can take a nearly singular matrix below zero; the gradient then leads on.
+    direction = jnp.where(jnp.all(jnp.isfinite(direction)), direction, -jnp.where(free, gradient, 0.0) / damping)
+    product = lambda step: join(*blocks.product(*split(step)))
+    y, success, gain = searched(problem.energy, x, direction, gradient, product, walk.energy, low, high)
+    finite = jnp.isfinite(walk.energy) & jnp.all(jnp.isfinite(gradient))
+    moved = jnp.max(jnp.abs(y - x), initial=0.0) > rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
+    eased = damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
+    y = jnp.where(finite, y, x)
+    return _Walk(
+        y,
+        problem.energy(y),
+        jnp.where(success, eased, damping * walk.growth),
+        jnp.where(success, 2.0, 2 * walk.growth),
+        walk.steps + 1,
+        moved & (_projected(x, gradient, low, high) > atol) & finite,
+        finite,
+    )
+
+
+def _projected(x: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """Largest component of the projected gradient."""
+    return jnp.max(jnp.abs(x - jnp.clip(x - gradient, low, high)), initial=0.0)
 
 
 def _flattened(start: Split) -> tuple[Array, Callable[[Array], Split]]:
@@ -149,22 +173,36 @@ class _Problem(NamedTuple):
     own: Callable[[Array], Array]
     """The prior's."""
     data: PyTree
+    size: int
+    """Of the shared variables, which come first."""
+    frames: int
 
-    def energy(self, s: Array, f: Array) -> Array:
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """Shared variables (s,), and those of the frames (n, f)."""
+        return x[: self.size], x[self.size :].reshape(self.frames, -1)
+
+    def join(self, shared: Array, frames: Array) -> Array:
+        """The other way round."""
+        return jnp.concatenate([shared, frames.ravel()])
+
+    def energy(self, x: Array) -> Array:
         """Half of the sum of squares."""
+        s, f = self.split(x)
         of_frames = jax.vmap(self.of_frame, (None, 0, 0))(s, f, self.data)
         return 0.5 * (jnp.sum(of_frames**2) + jnp.sum(self.own(s) ** 2))
 
 
 def _problem(residuals, prior, start: Split, data: PyTree) -> _Problem:
-    _, to_shared = ravel_pytree(start.shared)
+    shared, to_shared = ravel_pytree(start.shared)
     _, to_frame = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], start.frames))
     of_frame = lambda s, f, data: ravel_pytree(residuals(to_shared(s), to_frame(f), data))[0]
     own = (lambda s: ravel_pytree(prior(to_shared(s)))[0]) if prior else (lambda s: jnp.zeros(0, s.dtype))
-    return _Problem(of_frame, own, data)
+    return _Problem(of_frame, own, data, shared.size, jax.tree.leaves(start.frames)[0].shape[0])
 
 
-def _blocks(problem: _Problem, s: Array, f: Array) -> _Blocks:
+def _blocks(problem: _Problem, x: Array) -> _Blocks:
+    s, f = problem.split(x)
+
     def one(f: Array, data: Any) -> tuple[Array, Array, Array]:
         r = problem.of_frame(s, f, data)
         return r, *jax.jacfwd(problem.of_frame, (0, 1))(s, f, data)

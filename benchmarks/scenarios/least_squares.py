@@ -17,7 +17,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jaxopt
 import numpy as np
 import optimistix
 import scipy.optimize
@@ -157,6 +156,8 @@ def batch_metrics(problems: tuple[np.ndarray, ...], rounds: int) -> dict[str, Me
 @partial(jax.vmap, in_axes=(0,) * 6)
 def lbfgsb_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
     """By jaxopt's L-BFGS-B."""
+    import jaxopt
+
     solver = jaxopt.LBFGSB(fun=energy, tol=STATIONARY, maxiter=MOST_STEPS)
     return solver.run(start, bounds=(lower, upper), args=(A, b, c)).params
 
@@ -165,6 +166,8 @@ def lbfgsb_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start
 @partial(jax.vmap, in_axes=(0,) * 6)
 def projected_solve(A: Array, b: Array, c: Array, lower: Array, upper: Array, start: Array) -> Array:
     """By jaxopt's accelerated projected gradients."""
+    import jaxopt
+
     solver = jaxopt.ProjectedGradient(
         fun=energy, projection=jaxopt.projection.projection_box, tol=STATIONARY, maxiter=MOST_STEPS
     )

@@ -94,26 +94,19 @@ def refine(
     def iterate(_, x):
         residual, H, S, _, _, trust = pieces(x)
         SH = _solve(S, H)
-        information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
         gradient = jnp.einsum("k,kia,ki->a", trust, SH, residual) + precision @ (prior.mean - x)
-        return x + jnp.linalg.solve(information, gradient)
+        return x + jnp.linalg.solve(precision + jnp.einsum("k,kia,kib->ab", trust, SH, H), gradient)
 
     x = jax.lax.fori_loop(0, ITERATIONS, iterate, start)
     residual, H, S, by_shape, distance, trust = pieces(x)
     SH = _solve(S, H)
     information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
-    expected = trust * (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + per_landmark + 2)
-    covariance = jnp.linalg.inv(precision + jnp.einsum("k,kia,kib->ab", expected, SH, H))
-    by_bias = jnp.linalg.solve(information, jnp.einsum("k,kia->ai", trust, SH))
-    covariance += COMMON_BIAS_PX**2 * by_bias @ by_bias.T
-    off = x - prior.mean
-    log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + 0.5 * (
-        jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off
-    )
-    own = seen if is_own is None else seen & is_own
-    misfit, share = _misfit(jnp.where(own[..., None, None], found.covariance, 0.0), residual, S, SH, trust, information)
+    covariance = _covariance(precision, information, trust, per_landmark, SH, H)
+    log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + _laplace(x - prior.mean, precision, information)
+    own = jnp.where((seen if is_own is None else seen & is_own)[..., None, None], found.covariance, 0.0)
+    misfit, share = _misfit(own, residual, S, SH, trust, information)
     return Refined(
-        belief=Gaussian(x, 0.5 * (covariance + covariance.T)),
+        belief=Gaussian(x, covariance),
         log_evidence=log_evidence,
         excess=_excess(found, seen, residual, S, by_shape, x.size),
         trust=trust,
@@ -121,6 +114,20 @@ def refine(
         misfit_share=share,
         num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
     )
+
+
+def _laplace(off, precision, information):
+    """What the prior and the width of the posterior add to the log evidence."""
+    return 0.5 * (jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off)
+
+
+def _covariance(precision, information, trust, per_landmark, SH, H):
+    """Of the mode: inverse expected information, and a bias that is common to all landmarks of one image."""
+    expected = trust * (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + per_landmark + 2)
+    covariance = jnp.linalg.inv(precision + jnp.einsum("k,kia,kib->ab", expected, SH, H))
+    by_bias = jnp.linalg.solve(information, jnp.einsum("k,kia->ai", trust, SH))
+    covariance += COMMON_BIAS_PX**2 * by_bias @ by_bias.T
+    return 0.5 * (covariance + covariance.T)
 
 
 def _misfit(own, residual, S, SH, trust, information):

@@ -109,11 +109,7 @@ def refined(
     # One by one: batches of factorisations can stand still on two cores.
     fits = jax.lax.map(fit, jnp.asarray(STRENGTHS, x.dtype))
     rest, rest_belief = _at_rest(prior, found, state, model, rig, x, ~is_followed)
-    evidence = jnp.append(fits.log_evidence, rest.log_evidence)
-    share = jax.nn.softmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
-    share = jnp.where(jnp.all(jnp.isfinite(share)), share, jnp.zeros_like(share).at[0].set(1.0))
-    moving, resting = share[:-1], share[-1]
-    among = moving / jnp.maximum(jnp.sum(moving), 1e-12)
+    resting, among = _shares(rest, fits)
     average = lambda values: jnp.tensordot(among, values, 1)
     is_unknown = jnp.asarray(STRENGTHS) > 0
     doubt = ALIKE_ANEW * (1 - resting) * jnp.tensordot(among * is_unknown, fits.belief.covariance, 1)[:POSE, :POSE]
@@ -122,10 +118,7 @@ def refined(
     M = resting * state.registered.shape + (1 - resting) * shape(model, free.mean[POSE:])
     beliefs = jax.tree.map(lambda a, b: jnp.stack([a, b]), rest_belief, free)
     belief = _mixed(jnp.stack([resting, 1 - resting]), beliefs)
-    belief = _with_gauge(belief, M - state.registered.shape, model)
-    R = rotation(belief.mean[3:POSE])
-    covariance = belief.covariance.at[:3, :3].add(R @ state.registered.alike @ R.T)
-    belief = Gaussian(belief.mean, covariance)
+    belief = _with_gauge(belief, M - state.registered.shape, state, model)
     wide = MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1))
     measured = displaced(free.mean, found, state.slopes, model, wide, rig)
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
@@ -146,6 +139,15 @@ def refined(
         jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * average(fits.excess), *LOOSENESS),
         jnp.clip(state.misfit * (1 + (1 - MEMORY) * misfit), *MISFIT),
     )
+
+
+def _shares(rest: Refined, fits: Refined) -> tuple[Array, Array]:
+    """How far the face is believed to be at rest; and otherwise, to be as each of the other fits has it."""
+    known = lambda evidence: jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf)
+    among = jax.nn.softmax(known(fits.log_evidence))
+    among = jnp.where(jnp.all(jnp.isfinite(among)), among, jnp.zeros_like(among).at[0].set(1.0))
+    resting = jax.nn.sigmoid(rest.log_evidence - jax.nn.logsumexp(known(fits.log_evidence)))
+    return jnp.where(jnp.isfinite(resting), resting, 0.0), among
 
 
 def _looseness(state: HeadState, strength: Array | float) -> Array:
@@ -200,13 +202,17 @@ def _prior(search: AdaptiveState, state: HeadState, model: FaceModel, moved: Arr
     return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
 
 
-def _with_gauge(belief: Gaussian, deformation: Array, model: FaceModel) -> Gaussian:
-    """The belief, with what cannot be known of the skull's motion beside a deformation of this size."""
+def _with_gauge(belief: Gaussian, deformation: Array, state: HeadState, model: FaceModel) -> Gaussian:
+    """The belief, with what cannot be known of the skull.
+
+    Registration may have it all too near or too far, and beside a deformation of this size its motion is hidden.
+    """
     share = jnp.minimum(1.0, jnp.sum(deformation**2) / ORDINARY_EXPRESSION**2)
     R = rotation(belief.mean[3:POSE])
     to_angles = jnp.linalg.solve(turning_axes(belief.mean[3:POSE]).T, R)
     turn = jnp.zeros((POSE, POSE), R.dtype).at[:3, :3].set(R).at[3:, 3:].set(to_angles)
     extra = share * turn @ motion_covariance(model.mean) @ turn.T
+    extra = extra.at[:3, :3].add(R @ state.registered.alike @ R.T)
     return Gaussian(belief.mean, belief.covariance.at[:POSE, :POSE].add(extra))
 
 

@@ -148,15 +148,10 @@ def begin(
         options: Constants.
         detected_px: Standard deviation of each coordinate of the points.
     """
-    bundle, uv = start.bundle, start.uv[frame]
-    person, pose, expression = bundle.person, bundle.poses[frame], bundle.expressions[frame]
-    first, last = jnp.asarray(images, pose.dtype)[:, None]
-    wide = windows(first, uv[None])
-    border = (WIDE_SIZE - SIZE) // 2
-    templates = wide[..., border:-border, border:-border]
-    model, modes = model_of(face, person, templates)
-    shape = posed_shape(face, person, expression)
-    seen = patches_of(wide, shape, pose, rig, jnp.asarray(SKIN_NORMALS, pose.dtype))
+    bundle, uv, person = start.bundle, start.uv[frame], start.bundle.person
+    first, last = jnp.asarray(images, uv.dtype)[:, None]
+    registered = _registered(face, rig, bundle, uv, frame, first)
+    model, modes = model_of(face, person, registered.templates)
     here, expressed = bundle.poses[-1], bundle.expressions[-1]
     x = jnp.concatenate([here, modes.coefficients(face, expressed)])
     variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
@@ -170,15 +165,15 @@ def begin(
         model=model,
         modes=modes,
         response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
-        registered=Registered(wide, templates, seen),
+        registered=registered,
         window=window,
         identities=jnp.tile(person.identity, (AVERAGED, 1)),
         num_adjusted=jnp.ones((), jnp.int32),
         recent=nothing_changed(last, posed_shape(face, person, expressed), here, rig),
-        windows=templates,
+        windows=registered.templates,
         is_fresh=jnp.zeros((), bool),
-        slopes=unknown_slopes(len(shape)),
-        looseness=jnp.full(len(shape), FIRST_LOOSENESS, x.dtype),
+        slopes=unknown_slopes(face.num_landmarks),
+        looseness=jnp.full(face.num_landmarks, FIRST_LOOSENESS, x.dtype),
         misfit=jnp.ones((), x.dtype),
         last_good=x,
         misses=jnp.zeros((), jnp.int32),
@@ -204,6 +199,15 @@ def search_of(rig: CameraRig, options: MonoOptions) -> Searches:
         return replace(filter, params=replace(filter.params, log_likelihood=likelihood))
 
     return Searches(*map(sharper, usual))
+
+
+def _registered(face, rig, bundle, uv, frame, image) -> Registered:
+    """What the landmarks look like in one frame of the start."""
+    wide = windows(image, uv[None])
+    border = (WIDE_SIZE - SIZE) // 2
+    shape = posed_shape(face, bundle.person, bundle.expressions[frame])
+    seen = patches_of(wide, shape, bundle.poses[frame], rig, jnp.asarray(SKIN_NORMALS, uv.dtype))
+    return Registered(wide, wide[..., border:-border, border:-border], seen)
 
 
 def _first_window(
