@@ -87,8 +87,17 @@ def test_rows_of_the_factors_reproduce_the_training_faces(x64, tensor, model):
         np.testing.assert_allclose(face, best[:, :, i, j], atol=1e-9)
         assert rms_of_a_point(tensor[:, :, i, j], face) < 3 * rms_of_a_point(tensor, best)
     np.testing.assert_allclose(model.identity_mean, np.mean(people, axis=0), atol=1e-12)
-    np.testing.assert_allclose(model.identity_covariance, np.cov(people.T), atol=1e-12)
-    np.testing.assert_allclose(model.expression_std, np.std(actions, axis=0, ddof=1), atol=1e-12)
+    for rows, covariance in ((people, model.identity_covariance), (actions, model.expression_covariance)):
+        sample = np.cov(rows.T)
+        least = multilinear.LEAST_VARIANCE * np.trace(sample) / len(sample)
+        np.testing.assert_allclose(covariance, sample + least * np.eye(len(sample)), atol=1e-12)
+
+
+def test_as_many_parameters_as_examples_have_a_covariance_of_full_rank():
+    """Five expressions in five parameters: their sample covariance alone is singular."""
+    shapes = generator_shapes(jax.random.key(3), people_of(jax.random.key(2), 6))[:, :5]
+    face = multilinear.learn(shapes, identities=8, expressions=5)
+    assert np.isfinite(np.linalg.cholesky(np.asarray(face.expression_covariance))).all()
 
 
 def test_one_parameter_of_either_kind_is_nearly_constant(x64, model):
