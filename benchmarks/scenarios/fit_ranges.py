@@ -1,0 +1,177 @@
+"""Range bias, noise and outliers of radio beacons learnt by maximum likelihood; a robot's error before and after.
+
+Real recording: Plaza 1 (J. Djugash, B. Hamner, S. Roth, "Navigating with ranging radios", Journal of Field Robotics
+26(9), 2009), odometry and ranges to four beacons at known places. What is learnt never sees the true path, nor the
+second half of the recording; errors are those of both halves apart. `nominal` is the filter with round numbers in
+place of what was learnt, `bias` one with a constant bias, `scale` one whose bias grows with the distance.
+"""
+
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import NamedTuple, no_type_check
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.io
+from jaxtyping import Array, Float, PyTree
+
+from jaxfilters import filter, fit
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.extended import Measured
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.range_beacons import RangeRobot, Step, localisation, steps_between
+from jaxfilters.trackers.shell.chart import Curve, draw_chart
+
+NOMINAL = RangeRobot(*map(jnp.float32, (0.0, 0.0, 1.0, 0.01, 10.0, 0.1, 0.02)))
+"""No bias, a metre of noise, one range in a hundred wild, a decimetre a metre, a degree a second."""
+CONSTRAINTS = RangeRobot(
+    bias=fit.free,
+    scale=fit.free,
+    noise=fit.positive,
+    outlier_share=fit.interval(0.0, 0.5),
+    outlier_noise=fit.positive,
+    slip=fit.positive,
+    turn_noise=fit.positive,
+)
+MODELS = {"bias": replace(CONSTRAINTS, scale=fit.fixed), "scale": CONSTRAINTS}
+QUICK_NUM_RANGES = 400
+KEY = jax.random.key(0)
+
+
+class Recording(NamedTuple):
+    """A robot that drove among beacons; one row a range."""
+
+    seconds: Float[np.ndarray, " t"]
+    steps: Step
+    ranges: Measured
+    beacons: Float[Array, "b 2"]
+    start: Float[Array, "3"]
+    """True x, y (metres) and heading (radians) before the first step."""
+    truth: Float[np.ndarray, "t 2"]
+    """Where it was at each range, by satellites."""
+
+    def part(self, rows: slice) -> "Recording":
+        """Some of the rows, the first ones among them."""
+        cut = jax.tree.map(lambda leaf: leaf[rows], (self.seconds, self.steps, self.ranges, self.truth))
+        return self._replace(**dict(zip(("seconds", "steps", "ranges", "truth"), cut, strict=True)))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class Localisation:
+    """The filter of a robot among beacons, as a function of its parameters."""
+
+    beacons: Float[Array, "b 2"]
+    start: Float[Array, "3"]
+
+    def __call__(self, robot: RangeRobot) -> Filter:
+        prior = Gaussian(self.start, jnp.diag(jnp.array([1.0, 1.0, 0.1]) ** 2))
+        return localisation(robot, self.beacons, prior)
+
+
+def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
+    """Learn, localise, print, and draw what was learnt."""
+    del seed  # Nothing is drawn.
+    recording = read(recording_folder("plaza_range_slam") / "Plaza1_.mat")
+    recording = recording.part(slice(QUICK_NUM_RANGES)) if quick else recording
+    half = len(recording.seconds) // 2
+    learnt = {name: learn(recording.part(slice(half)), constraints) for name, constraints in MODELS.items()}
+    robots = {"nominal": NOMINAL, **{name: found.theta for name, found in learnt.items()}}
+    errors = {name: localisation_errors(recording, robot) for name, robot in robots.items()}
+    for name, found in learnt.items():
+        sys.stdout.write(f"{name}\n{found}\n\n")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        _draw(out / "fit_ranges.png", recording.seconds, errors)
+    return _metrics(recording, robots, errors, half) | _learnt_metrics(recording, learnt["scale"])
+
+
+def read(path: Path) -> Recording:
+    """A recording of the Plaza set: `GT`, `DR`, `TD` and `TL` of a .mat file.
+
+    Raises:
+        RecordingError: If the file is not there or has other contents.
+    """
+    try:
+        held = scipy.io.loadmat(path)
+        truth, odometry, ranges, beacons = (np.asarray(held[name], float) for name in ("GT", "DR", "TD", "TL"))
+    except (OSError, KeyError, ValueError, scipy.io.matlab.MatReadError) as error:
+        raise RecordingError(f"{path} is no recording of the Plaza set: {error}") from error
+    # A few stretches of ranges were written late.
+    ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
+    steps = steps_between(ranges[:, 0], *odometry.T)
+    heard = ranges[:, 2:3] == beacons[:, 0]
+    places = np.stack([np.interp(ranges[:, 0], truth[:, 0], truth[:, i]) for i in (1, 2)], axis=-1)
+    measured = Measured(jnp.asarray(np.where(heard, ranges[:, 3:], 0.0), jnp.float32), jnp.asarray(heard))
+    start = jnp.asarray(truth[0, 1:4], jnp.float32)
+    seconds = ranges[:, 0] - truth[0, 0]
+    steps = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), steps)
+    return Recording(seconds, steps, measured, jnp.asarray(beacons[:, 1:3], jnp.float32), start, places)
+
+
+def learn(recording: Recording, constraints: RangeRobot) -> fit.Fit:
+    """Parameters of most likelihood, given ranges and odometry alone."""
+    filter_of = Localisation(recording.beacons, recording.start)
+    density = fit.log_evidence(KEY, filter_of, recording.ranges, recording.steps)
+    return fit.maximize(density, NOMINAL, constraints)
+
+
+def localisation_errors(recording: Recording, robot: RangeRobot) -> Float[np.ndarray, " t"]:
+    """Metres between where the filter says the robot is at each range, and where it was."""
+    chosen = Localisation(recording.beacons, recording.start)(robot)
+    _, means = filter.run(chosen, KEY, recording.ranges, recording.steps, collect=_keep_mean)
+    return np.linalg.norm(np.asarray(means)[:, :2] - recording.truth, axis=-1)
+
+
+def mean_excess(recording: Recording, robot: RangeRobot) -> Float[Array, ""]:
+    """Metres by which the ranges of a recording are too long on average, as the robot's parameters have it."""
+    metres = jnp.sum(recording.ranges.y, axis=-1)
+    return jnp.mean(metres - (metres - robot.bias) / (1 + robot.scale))
+
+
+def _keep_mean(state: Gaussian, info: PyTree) -> Array:
+    del info
+    return state.mean
+
+
+def _metrics(recording: Recording, robots: dict, errors: dict, half: int) -> dict[str, Metric]:
+    found = {}
+    for name, error in errors.items():
+        first, second = (float(np.sqrt(np.mean(part**2))) for part in (error[:half], error[half:]))
+        found[f"rms_{name}_m"] = Metric(float(np.sqrt(np.mean(error**2))), "m", "lower")
+        found[f"rms_{name}_learnt_half_m"] = Metric(first, "m", "lower")
+        found[f"rms_{name}_other_half_m"] = Metric(second, "m", "lower")
+    for name in MODELS:
+        share = found[f"rms_{name}_m"].value / found["rms_nominal_m"].value
+        found[f"reduction_{name}_percent"] = Metric(100 * (1 - share), "%", "higher")
+        # Nearer to the true mean, which only the true path tells, is better: what counts is the distance.
+        gap = abs(float(mean_excess(recording, robots[name])) - _true_excess(recording))
+        found[f"mean_bias_{name}_gap_m"] = Metric(gap, "m", "lower")
+    return found
+
+
+def _learnt_metrics(recording: Recording, found: fit.Fit) -> dict[str, Metric]:
+    excess = float(mean_excess(recording, found.theta))
+    sys.stdout.write(f"mean bias of the ranges: learnt {excess:.3f} m, true {_true_excess(recording):.3f} m\n")
+    shown = {name: Metric(float(value), "", "lower") for name, value in asdict(found.theta).items()}
+    return {"learnt_mean_bias_m": Metric(excess, "m", "lower")} | {f"learnt_{n}": m for n, m in shown.items()}
+
+
+def _true_excess(recording: Recording) -> float:
+    true = np.linalg.norm(recording.truth[:, None] - np.asarray(recording.beacons), axis=-1)
+    heard = np.asarray(recording.ranges.mask)
+    return float(np.mean((np.asarray(recording.ranges.y) - true)[heard]))
+
+
+def _draw(path: Path, seconds: np.ndarray, errors: dict[str, np.ndarray]) -> None:
+    colors = {"nominal": (60, 60, 60), "bias": (40, 120, 230), "scale": (200, 110, 30)}
+    curves = [Curve(name, error, colors[name]) for name, error in errors.items()]
+    chart = draw_chart((320, 900), "error of the place, m", seconds, curves, "s", from_zero=True)
+    if not cv2.imwrite(str(path), chart):
+        raise OSError(f"Cannot write {path}.")
