@@ -1,10 +1,11 @@
 """A wheeled robot that measures distances to beacons whose places are known, one at a time.
 
 Ranges of radio beacons are too long, the more so the further off, and some are wild (J. Djugash, B. Hamner, S. Roth,
-"Navigating with ranging radios: five data sets with ground truth", Journal of Field Robotics 26(9), 2009): the bias,
-the scale, the noise and the share of outliers are parameters, to be learnt with those of the odometry.
+"Navigating with ranging radios: five data sets with ground truth", Journal of Field Robotics 26(9), 2009): by how
+much, the noise and the share of outliers are parameters, to be learnt with those of the odometry.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
 
@@ -35,13 +36,26 @@ class Step(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 @no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class LinearExcess:
+    """Ranges that are too long by a constant, and by a share of the distance."""
+
+    bias: Float[Array, ""]
+    """Metres."""
+    scale: Float[Array, ""]
+
+    def __call__(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Metres by which a range is too long at a distance in metres."""
+        return self.bias + self.scale * distance
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
 class RangeRobot:
     """Parameters of the robot's motion and of its ranges: what can be learnt."""
 
-    bias: Float[Array, ""]
-    """Metres by which ranges are too long."""
-    scale: Float[Array, ""]
-    """By how much of the distance they are too long, besides."""
+    excess: Callable[[Array], Array]
+    """`distances -> metres by which ranges are too long`; its leaves can be learnt, as those of `LinearExcess`."""
     noise: Float[Array, ""]
     """Standard deviation of a range, metres."""
     outlier_share: Float[Array, ""]
@@ -70,7 +84,7 @@ class _Sight:
 
     def __call__(self, x: Float[Array, "3"]) -> Float[Array, " b"]:
         distance = linalg.safe_norm(self.beacons - x[:2])
-        return self.robot.bias + (1 + self.robot.scale) * distance
+        return distance + self.robot.excess(distance)
 
 
 def drive(x: Float[Array, "3"], step: Step) -> Float[Array, "3"]:

@@ -3,11 +3,12 @@
 Real recording: Plaza 1 (J. Djugash, B. Hamner, S. Roth, "Navigating with ranging radios", Journal of Field Robotics
 26(9), 2009), odometry and ranges to four beacons at known places. What is learnt never sees the true path, nor the
 second half of the recording; errors are those of both halves apart. `nominal` is the filter with round numbers in
-place of what was learnt, `bias` one with a constant bias, `scale` one whose bias grows with the distance.
+place of what was learnt; `bias` learns a constant excess of the ranges, `scale` one that grows with the distance, and
+`network` any function of the distance, a small network trained through the filter.
 """
 
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, no_type_check
 
@@ -24,23 +25,61 @@ from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.extended import Measured
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.range_beacons import RangeRobot, Step, localisation, steps_between
+from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, localisation, steps_between
 from jaxfilters.trackers.shell.chart import Curve, draw_chart
 
-NOMINAL = RangeRobot(*map(jnp.float32, (0.0, 0.0, 1.0, 0.01, 10.0, 0.1, 0.02)))
-"""No bias, a metre of noise, one range in a hundred wild, a decimetre a metre, a degree a second."""
-CONSTRAINTS = RangeRobot(
-    bias=fit.free,
-    scale=fit.free,
-    noise=fit.positive,
-    outlier_share=fit.interval(0.0, 0.5),
-    outlier_noise=fit.positive,
-    slip=fit.positive,
-    turn_noise=fit.positive,
-)
-MODELS = {"bias": replace(CONSTRAINTS, scale=fit.fixed), "scale": CONSTRAINTS}
+NOISES = tuple(map(jnp.float32, (1.0, 0.01, 10.0, 0.1, 0.02)))
+"""A metre of noise, one range in a hundred wild, a decimetre a metre, a degree a second."""
+POSITIVE = (fit.positive, fit.interval(0.0, 0.5), fit.positive, fit.positive, fit.positive)
+NOMINAL = RangeRobot(LinearExcess(jnp.float32(0), jnp.float32(0)), *NOISES)
+"""No excess at all."""
+NUM_UNITS = 6
 QUICK_NUM_RANGES = 400
 KEY = jax.random.key(0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class NetworkExcess:
+    """Any smooth excess: a layer of units, each of which switches at some distance."""
+
+    bias: Float[Array, ""]
+    places: Float[Array, " k"]
+    """Where units switch, metres."""
+    slopes: Float[Array, " k"]
+    """How fast, in units a metre."""
+    weights: Float[Array, " k"]
+    """Metres."""
+
+    def __call__(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        units = jnp.tanh(self.slopes * (distance[..., None] - self.places))
+        return self.bias + jnp.sum(self.weights * units, axis=-1)
+
+
+def untrained() -> NetworkExcess:
+    """Units at all distances, without weight."""
+    places = jnp.linspace(5.0, 75.0, NUM_UNITS)
+    return NetworkExcess(jnp.float32(0), places, jnp.full(NUM_UNITS, 0.1), jnp.zeros(NUM_UNITS))
+
+
+def penalty(robot: RangeRobot) -> Float[Array, ""]:
+    """Log prior of a network: weights of a metre or so, units that stay about where they were."""
+    excess, start = robot.excess, untrained()
+    strayed = (excess.places - start.places) / 10, jnp.log(excess.slopes / start.slopes), excess.weights
+    return -0.5 * sum(jnp.sum(part**2) for part in strayed)
+
+
+FREE = LinearExcess(fit.free, fit.free)
+MODELS = {
+    "bias": (NOMINAL, RangeRobot(replace(FREE, scale=fit.fixed), *POSITIVE)),
+    "scale": (NOMINAL, RangeRobot(FREE, *POSITIVE)),
+    "network": (
+        replace(NOMINAL, excess=untrained()),
+        RangeRobot(NetworkExcess(fit.free, fit.free, fit.positive, fit.free), *POSITIVE),
+    ),
+}
+"""Where each search starts, and what its parameters may be."""
 
 
 class Recording(NamedTuple):
@@ -81,14 +120,14 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     recording = read(recording_folder("plaza_range_slam") / "Plaza1_.mat")
     recording = recording.part(slice(QUICK_NUM_RANGES)) if quick else recording
     half = len(recording.seconds) // 2
-    learnt = {name: learn(recording.part(slice(half)), constraints) for name, constraints in MODELS.items()}
+    learnt = {name: learn(recording.part(slice(half)), name) for name in MODELS}
     robots = {"nominal": NOMINAL, **{name: found.theta for name, found in learnt.items()}}
     errors = {name: localisation_errors(recording, robot) for name, robot in robots.items()}
     for name, found in learnt.items():
         sys.stdout.write(f"{name}\n{found}\n\n")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        _draw(out / "fit_ranges.png", recording.seconds, errors)
+        _draw(out / "fit_ranges.png", recording, robots, errors)
     return _metrics(recording, robots, errors, half) | _learnt_metrics(recording, learnt["scale"])
 
 
@@ -115,11 +154,12 @@ def read(path: Path) -> Recording:
     return Recording(seconds, steps, measured, jnp.asarray(beacons[:, 1:3], jnp.float32), start, places)
 
 
-def learn(recording: Recording, constraints: RangeRobot) -> fit.Fit:
+def learn(recording: Recording, model: str) -> fit.Fit:
     """Parameters of most likelihood, given ranges and odometry alone."""
     filter_of = Localisation(recording.beacons, recording.start)
     density = fit.log_evidence(KEY, filter_of, recording.ranges, recording.steps)
-    return fit.maximize(density, NOMINAL, constraints)
+    density = fit.with_prior(density, penalty) if model == "network" else density
+    return fit.maximize(density, *MODELS[model])
 
 
 def localisation_errors(recording: Recording, robot: RangeRobot) -> Float[np.ndarray, " t"]:
@@ -132,7 +172,9 @@ def localisation_errors(recording: Recording, robot: RangeRobot) -> Float[np.nda
 def mean_excess(recording: Recording, robot: RangeRobot) -> Float[Array, ""]:
     """Metres by which the ranges of a recording are too long on average, as the robot's parameters have it."""
     metres = jnp.sum(recording.ranges.y, axis=-1)
-    return jnp.mean(metres - (metres - robot.bias) / (1 + robot.scale))
+    # The distance that a range stands for, by fixed-point steps: the excess changes slowly.
+    distance = jax.lax.fori_loop(0, 20, lambda _, distance: metres - robot.excess(distance), metres)
+    return jnp.mean(metres - distance)
 
 
 def _keep_mean(state: Gaussian, info: PyTree) -> Array:
@@ -159,19 +201,37 @@ def _metrics(recording: Recording, robots: dict, errors: dict, half: int) -> dic
 def _learnt_metrics(recording: Recording, found: fit.Fit) -> dict[str, Metric]:
     excess = float(mean_excess(recording, found.theta))
     sys.stdout.write(f"mean bias of the ranges: learnt {excess:.3f} m, true {_true_excess(recording):.3f} m\n")
-    shown = {name: Metric(float(value), "", "lower") for name, value in asdict(found.theta).items()}
-    return {"learnt_mean_bias_m": Metric(excess, "m", "lower")} | {f"learnt_{n}": m for n, m in shown.items()}
+    return {
+        "learnt_mean_bias_m": Metric(excess, "m", "lower"),
+        "learnt_noise_m": Metric(float(found.theta.noise), "m", "lower"),
+        "learnt_outlier_share": Metric(float(found.theta.outlier_share), "", "lower"),
+    }
+
+
+def _true_distances(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """True distance and measured range of each row, metres."""
+    true = np.linalg.norm(recording.truth[:, None] - np.asarray(recording.beacons), axis=-1)
+    heard = np.asarray(recording.ranges.mask)
+    return true[heard], np.asarray(recording.ranges.y)[heard]
 
 
 def _true_excess(recording: Recording) -> float:
-    true = np.linalg.norm(recording.truth[:, None] - np.asarray(recording.beacons), axis=-1)
-    heard = np.asarray(recording.ranges.mask)
-    return float(np.mean((np.asarray(recording.ranges.y) - true)[heard]))
+    true, measured = _true_distances(recording)
+    return float(np.mean(measured - true))
 
 
-def _draw(path: Path, seconds: np.ndarray, errors: dict[str, np.ndarray]) -> None:
-    colors = {"nominal": (60, 60, 60), "bias": (40, 120, 230), "scale": (200, 110, 30)}
+def _draw(path: Path, recording: Recording, robots: dict, errors: dict) -> None:
+    """Errors over time; below, the excess of the ranges by distance, learnt and true."""
+    colors = {"nominal": (60, 60, 60), "bias": (40, 120, 230), "scale": (200, 110, 30), "network": (60, 160, 60)}
     curves = [Curve(name, error, colors[name]) for name, error in errors.items()]
-    chart = draw_chart((320, 900), "error of the place, m", seconds, curves, "s", from_zero=True)
-    if not cv2.imwrite(str(path), chart):
+    over_time = draw_chart((320, 900), "error of the place, m", recording.seconds, curves, "s", from_zero=True)
+    true, measured = _true_distances(recording)
+    edges = np.linspace(0, 80, 41)
+    place = np.digitize(true, edges) - 1
+    means = np.array([np.mean((measured - true)[place == i]) if np.sum(place == i) > 4 else np.nan for i in range(40)])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    curves = [Curve(n, np.asarray(r.excess(jnp.asarray(middle))), colors[n]) for n, r in robots.items()]
+    curves.append(Curve("true mean", means, (200, 60, 200)))
+    by_distance = draw_chart((320, 900), "excess of a range, m", middle, curves, "distance, m", from_zero=True)
+    if not cv2.imwrite(str(path), np.concatenate([over_time, by_distance])):
         raise OSError(f"Cannot write {path}.")

@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters.hmm import Codes
 
 NUM_DIRECTIONS = 16
 STILL = 17
 """The code of a fingertip that hardly moves."""
+MOST_TIPS = 5
+"""Of a hand."""
 
 
 def direction_code(displacement: Float[Array, "... 2"], still: float | Float[Array, ""] = 1.5) -> Int32[Array, "..."]:
@@ -50,3 +52,32 @@ def blurred(codes: Codes, spread: float | Float[Array, ""] = 1.0) -> Codes:
     blurry = jnp.concatenate([directions, probability[..., NUM_DIRECTIONS:]], axis=-1)
     possible = blurry > 0
     return replace(codes, log_probability=jnp.where(possible, jnp.log(jnp.where(possible, blurry, 1.0)), -jnp.inf))
+
+
+def displacements(tips: Float[Array, "t f 2"], present: Bool[Array, "t f"]) -> Float[Array, "t 2"]:
+    """How a hand moved since the frame before: the mean over the tips that were seen in both (section 2.6), pixels.
+
+    Zero where there is none, as in the first frame. Their running sum is the path of the hand.
+
+    Args:
+        tips: (x, y) of each finger in pixels; anything where it is not seen.
+        present: Whether each finger is seen.
+    """
+    both = (present[1:] & present[:-1])[..., None]
+    moved = jnp.where(both, tips[1:], 0.0) - jnp.where(both, tips[:-1], 0.0)
+    mean = jnp.sum(moved, axis=1) / jnp.maximum(jnp.sum(both, axis=1), 1)
+    return jnp.concatenate([jnp.zeros((1, 2), mean.dtype), mean])
+
+
+def observed(
+    tips: Float[Array, "t f 2"], present: Bool[Array, "t f"], still: float | Float[Array, ""] = 1.5
+) -> tuple[Int32[Array, " t"], Int32[Array, " t"]]:
+    """Direction code and number of fingertips of a hand in every frame; the first frame is still.
+
+    Args:
+        tips: (x, y) of each finger in pixels; anything where it is not seen.
+        present: Whether each finger is seen, at most five at once.
+        still: Length of a displacement below which there is no direction, in pixels a frame.
+    """
+    counts = jnp.sum(present, axis=1, dtype=jnp.int32)
+    return direction_code(displacements(tips, present), still), jnp.minimum(counts, MOST_TIPS)

@@ -9,8 +9,10 @@ from jaxtyping import Array, Float
 
 from jaxfilters.linalg import safe_norm
 
-SMOOTHING = 5
-"""Samples in the running mean that takes off what the sensor adds."""
+NUM_POINTS = 40
+"""Of a resampled stroke, unless told otherwise."""
+Drawn = tuple[Sequence[Float[np.ndarray, "_ d"]], int | float]
+"""A symbol: the pieces of its stroke, positions in time, and how many fingers drew it."""
 TURN_SCALE = 12.0
 """Parts of a stroke to which its turning refers."""
 
@@ -34,13 +36,6 @@ def resampled(points: Float[np.ndarray, "t d"], num_points: int) -> Float[np.nda
     return np.stack([np.interp(places, along[moved], points[moved, k]) for k in range(points.shape[1])], axis=1)
 
 
-def smoothed(points: Float[np.ndarray, "t d"]) -> Float[np.ndarray, "t d"]:
-    """Running mean over `SMOOTHING` samples; at the ends over copies of the last sample."""
-    half = SMOOTHING // 2
-    padded = np.pad(np.asarray(points, float), ((half, half), (0, 0)), mode="edge")
-    return np.mean([padded[i : i + len(points)] for i in range(SMOOTHING)], axis=0)
-
-
 @jax.jit
 def shape_features(points: Float[Array, "p d"]) -> Float[Array, "p three_d"]:
     """Position, direction and turning at each point of a resampled stroke.
@@ -59,36 +54,84 @@ def shape_features(points: Float[Array, "p d"]) -> Float[Array, "p three_d"]:
     return jnp.concatenate([2 * centred / size, direction, 0.5 * turning], axis=1)
 
 
-def features(points: Float[np.ndarray, "t d"], *, num_points: int = 40) -> Float[Array, "p three_d"]:
-    """Features of a stroke as it comes: smoothed, resampled, described.
+def features(
+    pieces: Sequence[Float[np.ndarray, "_ d"]], fingers: int | float = 1, *, num_points: int = NUM_POINTS
+) -> Float[Array, "p three_d_and_2"]:
+    """What a symbol looks like: its shape, where there is ink, and the number of fingers that drew it.
+
+    Pieces, as a pen draws them, are joined in the order in which they were drawn. The feature before the last is 1 on
+    ink and 0 between pieces; the last one is `fingers` at every point.
 
     Raises:
         ValueError: If there is no sample, or one is not finite.
     """
-    stroke = resampled(points, num_points)
-    if len(points) >= SMOOTHING:
-        stroke = resampled(smoothed(points), num_points)
-    return shape_features(jnp.asarray(stroke, dtype=float))
+    return stacked([(pieces, fingers)], num_points=num_points)[0]
 
 
-def pen_features(
-    strokes: Sequence[Float[np.ndarray, "_ d"]], *, num_points: int = 32
-) -> Float[Array, "p three_d_and_1"]:
-    """Features of a symbol that was drawn with one or more strokes of a pen: as of one stroke, and where there is ink.
-
-    The strokes are joined in the order in which they were drawn; the last feature is 1 on ink and 0 in between.
+def stacked(strokes: Sequence[Drawn], *, num_points: int = NUM_POINTS) -> Float[Array, "n p three_d_and_2"]:
+    """`features` of many symbols, each its pieces and its number of fingers.
 
     Raises:
-        ValueError: If there is no sample, or one is not finite.
+        ValueError: As `features`, or if there is no symbol.
     """
-    strokes = [np.asarray(stroke, float) for stroke in strokes if len(stroke)]
     if not strokes:
-        raise ValueError("strokes must hold at least one sample; got none.")
-    points = np.concatenate(strokes)
+        raise ValueError("strokes must be at least one; got none.")
+    joined = [_joined(pieces, num_points) for pieces, _ in strokes]
+    shapes = _shapes(jnp.asarray(np.stack([points for points, _ in joined]), dtype=float))
+    ink = jnp.asarray(np.stack([ink for _, ink in joined]), shapes.dtype)
+    fingers = jnp.asarray([count for _, count in strokes], shapes.dtype)
+    return jnp.concatenate([shapes, ink[..., None], jnp.broadcast_to(fingers[:, None, None], (*ink.shape, 1))], axis=2)
+
+
+def to_judge(
+    strokes: Sequence[Drawn], dimensions: int, *, num_points: int = NUM_POINTS
+) -> Float[np.ndarray, "p three_d_and_2 n"]:
+    """`features` of strokes that may be none, the strokes last: NaN, which is rejected, where they are none.
+
+    That is without a sample, with one that is not finite, or where all of them are in one place.
+
+    Raises:
+        ValueError: If a stroke has samples of other than that many dimensions.
+    """
+    found = np.full((num_points, 3 * dimensions + 2, len(strokes)), np.nan, np.float32)
+    usable = []
+    for i, (pieces, _) in enumerate(strokes):
+        pieces = [np.asarray(piece, float) for piece in pieces if len(piece)]
+        if any(piece.shape[1:] != (dimensions,) for piece in pieces):
+            shapes = [piece.shape for piece in pieces]
+            raise ValueError(f"strokes must have positions of {dimensions} dimensions; number {i} has {shapes}.")
+        points = np.concatenate(pieces) if pieces else np.zeros((1, dimensions))
+        if np.all(np.isfinite(points)) and np.any(points != points[0]):
+            usable.append(i)
+    if usable:
+        found[..., usable] = np.moveaxis(
+            np.asarray(stacked([strokes[i] for i in usable], num_points=num_points)), 0, -1
+        )
+    return found
+
+
+def turned(features: Float[Array, "*n p 8"], angle: float | Float[Array, ""]) -> Float[Array, "*n p 8"]:
+    """Features of strokes in the plane after a turn by `angle` in radians, from the first axis to the second."""
+    turn = jnp.array([[jnp.cos(angle), jnp.sin(angle)], [-jnp.sin(angle), jnp.cos(angle)]])
+    shape = features[..., :6].reshape(*features.shape[:-1], 3, 2)
+    moved = jnp.matmul(shape, turn, precision="highest").reshape(*features.shape[:-1], 6)
+    return jnp.concatenate([moved, features[..., 6:]], axis=-1)
+
+
+@jax.jit
+def _shapes(points: Float[Array, "n p d"]) -> Float[Array, "n p three_d"]:
+    return jax.vmap(shape_features)(points)
+
+
+def _joined(pieces, num_points):
+    """Points at even distances along all pieces, and which of them are on ink."""
+    pieces = [np.asarray(piece, float) for piece in pieces if len(piece)]
+    if not pieces:
+        raise ValueError("pieces must hold at least one sample; got none.")
+    points = np.concatenate(pieces)
     # Of the segment that ends in each point.
-    inked = np.concatenate([np.arange(len(stroke)) > 0 for stroke in strokes])
+    inked = np.concatenate([np.arange(len(piece)) > 0 for piece in pieces])
+    places = resampled(points, num_points)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     segment = np.minimum(np.searchsorted(along, np.linspace(0.0, along[-1], num_points)), len(along) - 1)
-    ink = np.where(segment == 0, True, inked[segment])
-    shape = shape_features(jnp.asarray(resampled(points, num_points), dtype=float))
-    return jnp.concatenate([shape, jnp.asarray(ink, shape.dtype)[:, None]], axis=1)
+    return places, np.where(segment == 0, True, inked[segment])

@@ -1,4 +1,4 @@
-"""Symbols told apart by hidden Markov models of the features of their strokes."""
+"""Symbols told apart by hidden Markov models of what their strokes look like."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,14 +8,20 @@ from typing import NamedTuple, no_type_check
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float, Int, Int32, PyTree
 from scipy.cluster.vq import kmeans2
 
 from jaxfilters import hmm
-from jaxfilters.hmm import HiddenMarkovModel
+from jaxfilters.hmm import Emission, HiddenMarkovModel
+from jaxfilters.models.gesture.rejection import threshold_log_likelihood
 
 MIN_VARIANCE = 0.15
 """Floor of the variances of features, which have the size of 1: people differ by more than one of them shows."""
+
+SHARPNESS = 0.25
+"""Share of a log-likelihood that counts towards confidence."""
+CHUNK = 128
+"""Strokes that `recognise_all` judges at once."""
 
 
 @jax.tree_util.register_dataclass
@@ -66,30 +72,50 @@ def learn(
     Raises:
         ValueError: If there is no stroke, `labels` has another length, or a feature is not finite.
     """
+    features = np.asarray(features)
     if not len(features) or len(labels) != len(features):
         raise ValueError(f"labels must name each of the strokes, at least one; got {len(labels)} of {len(features)}.")
     if not np.all(np.isfinite(features)):
         raise ValueError("features must be finite.")
-    names = tuple(sorted(set(labels)))
-    groups, owner = [], []
-    for i, name in enumerate(names):
-        own = np.flatnonzero(np.asarray(labels) == name)
-        for members in _variants(np.asarray(features)[own], num_variants):
-            groups.append(own[members])
-            owner.append(i)
     num_points, num_features = features.shape[1:]
-    most = max(len(group) for group in groups)
-    strokes = np.zeros((len(groups), num_points, num_features, most), np.asarray(features).dtype)
-    lengths = np.zeros((len(groups), most), np.int32)
-    for i, group in enumerate(groups):
-        strokes[i, ..., : len(group)] = np.moveaxis(np.asarray(features)[group], 0, -1)
-        lengths[i, : len(group)] = num_points
     blank = hmm.DiagonalGaussian(
         jnp.zeros((num_states, num_features)), jnp.ones((num_states, num_features)), float(min_variance)
     )
-    start = hmm.from_topology(hmm.left_right(num_states), blank, first=hmm.first_only(num_states))
-    models = _train(start, jnp.asarray(strokes), jnp.asarray(lengths), max_iterations)
-    return Symbols(models, jnp.asarray(owner, jnp.int32), names)
+    lengths = np.full(len(features), num_points, np.int32)
+    groups = [
+        (name, own[members]) for name, own in by_name(labels) for members in _variants(features[own], num_variants)
+    ]
+    return trained(blank, np.moveaxis(features, 0, -1), lengths, groups, max_iterations=max_iterations)
+
+
+def trained(
+    emission: Emission,
+    observations: PyTree,
+    lengths: Int[np.ndarray, " n"],
+    groups: Sequence[tuple[str, Int[np.ndarray, " _"]]],
+    *,
+    max_iterations: int = 8,
+) -> Symbols:
+    """Left-right models, one a group of strokes, each begun by dividing its strokes evenly among the states.
+
+    Args:
+        emission: Of as many states as a model has; what it holds is replaced.
+        observations: Those of the emission, leaves `(T, ..., n)`.
+        lengths: Frames of each stroke.
+        groups: Name of the symbol, and which strokes are drawn in one way of drawing it.
+        max_iterations: Of Baum-Welch.
+    """
+    names = tuple(sorted({name for name, _ in groups}))
+    most = max(len(members) for _, members in groups)
+    # Groups are filled up with strokes of no frame.
+    chosen = np.stack([np.pad(members, (0, most - len(members))) for _, members in groups])
+    counts = np.array([len(members) for _, members in groups])
+    owned = np.where(np.arange(most) < counts[:, None], np.asarray(lengths)[chosen], 0)
+    strokes = jax.tree.map(lambda leaf: jnp.asarray(np.moveaxis(np.asarray(leaf)[..., chosen], -2, 0)), observations)
+    num_states = jax.tree.leaves(emission)[0].shape[0]
+    start = hmm.from_topology(hmm.left_right(num_states), emission, first=hmm.first_only(num_states))
+    models = _train(start, strokes, jnp.asarray(owned), max_iterations)
+    return Symbols(models, jnp.asarray([names.index(name) for name, _ in groups], jnp.int32), names)
 
 
 def extended(symbols: Symbols, others: Symbols) -> Symbols:
@@ -119,53 +145,118 @@ def network(symbols: Symbols) -> hmm.Network:
 @jax.jit
 def recognise(
     symbols: Symbols,
-    features: Float[Array, "p f n"],
+    observations: PyTree,
     threshold: HiddenMarkovModel | None = None,
+    lengths: Int[Array, " n"] | None = None,
     *,
     margin: float | Float[Array, ""] = 0.0,
-    sharpness: float | Float[Array, ""] = 0.25,
+    distance: float | Float[Array, ""] = 0.0,
+    sharpness: float | Float[Array, ""] = SHARPNESS,
 ) -> Recognition:
     """What strokes are, in one pass over all models.
 
     Args:
         symbols: Made by `learn`.
-        features: Of n strokes, the strokes last.
+        observations: Features `(p, f, n)` of n strokes, or what else the models observe; the strokes last.
         threshold: What a symbol has to beat, `hmm.threshold(network(symbols))`; `None` rejects only strokes whose
             features are not finite or that no symbol can produce.
+        lengths: Points of each stroke; `None` is all.
         margin: Nats a point by which it has to.
+        distance: Nats a point by which it has to beat every other symbol.
         sharpness: Of the confidence: share of a log-likelihood that counts. Neighbouring points say nearly the
             same, so that all of it would be certain of everything.
     """
-    num_points = features.shape[0]
-    by_model = jax.vmap(partial(_score, features))(symbols.models)
+    leaf = jax.tree.leaves(observations)[0]
+    lengths = jnp.full(leaf.shape[-1], leaf.shape[0]) if lengths is None else lengths
+    seen = _seen(symbols, observations)
+    bar = jnp.full(leaf.shape[-1], -jnp.inf, seen.dtype)
+    if threshold is not None:
+        bar = hmm.log_likelihood(threshold, jax.vmap(threshold.log_likelihoods, -1, -1)(observations), lengths)
+    return _decided(symbols, seen, bar, lengths, margin, distance, sharpness)
+
+
+def recognise_all(
+    symbols: Symbols,
+    observations: PyTree,
+    lengths: Int[np.ndarray, " n"] | None = None,
+    *,
+    margin: float = 0.0,
+    distance: float = 0.0,
+) -> Recognition:
+    """What any number of strokes are, against the threshold model of the symbols themselves.
+
+    One program for a single stroke and one for `CHUNK` of them; a stroke of no point is rejected. Arguments as of
+    `recognise`.
+    """
+    leaf = jax.tree.leaves(observations)[0]
+    num_strokes = leaf.shape[-1]
+    lengths = np.full(num_strokes, leaf.shape[0], np.int32) if lengths is None else np.asarray(lengths, np.int32)
+    chunk = 1 if num_strokes == 1 else CHUNK
+    # One call at least, for its shapes.
+    missing = -num_strokes % chunk if num_strokes else chunk
+    filled = jax.tree.map(
+        lambda leaf: np.pad(np.asarray(leaf), [(0, 0)] * (leaf.ndim - 1) + [(0, missing)]), observations
+    )
+    lengths = np.pad(lengths, (0, missing))
+    parts = [
+        _judged(
+            symbols,
+            jax.tree.map(lambda leaf, i=i: leaf[..., i : i + chunk], filled),
+            lengths[i : i + chunk],
+            margin,
+            distance,
+        )
+        for i in range(0, num_strokes + missing, chunk)
+    ]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1)[..., :num_strokes], *parts)
+
+
+@jax.jit
+def _judged(symbols, observations, lengths, margin, distance):
+    seen = _seen(symbols, observations)
+    bar = threshold_log_likelihood(symbols.models, seen, lengths)
+    return _decided(symbols, seen, bar, lengths, margin, distance, SHARPNESS)
+
+
+def _seen(symbols: Symbols, observations: PyTree) -> Float[Array, "m p q n"]:
+    """Log-likelihoods of the states of every model."""
+    return jax.vmap(lambda model: jax.vmap(model.log_likelihoods, -1, -1)(observations))(symbols.models)
+
+
+def _decided(symbols, seen, bar, lengths, margin, distance, sharpness) -> Recognition:
+    num_points = jnp.maximum(lengths, 1)
+    by_model = jax.vmap(hmm.log_likelihood, (0, 0, None))(symbols.models, seen, lengths)
     own = symbols.owner == jnp.arange(len(symbols.names))[:, None]
     totals = jnp.max(jnp.where(own[..., None], by_model, -jnp.inf), axis=1)
     best = jnp.argmax(totals, axis=0).astype(jnp.int32)
-    bar = jnp.full(totals.shape[1:], -jnp.inf) if threshold is None else _score(features, threshold)
     top = jnp.max(totals, axis=0)
-    possible = top > -jnp.inf
-    lead = jnp.where(possible, (jnp.where(possible, top, 0.0) - bar) / num_points, -jnp.inf)
-    usual = jnp.where(possible, totals - jnp.where(possible, top, 0.0), 0.0)
-    accepted = possible & (lead >= margin)
+    possible = (top > -jnp.inf) & (lengths > 0)
+    finite = jnp.where(possible, top, 0.0)
+    lead = jnp.where(possible, (finite - bar) / num_points, -jnp.inf)
+    others = jnp.where(jnp.arange(len(totals))[:, None] == best, -jnp.inf, totals)
+    apart = (finite - jnp.max(others, axis=0)) / num_points
+    usual = jnp.where(possible, totals - finite, 0.0)
+    accepted = possible & (lead >= margin) & (apart >= distance)
     return Recognition(
         jnp.where(accepted, best, -1), jax.nn.softmax(sharpness * usual, axis=0), totals / num_points, lead
     )
 
 
-def _score(features: Array, model: HiddenMarkovModel) -> Float[Array, " n"]:
-    return hmm.log_likelihood(model, jax.vmap(model.log_likelihoods, -1, -1)(features))
-
-
 @partial(jax.jit, static_argnames="max_iterations")
-def _train(start: HiddenMarkovModel, strokes: Array, lengths: Array, max_iterations: int) -> HiddenMarkovModel:
+def _train(start: HiddenMarkovModel, strokes: PyTree, lengths: Array, max_iterations: int) -> HiddenMarkovModel:
     num_states = start.log_initial.shape[0]
 
-    def one(strokes: Array, lengths: Array) -> HiddenMarkovModel:
-        shares = hmm.in_turn(lengths, strokes.shape[0], num_states)
+    def one(strokes: PyTree, lengths: Array) -> HiddenMarkovModel:
+        shares = hmm.in_turn(lengths, jax.tree.leaves(strokes)[0].shape[0], num_states)
         model = hmm.with_states(start, strokes, shares)
         return hmm.baum_welch(model, strokes, lengths, max_iterations=max_iterations).model
 
     return jax.vmap(one)(strokes, lengths)
+
+
+def by_name(labels: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+    """Every symbol and the indices of its strokes."""
+    return [(name, np.flatnonzero(np.asarray(labels) == name)) for name in sorted(set(labels))]
 
 
 def _variants(features: np.ndarray, num_variants: int) -> list[np.ndarray]:

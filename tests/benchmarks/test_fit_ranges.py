@@ -14,7 +14,7 @@ from jaxfilters.benchmarks.scenarios import fit_ranges
 @pytest.mark.skipif("JAXFILTERS_DATA" not in os.environ, reason="needs plaza_range_slam in JAXFILTERS_DATA")
 def test_what_is_learnt_of_the_first_ranges_places_the_robot_better():
     recording = fit_ranges.read(recording_folder("plaza_range_slam") / "Plaza1_.mat").part(slice(600))
-    found = fit_ranges.learn(recording.part(slice(400)), fit_ranges.MODELS["scale"])
+    found = fit_ranges.learn(recording.part(slice(400)), "scale")
     before, after = (fit_ranges.localisation_errors(recording, robot) for robot in (fit_ranges.NOMINAL, found.theta))
     assert np.sqrt(np.mean(after[400:] ** 2)) < 0.3 * np.sqrt(np.mean(before[400:] ** 2))
     assert abs(float(fit_ranges.mean_excess(recording, found.theta)) - 2.8) < 0.3

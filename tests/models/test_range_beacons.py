@@ -6,10 +6,10 @@ import pytest
 from jaxfilters import run
 from jaxfilters.extended import Measured
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.range_beacons import RangeRobot, Step, drive, localisation, steps_between
+from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, drive, localisation, steps_between
 
 BEACONS = jnp.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [40.0, 40.0]])
-ROBOT = RangeRobot(*map(jnp.float32, (1.5, 0.05, 0.3, 0.02, 8.0, 0.05, 0.01)))
+ROBOT = RangeRobot(LinearExcess(1.5, 0.05), *map(jnp.float32, (0.3, 0.02, 8.0, 0.05, 0.01)))
 
 
 def circle(num_readings, radius=10.0, turn=0.05):

@@ -73,3 +73,11 @@ def test_bounds_of_capsules_are_exact(x64, camera, random_capsules):
             uv = np.asarray(camera.project(jnp.asarray(points)))
             low, high = np.minimum(low, uv.min(axis=0)), np.maximum(high, uv.max(axis=0))
         np.testing.assert_allclose(box[part], [*low, *high], atol=1e-5)
+
+
+def test_an_image_smaller_than_the_smallest_window_is_drawn_whole():
+    box = jnp.array([[0.0, 0.0, 3.0, 3.0], [20.0, 0.0, 30.0, 3.0]])
+    plan = plan_windows(box, (8, 8), ((16, 16), (64, 64)))
+    assert plan.sizes == ((8, 8),)
+    np.testing.assert_array_equal(plan.order, [1, 0])
+    np.testing.assert_array_equal(plan.bounds, [1, 2])
