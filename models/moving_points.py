@@ -1,0 +1,130 @@
+"""Points that move by constant velocity and are seen through noise: what both noises are, learnt from tracks.
+
+Every coordinate is a sequence of its own, a Kalman filter with position and velocity; all share the two noises. Tracks
+are what a detector says: no truth is needed, since jitter that no motion explains is the sensor's.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfilters import fit
+from jaxfilters.extended import Measured, extended
+from jaxfilters.filter import Filter, run
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.smoothing import rts
+
+_KEY = jax.random.key(0)
+
+
+class PointNoise(NamedTuple):
+    """Noises of one coordinate; positive. Lengths are in the unit of the tracks."""
+
+    sensor: Float[Array, ""]
+    """Standard deviation of one reading."""
+    drive: Float[Array, ""]
+    """Standard deviation of the velocity after a second, per second; it grows with the square root of the time."""
+
+
+class Tracks(NamedTuple):
+    """Coordinates of points over time, each about its own mean; one sequence a column."""
+
+    y: Float[Array, "t 1 n"]
+    """NaN where nothing was seen."""
+    seconds: Float[Array, "t n"]
+    """Since the frame before, the same in all columns."""
+    extent: Float[Array, ""]
+    """Standard deviation of all coordinates about their means: how far points go."""
+
+
+def tracks_of(points: Float[np.ndarray, "t *point"], times: Float[np.ndarray, " t"]) -> tuple[Tracks, np.ndarray]:
+    """Tracks of points, NaN where not seen, and the mean of each coordinate, which they lack.
+
+    Raises:
+        ValueError: If times do not rise, there are fewer than three frames, or a coordinate was never seen.
+    """
+    points = np.asarray(points, float).reshape(len(points), -1)
+    if len(points) < 3 or len(times) != len(points) or np.any(np.diff(times) <= 0):
+        raise ValueError(f"times must rise and be one of each of 3 or more frames; got {len(times)} of {len(points)}.")
+    never = np.flatnonzero(~np.isfinite(points).any(axis=0))
+    if never.size:
+        raise ValueError(f"points must each be seen in some frame; coordinates {never.tolist()} never are.")
+    means = np.nanmean(points, axis=0)
+    about = points - means
+    seconds = np.diff(times, prepend=times[0])
+    extent = np.sqrt(np.nanmean(about**2))
+    columns = np.broadcast_to(seconds[:, None], about.shape)
+    return Tracks(
+        jnp.asarray(about[:, None], jnp.float32), jnp.asarray(columns, jnp.float32), jnp.float32(extent)
+    ), means
+
+
+def drift(x: Float[Array, "2"], seconds: Float[Array, ""]) -> Float[Array, "2"]:
+    """Position and velocity some seconds later."""
+    return jnp.stack([x[0] + seconds * x[1], x[1]])
+
+
+def position(x: Float[Array, "2"]) -> Float[Array, "1"]:
+    """What is seen of position and velocity."""
+    return x[:1]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class _Drive:
+    """Covariance of what white acceleration adds to position and velocity."""
+
+    drive: Float[Array, ""]
+
+    def __call__(self, seconds: Float[Array, ""]) -> Float[Array, "2 2"]:
+        rows = jnp.stack([jnp.stack([seconds**3 / 3, seconds**2 / 2]), jnp.stack([seconds**2 / 2, seconds])])
+        return jnp.square(self.drive) * rows
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+class PointFilter:
+    """The filter of one coordinate, as a function of the noises."""
+
+    extent: Float[Array, ""]
+    """How far points go, and how fast they may be at first, in a second."""
+
+    def __call__(self, noise: PointNoise) -> Filter:
+        prior = Gaussian(jnp.zeros(2), jnp.diag(jnp.square(jnp.stack([2 * self.extent, 5 * self.extent]))))
+        observed = jnp.square(noise.sensor)[None, None]
+        return extended(prior, drift, _Drive(noise.drive).__call__, position, observed)
+
+
+def learn(tracks: Tracks) -> fit.Fit:
+    """`PointNoise` of most likelihood, with standard errors."""
+    y = Measured(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
+    density = fit.over_sequences(_KEY, PointFilter(tracks.extent), y, tracks.seconds)
+    start = PointNoise(0.05 * tracks.extent, 5 * tracks.extent)
+    return fit.maximize(density, start, fit.positive)
+
+
+class Positions(NamedTuple):
+    """Of every coordinate, about the same mean as its track."""
+
+    filtered: Float[Array, "t n"]
+    """Given the past and the present."""
+    smoothed: Float[Array, "t n"]
+    """Given the future, too."""
+
+
+@jax.jit
+def positions(tracks: Tracks, noise: PointNoise) -> Positions:
+    """Where the points are, given their tracks and the noises."""
+    chosen = PointFilter(tracks.extent)(noise)
+
+    def one(y: Array, seconds: Array) -> Positions:
+        _, (beliefs, _) = run(chosen, _KEY, y, seconds)
+        return Positions(beliefs.mean[:, 0], rts(chosen, beliefs, seconds).mean[:, 0])
+
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(tracks.y, tracks.seconds)
