@@ -1,0 +1,199 @@
+"""Hands in a mask: palm, forearm, fingertips and where the fingers begin (section 2.1 of the specification)."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxfilters.models.fingertip.arm import Palm, border_contact, find_arm, find_palm
+from jaxfilters.models.fingertip.fingers import Bases, find_bases, measured_ends
+from jaxfilters.models.fingertip.hand_parameters import HandParameters
+from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation
+from jaxfilters.models.fingertip.tip_template import (
+    SUPPRESSION,
+    best_apart,
+    correlation,
+    peaks,
+    tip_template,
+)
+
+WORKING_RADIUS = 6.5
+"""Pixels: hands with thicker fingers are looked at in a smaller image, and only their tips in the whole one."""
+SMALLEST_PALM = 1.7
+"""Tip radii; what is thinner everywhere is no hand."""
+BEHIND, NEAR = 0.3, 1.3
+"""Palm radii: farther back than the one, or nearer to the palm than the other, there are no tips."""
+
+
+LEAST_AGREEMENT = 0.75
+"""Of a tip with a half disc on a finger of its own direction and thickness."""
+THICKEST, SHORTEST = 1.7, 0.6
+"""Tip radii: what is thicker where it ends, or nearer to where it begins, is a knuckle of a fist."""
+MAX_CANDIDATES, CANDIDATES_APART = 24, 0.7
+"""Places that are looked at more closely, and tip radii between them."""
+
+
+class _Silhouette(NamedTuple):
+    """One component of the mask, alone in an image with fingers no thicker than the working radius."""
+
+    image: UInt8[np.ndarray, "rows cols"]
+    """0 to 255: the share of each pixel that is skin."""
+    origin: Float[np.ndarray, "2"]
+    """Pixel of the mask at (0, 0) here."""
+    step: Float[np.ndarray, "2"]
+    """Pixels of the mask per pixel here."""
+
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """In the mask."""
+        return self.origin + self.step * points
+
+
+def no_hand() -> HandObservation:
+    """The observation of a frame in which no hand is seen."""
+    numbers, no = np.zeros(MAX_TIPS, np.float32), np.zeros(MAX_TIPS, bool)
+    points, vector = np.zeros((MAX_TIPS, 2), np.float32), np.zeros(2, np.float32)
+    hand: Any = {  # numpy's arrays until a device needs them
+        "tips": points,
+        "is_tip": no,
+        "scores": numbers,
+        "bases": points,
+        "has_base": no,
+        "palm": vector,
+        "palm_radius": np.zeros((), np.float32),
+        "axis": vector,
+        "has_axis": np.zeros((), bool),
+        "is_hand": np.zeros((), bool),
+    }
+    return HandObservation(**hand)
+
+
+def detect_hand(mask: np.ndarray, parameters: HandParameters) -> HandObservation:
+    """The largest component of a mask that can be a hand; `no_hand()` if none can.
+
+    Args:
+        mask: (rows, cols) of bool: which pixels are skin.
+        parameters: Of the user, for the camera that gave the mask.
+
+    Raises:
+        ValueError: a mask that is not (rows, cols) of bool.
+    """
+    return detect_hands(mask, parameters, capacity=1)[0]
+
+
+def detect_hands(mask: np.ndarray, parameters: HandParameters, *, capacity: int = 2) -> tuple[HandObservation, ...]:
+    """The largest components of a mask that can be hands, from left to right by their palms; then `no_hand()`.
+
+    Hands that touch are one component, and one hand with the tips of both, at most `MAX_TIPS` of them.
+
+    Args:
+        mask: (rows, cols) of bool: which pixels are skin.
+        parameters: Of the user, for the camera that gave the mask.
+        capacity: How many observations to give.
+
+    Raises:
+        ValueError: a mask that is not (rows, cols) of bool, or a capacity below 1.
+    """
+    if capacity < 1:
+        raise ValueError(f"capacity must be at least 1; got {capacity}.")
+    skin = checked_mask(mask)
+    hands: list[HandObservation] = []
+    for silhouette in _components(skin, parameters.tip_radius):
+        hand = _hand(silhouette, parameters)
+        if hand is not None:
+            hands.append(hand)
+        if len(hands) == capacity:
+            break
+    hands.sort(key=lambda hand: float(hand.palm[0]))
+    return (*hands, *[no_hand()] * (capacity - len(hands)))
+
+
+def checked_mask(mask: np.ndarray) -> UInt8[np.ndarray, "rows cols"]:
+    """The mask as OpenCV wants it, 0 or 1.
+
+    Raises:
+        ValueError: a mask that is not (rows, cols) of bool.
+    """
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.ndim != 2 or mask.size == 0:
+        got = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"mask must be a bool array (rows, cols) with pixels; got {got}.")
+    return np.ascontiguousarray(mask).view(np.uint8)
+
+
+def _components(skin: np.ndarray, tip_radius: float) -> Iterator[_Silhouette]:
+    """Components that are large enough for a palm, largest first."""
+    rows, cols = skin.shape
+    shrink = max(1.0, tip_radius / WORKING_RADIUS)
+    size = (max(1, round(cols / shrink)), max(1, round(rows / shrink)))
+    step = np.array([cols / size[0], rows / size[1]])
+    small = cv2.resize(255 * skin, size, interpolation=cv2.INTER_AREA) if shrink > 1 else 255 * skin
+    inside = cv2.threshold(small, 127, 1, cv2.THRESH_BINARY)[1]
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)
+    areas = stats[:, cv2.CC_STAT_AREA] * (np.arange(count) > 0)  # 0 is what is no component
+    for label in np.argsort(-areas, kind="stable"):
+        if areas[label] < math.pi * (SMALLEST_PALM * tip_radius / shrink) ** 2:
+            return
+        image = small if areas[label] == areas.sum() else cv2.copyTo(small, (labels == label).view(np.uint8))
+        yield _Silhouette(image, (step - 1) / 2, step)
+
+
+def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservation | None:
+    """What a component shows of a hand; `None` if it has no palm."""
+    scale = float(silhouette.step.mean())
+    radius = parameters.tip_radius / scale
+    inside = cv2.threshold(silhouette.image, 127, 1, cv2.THRESH_BINARY)[1]
+    # What lies beyond the border of the image counts as background, as in an erosion.
+    depth = cv2.distanceTransform(cv2.copyMakeBorder(inside, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0), cv2.DIST_L2, 5)
+    depth = np.ascontiguousarray(depth[1:-1, 1:-1])
+    contact = border_contact(inside)
+    palm = find_palm(depth, contact)
+    if palm.radius < SMALLEST_PALM * radius:
+        return None
+    arm = find_arm(inside, palm, contact)
+    half_size = max(round(parameters.half_size / scale), math.ceil(radius) + 1)
+    found = _candidates(silhouette.image, palm, arm.direction, radius, half_size, parameters.min_correlation)
+    bases = find_bases(depth, found, palm.center, radius)
+    towards = found - np.where(bases.is_found[:, None], bases.points, palm.center)
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
+    ends = measured_ends(silhouette.image, found, towards, radius)
+    is_finger = ~bases.is_found | (np.hypot(*(found - bases.points).T) > SHORTEST * radius)
+    is_tip = is_finger & ends.is_end & (ends.scores > LEAST_AGREEMENT) & (ends.radii < THICKEST * radius)
+    best = best_apart(ends.points, np.where(is_tip, ends.scores, 0.0), SUPPRESSION * radius, MAX_TIPS)
+    bases = Bases(bases.points[best], bases.is_found[best])
+    starts = np.where(bases.is_found[:, None], silhouette.placed(bases.points), 0.0)
+    hand: Any = {
+        "tips": _filled(silhouette.placed(ends.points[best])),
+        "is_tip": np.arange(MAX_TIPS) < len(best),
+        "scores": _filled(ends.scores[best]),
+        "bases": _filled(starts),
+        "has_base": _filled(bases.is_found),
+        "palm": silhouette.placed(palm.center).astype(np.float32),
+        "palm_radius": np.asarray(scale * palm.radius, np.float32),
+        "axis": arm.direction.astype(np.float32),
+        "has_axis": np.asarray(arm.is_seen),
+        "is_hand": np.asarray(True),
+    }
+    return HandObservation(**hand)
+
+
+def _candidates(
+    image: np.ndarray, palm: Palm, axis: np.ndarray, radius: float, half_size: int, min_correlation: float
+) -> Float[np.ndarray, "n 2"]:
+    """Places that may be ends of fingers, neither near nor behind the palm, several of each."""
+    left, top, width, height = cv2.boundingRect(image)
+    window = image[top : top + height, left : left + width]
+    found = peaks(correlation(window, tip_template(radius, half_size)), min_correlation)
+    places = found.points + np.array([left, top])
+    arm = places - palm.center
+    far = np.linalg.norm(arm, axis=1) > NEAR * palm.radius
+    score = np.where(far & (arm @ axis > -BEHIND * palm.radius), found.scores, 0.0)
+    return places[best_apart(places, score, CANDIDATES_APART * radius, MAX_CANDIDATES)]
+
+
+def _filled(values: np.ndarray) -> np.ndarray:
+    """Padded to `MAX_TIPS`."""
+    filled = np.zeros((MAX_TIPS, *values.shape[1:]), bool if values.dtype == np.bool_ else np.float32)
+    filled[: len(values)] = values
+    return filled

@@ -1,0 +1,28 @@
+"""What one frame shows of a hand over a desk: tips, where their fingers begin, palm and forearm."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+MAX_TIPS = 5
+"""Of one hand."""
+
+
+class HandObservation(NamedTuple):
+    """A hand in one frame, in pixels (x right, y down, centres at integers); what is not there is masked, and 0."""
+
+    tips: Float[Array, "tips 2"]
+    """Ends of the extended fingers, best first."""
+    is_tip: Bool[Array, " tips"]
+    scores: Float[Array, " tips"]
+    """Correlation of each tip with the end of a finger of its thickness and direction, at most 1."""
+    bases: Float[Array, "tips 2"]
+    """Where the finger of each tip leaves the palm, or parts from the finger beside it."""
+    has_base: Bool[Array, " tips"]
+    palm: Float[Array, "2"]
+    palm_radius: Float[Array, ""]
+    axis: Float[Array, "2"]
+    """Unit vector along the forearm, towards the hand."""
+    has_axis: Bool[Array, ""]
+    """Whether the forearm reaches the border of the image, so that its axis can be trusted."""
+    is_hand: Bool[Array, ""]
