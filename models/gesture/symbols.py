@@ -72,20 +72,18 @@ def learn(
     Raises:
         ValueError: If there is no stroke, `labels` has another length, or a feature is not finite.
     """
-    features = np.asarray(features)
+    shown = np.asarray(features)
     if not len(features) or len(labels) != len(features):
         raise ValueError(f"labels must name each of the strokes, at least one; got {len(labels)} of {len(features)}.")
-    if not np.all(np.isfinite(features)):
+    if not np.all(np.isfinite(shown)):
         raise ValueError("features must be finite.")
-    num_points, num_features = features.shape[1:]
+    num_points, num_features = shown.shape[1:]
     blank = hmm.DiagonalGaussian(
         jnp.zeros((num_states, num_features)), jnp.ones((num_states, num_features)), float(min_variance)
     )
-    lengths = np.full(len(features), num_points, np.int32)
-    groups = [
-        (name, own[members]) for name, own in by_name(labels) for members in _variants(features[own], num_variants)
-    ]
-    return trained(blank, np.moveaxis(features, 0, -1), lengths, groups, max_iterations=max_iterations)
+    lengths = np.full(len(shown), num_points, np.int32)
+    groups = [(name, own[members]) for name, own in by_name(labels) for members in _variants(shown[own], num_variants)]
+    return trained(blank, np.moveaxis(shown, 0, -1), lengths, groups, max_iterations=max_iterations)
 
 
 def trained(

@@ -10,7 +10,9 @@ from typing import Any
 
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.devices import use_all_cores
+from jaxfilters.trackers.shell.fingertip_options import add_fingertips
 from jaxfilters.trackers.shell.fit_options import add_fit
+from jaxfilters.trackers.shell.gesture_options import add_recognise
 from jaxfilters.trackers.shell.head_options import add_head
 from jaxfilters.trackers.shell.mono_options import add_mono
 from jaxfilters.trackers.shell.people_options import add_people
@@ -37,6 +39,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             from jaxfilters.trackers.shell.calibrate_command import calibrate
 
             print(calibrate(options))
+        elif options.command == "fit" and options.source == "noise":
+            from jaxfilters.trackers.shell.noise_command import fit_noise
+
+            print(fit_noise(options))
+        elif options.command == "fit" and options.source == "gestures":
+            from jaxfilters.trackers.shell.gesture_command import fit_gestures
+
+            print(fit_gestures(options))
+        elif options.command == "recognise":
+            from jaxfilters.trackers.shell.gesture_command import recognise
+
+            print(recognise(options))
         elif options.command == "fit":
             from jaxfilters.trackers.shell.fit_command import fit
 
@@ -53,6 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             from jaxfilters.trackers.shell.head_command import track_head
 
             print(track_head(options))
+        elif getattr(options, "what", None) == "fingertips":
+            from jaxfilters.trackers.shell.fingertip_command import track_fingertips
+
+            print(track_fingertips(options))
         else:
             track(_job(options), options)
     except (InputError, OutputError, CheckpointError) as error:
@@ -107,6 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     add_people(what, _seed)
     add_head(what, _seed)
     add_mono(what, _seed)
+    add_fingertips(what, _seed)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
@@ -115,6 +134,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_calibrate(commands, _image_size)
     add_fit(commands, _seed)
+    add_recognise(commands, _seed)
     commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
     return parser
 

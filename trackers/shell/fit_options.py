@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.gesture_options import add_fit_gestures
+
 IDENTITIES, EXPRESSIONS, PEOPLE = 15, 5, 200
 """What the model that comes with the package was made with."""
 
@@ -40,3 +42,22 @@ def add_fit(commands: Any, seed: Callable[[str], int]) -> None:
         help="how many to draw from the generator or the ICT face model (default: %(default)s)",
     )
     face.add_argument("--seed", type=seed, default=0, metavar="SEED", help="of that draw (default: %(default)s)")
+    add_fit_gestures(what, seed)
+    _add_noise(what, seed)
+
+
+def _add_noise(what: Any, seed: Callable[[str], int]) -> None:
+    noise = what.add_parser("noise", help="how noisy a detector is, and how points move, from tracks alone")
+    noise.add_argument(
+        "tracks",
+        nargs="?",
+        type=Path,
+        metavar="TRACKS",
+        help=".npz with points (frames, points, coordinates), or CSV with id, frame or time_s, and x, y (z), as the "
+        "trackers write it; without it, synthetic tracks",
+    )
+    noise.add_argument("--fps", type=float, default=30.0, help="frames a second, without times (default: %(default)s)")
+    noise.add_argument("--out", type=Path, metavar="NOISE.json", help="a file to write")
+    noise.add_argument(
+        "--seed", type=seed, default=0, metavar="SEED", help="of synthetic tracks (default: %(default)s)"
+    )

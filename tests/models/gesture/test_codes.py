@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxfilters import hmm
-from jaxfilters.models.gesture.codes import STILL, blurred, direction_code
+from jaxfilters.models.gesture.codes import STILL, blurred, direction_code, displacements, observed
 
 
 def turned(degrees, length=5.0):
@@ -44,3 +44,13 @@ def test_blur_spreads_directions_around_the_circle_and_leaves_still_alone():
     np.testing.assert_array_equal(found[1], probability[1])
     with pytest.raises(ValueError, match="17 symbols"):
         blurred(hmm.Codes(jnp.zeros((2, 16))))
+
+
+def test_a_hand_moves_as_the_mean_of_the_tips_that_were_seen_twice():
+    tips = np.array([[(0, 0), (9, 9)], [(4, 0), (9, 1)], [(7, 7), (9, -9)], [(np.nan, 0), (9, -9)], [(5, 5), (0, 0)]])
+    present = np.array([[1, 0], [1, 1], [1, 1], [0, 1], [1, 0]], bool)
+    found = displacements(jnp.asarray(tips), jnp.asarray(present))
+    np.testing.assert_allclose(found, [(0, 0), (4, 0), (1.5, -1.5), (0, 0), (0, 0)], atol=1e-6)
+    codes, counts = observed(jnp.asarray(tips), jnp.asarray(present))
+    np.testing.assert_array_equal(codes, [STILL, 1, 3, STILL, STILL])
+    np.testing.assert_array_equal(counts, [1, 2, 2, 1, 1])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxfilters import hmm
-from jaxfilters.models.gesture.stroke import features
-from jaxfilters.models.gesture.symbols import extended, learn, network, recognise
+from jaxfilters.models.gesture.stroke import features, stacked
+from jaxfilters.models.gesture.symbols import CHUNK, extended, learn, network, recognise, recognise_all
 
 CORNERS = {
     "caret": [(0, 0), (1, 2), (2, 0)],
@@ -31,7 +31,7 @@ def drawn(rng, name):
 def collection(seed, count, names=tuple(CORNERS)):
     rng = np.random.default_rng(seed)
     labels = [name for name in names for _ in range(count)]
-    return jnp.stack([features(drawn(rng, name), num_points=30) for name in labels]), labels
+    return jnp.stack([features([drawn(rng, name)], num_points=30) for name in labels]), labels
 
 
 def strokes_last(stacked):
@@ -56,10 +56,35 @@ def test_what_is_no_symbol_is_rejected_and_symbols_are_not(symbols):
     strokes, _ = collection(2, 12)
     assert np.mean(recognise(symbols, strokes_last(strokes), bar).label >= 0) >= 0.95
     rng = np.random.default_rng(3)
-    scribbles = jnp.stack([features(rng.normal(size=(14, 2)), num_points=30) for _ in range(20)])
+    scribbles = jnp.stack([features([rng.normal(size=(14, 2))], num_points=30) for _ in range(20)])
     found = recognise(symbols, strokes_last(scribbles), bar)
     assert np.mean(found.label < 0) >= 0.9
     assert np.all(recognise(symbols, strokes_last(strokes), bar, margin=100.0).label == -1)
+
+
+def test_any_number_of_strokes_is_judged_as_each_alone(symbols):
+    strokes, _ = collection(2, 12)
+    expected = recognise(symbols, strokes_last(strokes), hmm.threshold(network(symbols)), margin=0.1)
+    num_strokes = len(strokes)
+    many = np.tile(strokes_last(strokes), 3)
+    assert many.shape[-1] > CHUNK
+    lengths = np.where(np.arange(many.shape[-1]) == 3, 0, many.shape[0])
+    found = recognise_all(symbols, many, lengths, margin=0.1)
+    assert found.label[3] == -1
+    assert found.label.shape == lengths.shape
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one[..., -num_strokes:], other, rtol=1e-4, atol=1e-5)
+
+
+def test_a_symbol_that_hardly_beats_another_is_rejected(symbols):
+    strokes, _ = collection(2, 12)
+    found = recognise(symbols, strokes_last(strokes))
+    best = np.sort(found.log_likelihood, axis=0)
+    apart = best[-1] - best[-2]
+    # Between two strokes, so that rounding does not decide.
+    bar = float(np.mean(np.sort(apart)[[9, 10]]))
+    rejected = recognise(symbols, strokes_last(strokes), distance=bar).label < 0
+    np.testing.assert_array_equal(rejected, apart < bar)
 
 
 def test_features_that_are_not_finite_are_rejected_without_nan(symbols):
@@ -86,7 +111,7 @@ def test_a_symbol_that_is_drawn_in_two_ways_has_two_models():
     rng = np.random.default_rng(8)
     both_ways = [drawn(rng, "square")[:: 1 if i % 2 else -1] for i in range(12)]
     strokes = jnp.concatenate(
-        [jnp.stack([features(stroke, num_points=30) for stroke in both_ways]), collection(9, 1, ("z",))[0]]
+        [jnp.stack([features([stroke], num_points=30) for stroke in both_ways]), collection(9, 1, ("z",))[0]]
     )
     found = learn(strokes, ["square"] * 12 + ["z"], num_states=6, num_variants=2)
     np.testing.assert_array_equal(found.owner, [0, 0, 1])
@@ -107,7 +132,7 @@ def test_mid_air_symbols_of_people_it_has_never_seen(data_dir: Path):
     with np.load(data_dir / "midair_leap_gestures" / "midair_leap.npz") as archive:
         recorded = dict(archive)
     ends = np.cumsum(recorded["length"])
-    strokes = jnp.stack([features(stroke) for stroke in np.split(recorded["xyz_mm"], ends[:-1])])
+    strokes = stacked([([stroke], 1.0) for stroke in np.split(recorded["xyz_mm"], ends[:-1])])
     right = 0
     for person in np.unique(recorded["subject"]):
         own = recorded["subject"] == person

@@ -1,0 +1,208 @@
+"""What the fingertip tracker is told, what it remembers of a hand from frame to frame, and what it says of each tip."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int32
+
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.models.fingertip.motion import STATE
+from jaxfilters.models.fingertip.observation import MAX_TIPS
+from jaxfilters.models.fingertip.thumb import POSTURE, Posture
+
+FREE, TENTATIVE, CONFIRMED = range(3)
+"""Slots: unused; what may be a mistake; a fingertip."""
+ABSENT, SYMBOLIC, MANIPULATION = range(3)
+MODE_NAMES = ("absent", "symbolic", "manipulation")
+"""What a hand does: nothing, for want of fingertips; it draws; with its thumb out, it handles something."""
+NEVER = 10**6
+"""Frames since what has not happened."""
+
+
+@dataclass(frozen=True)
+class FingertipConfig:
+    """Constants of the tracker; Python values that are read when it is compiled. Pixels are those of a 640x480 image.
+
+    The defaults are for the modern method; `tracker.PUBLISHED_CONFIG` has the specification's.
+
+    Raises:
+        ValueError: naming the field, what was expected and what came.
+    """
+
+    capacity: int = 10
+    """Tracks at a time, the tentative ones included."""
+    frame: float = 1.0
+    """Time between two frames, in thirtieths of a second; velocities are pixels in such a time."""
+    measurement_sd: float = 1.5
+    """Of a coordinate of a tip, pixels (sigma_v)."""
+    drive_sd: float = 3.0
+    """Of the change of a velocity in a frame of 1/30 s, pixels a frame (sigma_w)."""
+    max_speed: float = 60.0
+    """Of a finger that was seen once, pixels a frame."""
+    lost: float = 75.0
+    """Uncertainty U of a prediction from which on a finger is gone (theta): after six misses while the palm is seen; of
+    predictions without the palm, 300 is after four."""
+    min_hits: int = 3
+    """Detections in a row that make a fingertip."""
+    gate: float = 40.0
+    """Farthest from its prediction that a fingertip is looked for, pixels."""
+    tentative_gate: float = 80.0
+    """The same of what was seen once or twice."""
+    surprise: float = 13.8
+    """Squared distance in standard deviations from which on a detection is not that finger's: chi-square, 99.9 %."""
+    apart: float = 16.0
+    """Nearer to a fingertip than this, pixels, nothing new begins."""
+    carried_sd: float = 4.0
+    """Of a fingertip's velocity beside the palm's, pixels a frame."""
+    disorder: float = 4.0
+    """Cost of the best matching in order, by that of the best in any, from which on the order is in doubt."""
+    disordered_frames: int = 3
+    """Frames of doubt after which fingers are matched in any order."""
+    empty_frames: int = 15
+    """Frames without a tip after which the hand is forgotten."""
+    axis_frames: int = 10
+    """Frames for which the arm's last axis stands in for one that cannot be seen."""
+    posture: Posture = POSTURE
+
+    def __post_init__(self) -> None:
+        whole = ("capacity", "min_hits", "disordered_frames", "empty_frames", "axis_frames")
+        for name in [entry.name for entry in fields(self) if entry.name != "posture"]:
+            value = getattr(self, name)
+            if name in whole and not (isinstance(value, int) and value >= 1):
+                raise ValueError(f"{name} must be a positive integer; got {value!r}.")
+            if not (isinstance(value, int | float) and 0 < value < np.inf):
+                raise ValueError(f"{name} must be positive; got {value!r}.")
+        if self.capacity < MAX_TIPS:
+            raise ValueError(f"capacity must be at least {MAX_TIPS}, the tips of a hand; got {self.capacity}.")
+
+    @property
+    def drive(self) -> float:
+        """q: variance of the drive in a frame by that of a measurement."""
+        return self.frame * (self.drive_sd / self.measurement_sd) ** 2
+
+
+def scaled(config: FingertipConfig, *, height: float = 480.0, fps: float = 30.0) -> FingertipConfig:
+    """The same for images of another height in pixels, and another number of frames a second."""
+    in_pixels = ("measurement_sd", "drive_sd", "max_speed", "gate", "tentative_gate", "apart", "carried_sd")
+    return replace(
+        config, frame=config.frame * 30.0 / fps, **{name: getattr(config, name) * height / 480.0 for name in in_pixels}
+    )
+
+
+class Tracks(NamedTuple):
+    """Fingertips and what may become some, one slot each."""
+
+    belief: Gaussian
+    """Mean (slots, 4) and covariance (slots, 4, 4) in the next frame, as in `models.fingertip.motion`."""
+    mode: Int32[Array, " slots"]
+    identity: Int32[Array, " slots"]
+    """-1 until it is confirmed."""
+    hits: Int32[Array, " slots"]
+    """Detections so far."""
+    missed: Int32[Array, " slots"]
+    """Frames since the last of them."""
+    thumb: Any
+    """What the thumb test remembers, slots first."""
+    is_thumb: Bool[Array, " slots"]
+
+
+class HandState(NamedTuple):
+    """One hand between two frames."""
+
+    tracks: Tracks
+    palm: Float[Array, "2"]
+    """Where it was seen last, pixels."""
+    palm_velocity: Float[Array, "2"]
+    """Between the last two frames in which it was seen, pixels a frame."""
+    unseen: Int32[Array, ""]
+    """Frames since it was seen."""
+    axis: Float[Array, "2"]
+    """Of the forearm, when it was seen last."""
+    axis_unseen: Int32[Array, ""]
+    """Frames since then."""
+    empty: Int32[Array, ""]
+    """Frames in a row without a tip."""
+    disordered: Int32[Array, ""]
+    """Frames in a row in which the order of the fingers was in doubt."""
+    next_identity: Int32[Array, ""]
+
+
+class HandReport(NamedTuple):
+    """What is known of one hand after a frame; tips one row a slot."""
+
+    identity: Int32[Array, " slots"]
+    """-1 where there is no fingertip, and all else of the row is 0."""
+    is_tip: Bool[Array, " slots"]
+    is_observed: Bool[Array, " slots"]
+    """Otherwise the position is predicted."""
+    position: Float[Array, "slots 2"]
+    """Pixels."""
+    sd: Float[Array, " slots"]
+    """Of a coordinate, pixels."""
+    velocity: Float[Array, "slots 2"]
+    """Pixels a frame of 1/30 s."""
+    is_thumb: Bool[Array, " slots"]
+    thumb_probability: Float[Array, " slots"]
+    palm: Float[Array, "2"]
+    has_palm: Bool[Array, ""]
+    """Whether it was seen in this frame."""
+    axis: Float[Array, "2"]
+    has_axis: Bool[Array, ""]
+    """Whether it was seen, now or a few frames ago; without it nothing new is learnt about the thumb."""
+    mode: Int32[Array, ""]
+    """Place in `MODE_NAMES`."""
+    num_tips: Int32[Array, ""]
+
+
+class ThumbTest(NamedTuple):
+    """How a track becomes the thumb; functions of one track but for the last, whose arrays are slots first."""
+
+    start: Callable[..., Any]
+    """`(config, angles) -> memory` of a track that begins."""
+    observe: Callable[..., Any]
+    """`(config, angles, memory, angle, seen) -> memory` with the angle of one more frame, where it was `seen`."""
+    judge: Callable[..., tuple[Array, Array]]
+    """`(memories, was_thumb, there) -> (probability, is_thumb)` over the fingers of a hand that are `there`."""
+
+
+class Method(NamedTuple):
+    """The strategies of which a tracker is made."""
+
+    hint: Callable[..., Gaussian]
+    """`(config, state, observed) -> beliefs`, with what else than tips tells where fingers are in this frame."""
+    associate: Callable[..., tuple[Array, Array]]
+    """`(config, state, beliefs, observed) -> (tip of every slot or -1, whether the order was in doubt)`."""
+    may_begin: Callable[..., Array]
+    """`(config, tracks, positions, observed) -> which tips without a track may begin one`."""
+    report: Callable[..., Array]
+    """`(detected, filtered) -> position` that is reported where a tip was detected."""
+    thumb: ThumbTest
+
+
+def no_tracks(config: FingertipConfig, memory: Any) -> Tracks:
+    """Nothing yet; `memory` is that of the thumb test for a track that begins."""
+    n = config.capacity
+    whole = jnp.zeros(n, jnp.int32)
+    return Tracks(
+        Gaussian(jnp.zeros((n, STATE)), jnp.broadcast_to(jnp.eye(STATE), (n, STATE, STATE))),
+        whole + FREE,
+        whole - 1,
+        whole,
+        whole,
+        repeated(memory, n),
+        whole > 0,
+    )
+
+
+def repeated(tree: Any, n: int) -> Any:
+    """The same n times, leaf by leaf."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), tree)
+
+
+def chosen(mask: Bool[Array, " slots"], yes: Any, no: Any) -> Any:
+    """`yes` in the slots of the mask, `no` elsewhere, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(b) - 1)), a, b), yes, no)

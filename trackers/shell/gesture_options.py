@@ -1,0 +1,56 @@
+"""The options of `jaxfilters fit gestures` and `recognise`, apart from what carries them out."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+WRITERS, TRIALS = 6, 30
+"""Of the generator, and how often each draws every shape with one finger and with two: what the model that comes with
+the package was made with."""
+_DATA = (
+    "strokes: .csv with a row for each point (columns stroke,label,time,x,y and perhaps z, person, fingers), folder "
+    "with a folder of such files for each symbol, .npz with points, length, label and perhaps person, or file of "
+    "UNIPEN; without it, symbols that are drawn at random"
+)
+
+
+def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
+    """Add `gestures` to what can be fitted; `seed` reads random seeds."""
+    gestures = what.add_parser("gestures", help="symbols from examples of their strokes")
+    gestures.add_argument("data", nargs="?", type=Path, metavar="DATA", help=_DATA)
+    gestures.add_argument("--out", type=Path, required=True, metavar="MODEL.npz", help="the file to write")
+    gestures.add_argument(
+        "--add", type=Path, metavar="MODEL.npz", help="keep the symbols of this model and add those of DATA; five do"
+    )
+    gestures.add_argument(
+        "--held-out", choices=("person",), help="also say how strokes of each person are recognised by the others'"
+    )
+    gestures.add_argument(
+        "--states", type=int, metavar="N", help="of each model (default: 10; 16 for paths in a plane)"
+    )
+    gestures.add_argument(
+        "--ways", type=int, metavar="N", help="to draw each symbol (default: one for 40 examples, at most 20)"
+    )
+    gestures.add_argument(
+        "--seed", type=seed, default=0, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"
+    )
+
+
+def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
+    """Add the command to the parser's `commands`; `seed` reads random seeds."""
+    recognise = commands.add_parser("recognise", help="say which symbols strokes are")
+    recognise.add_argument(
+        "model", type=Path, metavar="MODEL.npz", help="of `fit gestures`; `default` is the package's"
+    )
+    recognise.add_argument("data", nargs="?", type=Path, metavar="DATA", help=_DATA)
+    recognise.add_argument("--out", type=Path, metavar="FILE.csv", help="write a row for each stroke there")
+    recognise.add_argument(
+        "--margin",
+        type=float,
+        default=0.0,
+        metavar="NATS",
+        help="a point by which a symbol has to beat what all of them are made of (default: %(default)s)",
+    )
+    recognise.add_argument(
+        "--seed", type=seed, default=1, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"
+    )
