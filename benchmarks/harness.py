@@ -2,6 +2,7 @@
 
 A scenario is a module in `scenarios/` with `run(*, quick, seed, out) -> dict[str, Metric]`; its docstring says what it
 measures, and its file name, with dashes, is its name. One that compares with a file of truth takes `truth`, too.
+With `--gate` the exit code says whether anything is worse than a baseline allows.
 """
 
 import argparse
@@ -11,15 +12,15 @@ import inspect
 import json
 import pkgutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxfilters.benchmarks import metrics, scenarios
+from jaxfilters.benchmarks import gate, metrics, scenarios
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.trackers.shell.devices import use_all_cores
 
-FAILURE = 2
-"""Exit code for wrong arguments, missing packages and files that cannot be written."""
+REGRESSION, FAILURE = 1, 2
+"""Exit codes: worse than the baseline allows; wrong arguments, missing packages and files that cannot be written."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,6 +30,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser(found).parse_args(argv)
     if options.json and not options.json.parent.is_dir():
         return _fail(f"--json: no folder {options.json.parent}")
+    try:
+        bounds = gate.load(options.baseline, options.scenario) if options.gate else {}
+    except ValueError as error:
+        return _fail(f"--gate: {error}")
     try:
         scenario = importlib.import_module(f"{scenarios.__name__}.{options.scenario.replace('-', '_')}")
     except ModuleNotFoundError as error:
@@ -48,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         document = metrics.report(options.scenario, measured, environment())
         options.json.write_text(json.dumps(document, indent=2) + "\n")
-    return 0
+    return _gate(bounds, measured) if options.gate else 0
 
 
 def descriptions() -> dict[str, str]:
@@ -63,6 +68,12 @@ def descriptions() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def _gate(bounds: Mapping[str, gate.Bound], measured: Mapping[str, metrics.Metric]) -> int:
+    rows = gate.compare(bounds, measured)
+    print(f"\n{gate.table(rows)}")
+    return 0 if gate.passes(rows) else REGRESSION
+
+
 def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxfilters bench",
@@ -75,6 +86,16 @@ def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers and the environment there")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="what to compare with, where it is a file's to say")
+    parser.add_argument(
+        "--gate", action="store_true", help="compare with the baseline; exit 1 where something is worse"
+    )
+    parser.add_argument(
+        "--baseline",
+        type=Path,
+        metavar="FILE",
+        default=gate.BASELINE,
+        help="what to compare with (default: the committed one)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the plots of the scenario there")
     return parser
 

@@ -1,6 +1,6 @@
 """What a scenario measures, as a table for people and as JSON for comparisons."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,8 +20,13 @@ def table(metrics: Mapping[str, Metric]) -> str:
     """One aligned line a metric: name, value, unit, better direction."""
     header = ("metric", "value", "unit", "better")
     cells = [(name, f"{m.value:.4g}", m.unit, m.better) for name, m in metrics.items()]
-    widths = [max(len(row[i]) for row in [header, *cells]) for i in range(len(header))]
-    lines = [_line(row, widths) for row in [header, *cells]]
+    return aligned([header, *cells], numbers=(1,))
+
+
+def aligned(rows: Sequence[tuple[str, ...]], *, numbers: Collection[int]) -> str:
+    """Rows of words below one another, the first one underlined; `numbers` are the columns that end flush."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [_line(row, widths, numbers) for row in rows]
     return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
 
 
@@ -34,7 +39,9 @@ def report(scenario: str, metrics: Mapping[str, Metric], environment: Mapping[st
     }
 
 
-def _line(row: tuple[str, ...], widths: list[int]) -> str:
-    name, value, *words = row
-    padded = [word.ljust(width) for word, width in zip(words, widths[2:], strict=True)]
-    return "  ".join([name.ljust(widths[0]), value.rjust(widths[1]), *padded]).rstrip()
+def _line(row: tuple[str, ...], widths: Sequence[int], numbers: Collection[int]) -> str:
+    padded = [
+        word.rjust(width) if i in numbers else word.ljust(width)
+        for i, (word, width) in enumerate(zip(row, widths, strict=True))
+    ]
+    return "  ".join(padded).rstrip()

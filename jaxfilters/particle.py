@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters import weights
+from jaxfilters.differentiable_resampling import EnsembleScheme, Resampled
 from jaxfilters.filter import Filter
 from jaxfilters.resampling import systematic
 from jaxfilters.typing import (
@@ -66,7 +67,7 @@ class Bootstrap:
     ess_threshold: float
     num_particles: int = field(metadata={"static": True})
     noise: DrawNoise = field(metadata={"static": True})
-    scheme: ResamplingScheme = field(metadata={"static": True})
+    scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
 
 
 def bootstrap(
@@ -76,7 +77,7 @@ def bootstrap(
     *,
     num_particles: int,
     noise: DrawNoise | None = None,
-    scheme: ResamplingScheme = systematic,
+    scheme: ResamplingScheme | EnsembleScheme = systematic,
     ess_threshold: float = 0.5,
     temper: Temper | None = None,
 ) -> Filter:
@@ -89,7 +90,8 @@ def bootstrap(
         num_particles: Size N of the ensemble.
         noise: What `randomness` is. Default: a random key for each particle. `StandardNormal(d)` hands over `d`
             standard normal numbers instead and is several times faster.
-        scheme: Resampling scheme, e.g. `jaxfilters.resampling.stratified`.
+        scheme: Resampling scheme, e.g. `jaxfilters.resampling.stratified`, or one of
+            `jaxfilters.differentiable_resampling`.
         ess_threshold: Resample before a prediction if the effective sample size is below this share of N; 1 or more
             resamples always, 0 never.
         temper: Flattens log-likelihoods, e.g. `TemperToShare(0.2)`; the log evidence is then that of the flattened
@@ -153,7 +155,7 @@ def resample(
     key: AnyKey,
     particles: PyTree,
     log_weights: Float[Array, " n"],
-    scheme: ResamplingScheme,
+    scheme: ResamplingScheme | EnsembleScheme,
     ess_threshold: float | Float[Array, ""],
 ) -> tuple[PyTree, Float[Array, " n"], Int32[Array, " n"]]:
     """Resample where the effective sample size is below `ess_threshold * N`; keeps the total weight.
@@ -164,13 +166,17 @@ def resample(
     """
     num_particles = log_weights.shape[0]
     normalized, log_sum = weights.normalize(log_weights)
+    identity = jnp.arange(num_particles, dtype=jnp.int32)
+    uneven = weights.effective_sample_size(normalized) < ess_threshold * num_particles
+    uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
+    if isinstance(scheme, EnsembleScheme):
+        as_it_is = Resampled(particles, normalized, identity)
+        found = jax.lax.cond(uneven, lambda: scheme.resample(key, particles, normalized), lambda: as_it_is)
+        return found.particles, log_sum + found.log_weights, found.ancestors
 
     def draw() -> Int32[Array, " n"]:
         return scheme(key, jax.lax.stop_gradient(normalized))
 
-    identity = jnp.arange(num_particles, dtype=jnp.int32)
-    uneven = weights.effective_sample_size(normalized) < ess_threshold * num_particles
-    uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
     ancestors = jax.lax.cond(uneven, draw, lambda: identity)
     chosen = normalized[ancestors]
     chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)

@@ -18,9 +18,6 @@ from jaxfilters.filter import Filter, run
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.smoothing import rts
 
-_KEY = np.zeros(2, np.uint32)
-"""Gaussian filters draw nothing."""
-
 
 class PointNoise(NamedTuple):
     """Noises of one coordinate; positive. Lengths are in the unit of the tracks."""
@@ -105,7 +102,7 @@ class PointFilter:
 def learn(tracks: Tracks) -> fit.Fit:
     """`PointNoise` of most likelihood, with standard errors."""
     y = Measured(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
-    density = fit.over_sequences(_KEY, PointFilter(tracks.extent), y, tracks.seconds)
+    density = fit.over_sequences(_no_key(), PointFilter(tracks.extent), y, tracks.seconds)
     start = PointNoise(0.05 * tracks.extent, 5 * tracks.extent)
     return fit.maximize(density, start, fit.positive)
 
@@ -125,7 +122,12 @@ def positions(tracks: Tracks, noise: PointNoise) -> Positions:
     chosen = PointFilter(tracks.extent)(noise)
 
     def one(y: Array, seconds: Array) -> Positions:
-        _, (beliefs, _) = run(chosen, _KEY, y, seconds)
+        _, (beliefs, _) = run(chosen, _no_key(), y, seconds)
         return Positions(beliefs.mean[:, 0], rts(chosen, beliefs, seconds).mean[:, 0])
 
     return jax.vmap(one, in_axes=-1, out_axes=-1)(tracks.y, tracks.seconds)
+
+
+def _no_key() -> Array:
+    """Gaussian filters draw nothing."""
+    return jnp.zeros(2, jnp.uint32)

@@ -70,20 +70,21 @@ def chart_about(start: PyTree, constraints: PyTree) -> Chart:
     """
     try:
         spread = jax.tree.map(
-            lambda constraint, branch: [(constraint, leaf) for leaf in jax.tree.leaves(branch)],
+            lambda constraint, branch: jax.tree.map(lambda _: constraint, branch),
             constraints,
             start,
             is_leaf=lambda node: isinstance(node, Constraint),
         )
     except ValueError as error:
         raise ValueError(f"constraints must be like start, or a prefix of it: {error}") from None
-    pairs = jax.tree.leaves(spread, is_leaf=lambda node: isinstance(node, tuple))
-    for constraint, _ in pairs:
+    each = jax.tree.leaves(spread, is_leaf=lambda node: isinstance(node, Constraint))
+    for constraint in each:
         if not isinstance(constraint, Constraint):
             raise ValueError(f"constraints must hold constraints such as fit.positive; got {constraint!r}.")
+    pairs = zip(each, jax.tree.leaves(start), strict=True)
     leaves = [jnp.asarray(leaf, None if isinstance(c, Fixed) else float) for c, leaf in pairs]
     origin = jax.tree.unflatten(jax.tree.structure(start), leaves)
-    return Chart(origin, tuple(constraint for constraint, _ in pairs))
+    return Chart(origin, tuple(each))
 
 
 def boxed(chart: Chart) -> Chart:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxfilters import linalg
 from jaxfilters.fit.chart import Chart, chart_about
@@ -21,21 +21,37 @@ _QUANTILE = 1.959964
 
 
 def observed_information(loss: Callable[[Array], Array], z: Float[Array, " d"]) -> Float[Array, "d d"]:
-    """Covariance of the coordinates: the inverse Hessian of the loss; NaN where it is not positive definite.
+    """Covariance of the coordinates: the inverse Hessian of the loss.
 
-    Of a particle filter it is as noisy as one draw: the second derivative of its weights is an estimate, too.
+    A coordinate along which the loss does not curve, given those before it, is not determined: its rows are NaN, and
+    the covariance of the others is what it would be if it were known. So a variance that the data want to be zero has
+    no error, and takes none away. Of a particle filter the Hessian is as noisy as one draw: the second derivative of
+    its weights is an estimate, too.
     """
-    if z.size == 0:
-        return jnp.zeros((0, 0), z.dtype)
     information = jax.hessian(loss)(z)
-    # Scaled to ones on the diagonal: coordinates have different units.
     diagonal = jnp.diagonal(information)
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, jnp.nan))
-    root = linalg.cholesky(scale[:, None] * information * scale)
-    inverse = linalg.solve_triangular(root, jnp.eye(z.size, dtype=z.dtype))
-    definite = jnp.all(jnp.diagonal(root) > 0)
-    covariance = scale[:, None] * jnp.matmul(inverse.T, inverse, precision="highest") * scale
-    return jnp.where(definite, covariance, jnp.nan)
+    # Scaled to ones on the diagonal: coordinates have different units.
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    inverse, determined = _inverse(scale[:, None] * information * scale)
+    covariance = scale[:, None] * inverse * scale
+    return jnp.where(determined[:, None] & determined, covariance, jnp.nan)
+
+
+def _inverse(S: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Bool[Array, " d"]]:
+    """Inverse of a symmetric matrix with ones on its diagonal, by sweeping; and which pivots were positive."""
+    least = float(jnp.finfo(S.dtype).eps) ** 0.5
+
+    def sweep(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        A, determined = state
+        pivot = A[i, i]
+        sound = pivot > least
+        row = A[i] / jnp.where(sound, pivot, 1.0)
+        swept = A - jnp.outer(A[:, i], row)
+        swept = swept.at[i].set(row).at[:, i].set(row).at[i, i].set(-1 / jnp.where(sound, pivot, 1.0))
+        return jnp.where(sound, swept, A), determined.at[i].set(sound)
+
+    A, determined = jax.lax.fori_loop(0, S.shape[0], sweep, (S, jnp.zeros(S.shape[0], bool)))
+    return -A, determined
 
 
 def no_errors(loss: Callable[[Array], Array], z: Float[Array, " d"]) -> Float[Array, "d d"]:
@@ -51,6 +67,8 @@ def intervals(chart: Chart, z: Float[Array, " d"], covariance: Float[Array, "d d
     """
     deviation = linalg.safe_sqrt(jnp.diagonal(covariance))
     deviation = jnp.where(jnp.isnan(jnp.diagonal(covariance)), jnp.nan, deviation)
+    undetermined = jnp.isnan(deviation)
+    known = jnp.where(undetermined[:, None] | undetermined, 0.0, covariance)
     theta = chart.point(z)
     floors, ceilings = chart.point(z - _QUANTILE * deviation), chart.point(z + _QUANTILE * deviation)
 
@@ -59,8 +77,9 @@ def intervals(chart: Chart, z: Float[Array, " d"], covariance: Float[Array, "d d
         return [leaf.astype(z.dtype) for leaf in jax.tree.leaves(chart.point(z))]
 
     def spread(J: Array) -> Array:
-        variance = jnp.sum(J * jnp.matmul(J, covariance, precision="highest"), axis=-1)
-        return jnp.where(jnp.isnan(variance), jnp.nan, linalg.safe_sqrt(variance))
+        # Who does not depend on an undetermined coordinate has an error; NaN times zero would say otherwise.
+        variance = jnp.sum(J * jnp.matmul(J, known, precision="highest"), axis=-1)
+        return jnp.where(jnp.any((J != 0) & undetermined, axis=-1), jnp.nan, linalg.safe_sqrt(variance))
 
     errors = jax.tree.unflatten(jax.tree.structure(theta), map(spread, jax.jacfwd(numbers)(z)))
     ends = []
@@ -112,7 +131,8 @@ def _both_slopes(log_density: Callable, chart: Chart, step: Array | float) -> tu
     def value(z: Array) -> Array:
         return at_step(log_density, jnp.zeros((), jnp.int32), chart.point(z))
 
-    ahead, behind = (jax.lax.map(lambda shift: value(z + shift), side * step * jnp.eye(z.size)) for side in (1, -1))
+    shifts = step * jnp.concatenate([jnp.eye(z.size), -jnp.eye(z.size)])
+    ahead, behind = jax.lax.map(lambda shift: value(z + shift), shifts).reshape(2, z.size)
     return jax.grad(value)(z), (ahead - behind) / (2 * step)
 
 

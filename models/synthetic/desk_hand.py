@@ -103,8 +103,9 @@ def desk_video(
     blur: float = 1.0,
     speed: float = 1.0,
     desk: Desk | None = None,
+    poses: Float[np.ndarray, "frames 3"] | None = None,
 ) -> Iterator[DeskFrame]:
-    """Frames of a right hand on a Lissajous path, blurred by its motion while the shutter is open.
+    """Frames of a right hand that moves, blurred by its motion while the shutter is open.
 
     Args:
         key: Decides about path, desk and noise.
@@ -113,6 +114,7 @@ def desk_video(
         blur: Standard deviation of the lens, pixels of the image.
         speed: 1 for up to about 3 % of the image's height per frame.
         desk: What lies below the hand, of the same shape; the infrared one by default.
+        poses: Palm (x, y) in pixels of an image with 240 rows and lean of the arm in radians; a Lissajous path without.
 
     Raises:
         ValueError: a shape of another proportion.
@@ -125,12 +127,12 @@ def desk_video(
     out = np.stack([np.convolve(w, kernel, mode="same") for w in wanted.T], axis=1)[MOVE_FRAMES:]
     times = np.arange(len(out))
     for frame in range(len(fingers)):
-        poses = []
+        during = []
         for time in frame + EXPOSURE * (np.arange(SUBFRAMES) / (SUBFRAMES - 1) - 0.5):
             lengths = jitter * np.array([np.interp(time, times, share) for share in out.T])
-            palm, lean = _lissajous(speed * time, phases)
-            poses.append(HandPose(palm, -math.pi / 2 + lean, lengths))
-        yield frame_of(rng, poses, desk, blur=blur, time=float(frame))
+            palm, lean = _lissajous(speed * time, phases) if poses is None else _between(poses, time)
+            during.append(HandPose(palm, -math.pi / 2 + lean, lengths))
+        yield frame_of(rng, during, desk, blur=blur, time=float(frame))
 
 
 def finger_schedule(num_frames: int, *, hold: int = 45) -> Bool[np.ndarray, "frames 5"]:
@@ -220,6 +222,12 @@ def _lissajous(time: float, phases: np.ndarray) -> tuple[np.ndarray, float]:
     x = (left + right) / 2 + (right - left) / 2 * (0.8 * wave[0] + 0.2 * wave[1])
     y = (top + bottom) / 2 + (bottom - top) / 2 * (0.7 * wave[2] + 0.3 * wave[3])
     return np.array([x, y]), 0.8 * MAX_LEAN * float(wave[4])
+
+
+def _between(poses: Float[np.ndarray, "frames 3"], time: float) -> tuple[np.ndarray, float]:
+    """Palm and lean at a time between frames."""
+    x, y, lean = (float(np.interp(time, np.arange(len(poses)), numbers)) for numbers in poses.T)
+    return np.array([x, y]), lean
 
 
 def _generator(key: AnyKey) -> np.random.Generator:

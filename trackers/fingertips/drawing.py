@@ -24,6 +24,9 @@ class DrawingConfig:
     """In which a stroke moves; what is shorter is none."""
     least_size: float = 30.0
     """Longer side of the box around a stroke, pixels; what is smaller is none."""
+    folding_frames: int = 8
+    """Within which a finger comes out or folds; such a movement at either end is no part of a stroke, if it rests
+    between the two for half as long."""
     most_frames: int = 600
     """After which a stroke is ended, so that none goes on for ever."""
 
@@ -70,8 +73,10 @@ def drawn(config: DrawingConfig, state: Drawing, now: HandFrame) -> tuple[Drawin
 
 
 def finished(config: DrawingConfig, state: Drawing) -> Stroke | None:
-    """The stroke without the rest at its end; None where it is too short or too small to be one."""
+    """The stroke without the rests at its ends; None where it is too short or too small to be one."""
     moving = np.flatnonzero(np.asarray(state.codes, int) != STILL)
+    moving = _unfolded(config, moving)
+    moving = moving[-1] - _unfolded(config, (moving[-1] - moving)[::-1])[::-1] if len(moving) else moving
     if len(moving) < config.least_frames:
         return None
     span = slice(int(moving[0]), int(moving[-1]) + 1)
@@ -85,6 +90,14 @@ def finished(config: DrawingConfig, state: Drawing) -> Stroke | None:
         np.asarray(state.times_s)[span],
         state.first_frame + span.start,
     )
+
+
+def _unfolded(config: DrawingConfig, moving: np.ndarray) -> np.ndarray:
+    """The frames that move, without a short movement at their beginning after which the finger rests."""
+    pauses = np.flatnonzero(np.diff(moving) > config.folding_frames // 2)
+    if not len(pauses) or moving[pauses[0]] - moving[0] >= config.folding_frames:
+        return moving
+    return moving[pauses[0] + 1 :]
 
 
 def symbol_event(hand: int, now: HandFrame, stroke: Stroke, recogniser: Recogniser | None) -> Event:

@@ -13,14 +13,15 @@ from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold
 from jaxfilters.models.fingertip.skin import fit_skin_model, skin_mask
-from jaxfilters.models.synthetic.desk_hand import DeskFrame, desk_video, finger_schedule
+from jaxfilters.models.synthetic.desk_hand import DeskFrame, desk_video
+from jaxfilters.models.synthetic.desk_script import script
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.depth_files import open_depth
 from jaxfilters.trackers.shell.video_input import LiveCamera, open_video
 
 OPEN_HAND_IMAGES = 60
 """Images in which an open hand is looked for before a recording is followed."""
-DEMO_SECONDS, DEMO_FPS, DEMO_SHAPE = 18.0, 30.0, (480, 640)
+DEMO_FPS, DEMO_SHAPE = 30.0, (480, 640)
 USUAL_TIP_RADIUS = 13.0
 """Pixels of an image with 480 rows, of somebody who showed no open hand."""
 Segment = Callable[[np.ndarray], np.ndarray]
@@ -41,27 +42,26 @@ class DemoHand:
 
     def __init__(self, seed: int):
         self.name, self.fps, self.image_size = "synthetic hand", DEMO_FPS, (DEMO_SHAPE[1], DEMO_SHAPE[0])
-        self.frames = round(DEMO_SECONDS * DEMO_FPS)
+        self._script = script(seed)
+        self.frames = len(self._script.fingers)
         self.truth: list[DeskFrame] = []
         """Of the frames so far, without their images."""
         self._key = jax.random.key(seed)
 
     def sample(self, most: int) -> list[np.ndarray]:
         """The open hand that every user shows at the start."""
-        return [frame.image for frame in self._video(np.ones((1, 5), bool))][:most]
+        return [frame.image for frame in desk_video(self._key, np.ones((1, 5), bool), shape=DEMO_SHAPE)][:most]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
-        """Fingers come out one after the other, the thumb too, and go."""
-        for i, frame in enumerate(self._video(finger_schedule(self.frames))):
+        """An open hand, which then draws, and handles things."""
+        fingers, poses, _ = self._script
+        for i, frame in enumerate(desk_video(self._key, fingers, shape=DEMO_SHAPE, poses=poses)):
             self.truth.append(frame)
             yield i / self.fps, cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR)
 
     def trouble(self) -> str | None:
         """Nothing goes wrong."""
         return None
-
-    def _video(self, fingers: np.ndarray) -> Iterator[DeskFrame]:
-        return desk_video(self._key, fingers, shape=DEMO_SHAPE)
 
 
 class DepthVideo:

@@ -1,0 +1,132 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from jaxfilters import fit
+from jaxfilters.extended import Measured, extended
+from jaxfilters.filter import loglikelihood
+from jaxfilters.gaussian import Gaussian
+from jaxfilters.particle import StandardNormal, bootstrap
+
+KEY = jax.random.key(2)
+RNG = np.random.default_rng(8)
+THETA = {"rate": 0.8, "drift": 0.5, "noise": 0.4}
+LIMITS = {"rate": fit.interval(-1, 1), "drift": fit.positive, "noise": fit.positive}
+START = {"rate": 0.3, "drift": 1.0, "noise": 1.0}
+
+
+def move(rate, x, control):
+    del control
+    return rate * x
+
+
+def see(x):
+    return x
+
+
+def filter_of(theta):
+    prior = Gaussian(jnp.zeros(1), jnp.eye(1))
+    transition = jax.tree_util.Partial(move, theta["rate"])
+    return extended(prior, transition, theta["drift"] ** 2 * jnp.eye(1), see, theta["noise"] ** 2 * jnp.eye(1))
+
+
+def simulate(rng, shape, rate, drift, noise):
+    steps, *many = shape
+    x, ys = rng.normal(size=many), []
+    for _ in range(steps):
+        x = rate * x + drift * rng.normal(size=many)
+        ys.append(x + noise * rng.normal(size=many))
+    return np.array(ys)
+
+
+def joint_log_density(ys, seen, rate, drift, noise):
+    """Of all readings at once, from their covariance."""
+    variances = [rate**2 + drift**2]
+    for _ in ys[1:]:
+        variances.append(rate**2 * variances[-1] + drift**2)
+    steps = np.arange(len(ys))
+    lag = abs(steps[:, None] - steps)
+    covariance = np.array(variances)[np.minimum(steps[:, None], steps)] * rate**lag + noise**2 * np.eye(len(ys))
+    return multivariate_normal(np.zeros(seen.sum()), covariance[np.ix_(seen, seen)]).logpdf(ys[seen])
+
+
+def test_the_log_evidence_of_sequences_is_that_of_the_joint_gaussian(x64):
+    ys = simulate(RNG, (9, 3), 0.8, 0.5, 0.4)
+    seen = RNG.random((9, 3)) < 0.8
+    holes = jnp.where(seen, ys, jnp.nan)[:, None]
+    expected = [joint_log_density(ys[:, i], seen[:, i], 0.8, 0.5, 0.4) for i in range(3)]
+    one = fit.log_evidence(KEY, filter_of, holes[..., 0], mask=jnp.asarray(seen[:, 0]))
+    np.testing.assert_allclose(one(THETA), expected[0], rtol=1e-9)
+    together = fit.over_sequences(KEY, filter_of, holes, mask=jnp.asarray(seen))
+    np.testing.assert_allclose(together(THETA), sum(expected), rtol=1e-9)
+
+
+def test_nan_that_nothing_declares_is_named():
+    ys = np.ones((5, 2))
+    ys[3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"observations\['y'\] must not be NaN.*frame 3"):
+        fit.log_evidence(KEY, filter_of, {"y": ys, "count": np.ones(5, int)})
+    fit.check_observations({"y": ys}, mask=np.arange(5) != 3)
+    fit.check_observations(Measured(ys, ~np.isnan(ys)))
+    fit.check_observations(ys[:, None], mask=~np.isnan(ys))
+    with pytest.raises(ValueError, match="frame 3"):
+        fit.check_observations(Measured(ys))
+    with pytest.raises(ValueError, match="frame 3"):
+        fit.check_observations(ys, mask=np.arange(5) != 2)
+
+
+def start_anywhere(key):
+    return jax.random.normal(key, (1,))
+
+
+def move_by_noise(rate, drift, noise, x, control):
+    del control
+    return rate * x + drift * noise
+
+
+def log_likelihood(scale, x, y):
+    return jax.scipy.stats.norm.logpdf(y, x, scale).sum()
+
+
+def particle_filter_of(theta):
+    transition = jax.tree_util.Partial(move_by_noise, theta["rate"], theta["drift"])
+    likelihood = jax.tree_util.Partial(log_likelihood, theta["noise"])
+    return bootstrap(start_anywhere, transition, likelihood, num_particles=64, noise=StandardNormal(1))
+
+
+@pytest.mark.parametrize("draws", [fit.common_random_numbers, fit.fresh_keys])
+def test_a_particle_filter_draws_what_it_is_told(draws):
+    ys = jnp.asarray(simulate(RNG, (6, 1), 0.8, 0.5, 0.4), jnp.float32)
+    density = fit.log_evidence(KEY, particle_filter_of, ys, draws=draws)
+    for step in (0, 3):
+        key = KEY if draws is fit.common_random_numbers else jax.random.fold_in(KEY, step)
+        expected = loglikelihood(particle_filter_of(THETA), key, ys)
+        found = density(THETA) if draws is fit.common_random_numbers else density.at(jnp.asarray(step), THETA)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_the_gradient_of_the_log_evidence_agrees_with_differences():
+    density = fit.over_sequences(KEY, filter_of, jnp.asarray(simulate(RNG, (9, 1, 3), 0.8, 0.5, 0.4), jnp.float32))
+    assert fit.check_gradient(density, THETA, LIMITS).error < 1e-7
+
+
+@pytest.mark.slow
+def test_truth_lies_within_three_standard_errors():
+    runs = 100
+    truth = {"rate": 0.8, "drift": 0.5, "noise": 0.4}
+    ys = jnp.asarray(simulate(RNG, (300, 1, runs), *truth.values()), jnp.float32)
+
+    @jax.jit
+    def fitted(ys):
+        return fit.maximize(fit.log_evidence(KEY, filter_of, ys), START, LIMITS, method=fit.bfgs(max_steps=60))
+
+    found = jax.vmap(fitted, in_axes=-1)(ys)
+    assert found.converged.mean() > 0.95
+    for name, value in truth.items():
+        within = abs(found.theta[name] - value) < 3 * found.standard_errors[name]
+        assert within.mean() >= 0.95
+        # The share within one standard error is 0.683 +- 0.047; at four standard deviations:
+        within = abs(found.theta[name] - value) < found.standard_errors[name]
+        assert abs(within.mean() - 0.683) < 0.19

@@ -1,0 +1,108 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.stats import norm
+
+from jaxfilters import kalman
+from jaxfilters.extended import extended
+from jaxfilters.filter import Filter, run
+from jaxfilters.fixed_lag import fixed_lag, fixed_lag_rts
+from jaxfilters.gaussian import Gaussian, GaussianRoot
+from jaxfilters.particle import StandardNormal, bootstrap
+from jaxfilters.particle_smoothing import keep_history, lineages
+from jaxfilters.smoothing import smooth
+
+KEY = jax.random.key(1)
+RNG = np.random.default_rng(2)
+LENGTH, LAG = 7, 2
+F, H = 0.7 * RNG.normal(size=(2, 2)), RNG.normal(size=(1, 2))
+ROOT_P, ROOT_Q = np.tril(RNG.normal(size=(2, 2))), np.tril(RNG.normal(size=(2, 2)))
+YS, CONTROLS = RNG.normal(size=(LENGTH, 1)), RNG.normal(size=LENGTH)
+MASK = jnp.asarray(np.arange(LENGTH) != 3)
+
+
+def transition(x, control):
+    return F @ x + control
+
+
+def observe(x):
+    return H @ x
+
+
+def delayed(state, info):
+    return state.delayed, info.log_evidence
+
+
+@pytest.mark.parametrize("arithmetic", [kalman.joseph, kalman.square_root])
+def test_beliefs_are_those_of_the_smoother_of_what_was_seen(x64, arithmetic):
+    root = arithmetic is kalman.square_root
+    prior = (
+        GaussianRoot(jnp.zeros(2), jnp.asarray(ROOT_P))
+        if root
+        else Gaussian(jnp.zeros(2), jnp.asarray(ROOT_P @ ROOT_P.T))
+    )
+    Q = jnp.asarray(ROOT_Q if root else ROOT_Q @ ROOT_Q.T)
+    R = (0.5**0.5 if root else 0.5) * jnp.eye(1)
+    inner = extended(prior, transition, Q, observe, R, arithmetic=arithmetic)
+    ys, controls = jnp.asarray(YS), jnp.asarray(CONTROLS)
+    filter = fixed_lag_rts(inner, LAG, control=jnp.zeros(()))
+    _, (found, evidences) = run(filter, KEY, ys, controls, mask=MASK, collect=delayed)
+    smooth_until = jax.jit(lambda mask: smooth(inner, KEY, ys, controls, mask=mask))
+    for t in range(LENGTH):
+        # What comes later is as if it had not been seen.
+        beliefs, infos = smooth_until(MASK & (jnp.arange(LENGTH) <= t))
+        assert evidences[t] == pytest.approx(infos.log_evidence[t])
+        if t >= LAG:
+            np.testing.assert_allclose(found.mean[t], beliefs.mean[t - LAG], atol=1e-10)
+            spread = [leaf.root @ leaf.root.swapaxes(-1, -2) if root else leaf.covariance for leaf in (found, beliefs)]
+            np.testing.assert_allclose(spread[0][t], spread[1][t - LAG], atol=1e-10)
+    # In the first frame it is the state before, given that frame.
+    S = (H @ (F @ ROOT_P @ ROOT_P.T @ F.T + ROOT_Q @ ROOT_Q.T) @ H.T + 0.5).item()
+    expected = (ROOT_P @ ROOT_P.T @ F.T @ H.T / S * (YS[0] - H @ np.full(2, CONTROLS[0]))).sum(axis=1)
+    np.testing.assert_allclose(found.mean[0], expected, atol=1e-10)
+
+
+def sample_prior(key):
+    return jax.random.normal(key)
+
+
+def move(noise, x, control):
+    return 0.9 * x + control + 0.5 * noise[0]
+
+
+def log_likelihood(x, y):
+    return norm.logpdf(y[0], x, 0.4)
+
+
+def window_and_history(state, info):
+    return state.delayed, keep_history(state.inner, info)
+
+
+def test_delayed_particles_are_those_of_the_lineages():
+    pf = bootstrap(sample_prior, move, log_likelihood, num_particles=30, noise=StandardNormal(1))
+    ys, controls = jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32)
+    _, (found, history) = run(fixed_lag(pf, LAG), KEY, ys, controls, mask=MASK, collect=window_and_history)
+    particles, ancestors = np.asarray(history.particles), np.asarray(history.ancestors)
+    for t in range(LAG, LENGTH):
+        indices = np.arange(30)
+        for parents in ancestors[t : t - LAG : -1]:
+            indices = parents[indices]
+        np.testing.assert_array_equal(found[t], particles[t - LAG, indices])
+    np.testing.assert_array_equal(found[-1], lineages(history)[-1 - LAG])
+    _, plain = run(pf, KEY, ys, controls, mask=MASK, collect=keep_history)
+    np.testing.assert_array_equal(history.particles, plain.particles)
+
+
+def test_what_does_not_fit_is_rejected():
+    gaussian = extended(Gaussian(jnp.zeros(2), jnp.eye(2)), transition, jnp.eye(2), observe, jnp.eye(1))
+    pf = bootstrap(sample_prior, move, log_likelihood, num_particles=3, noise=StandardNormal(1))
+    with pytest.raises(ValueError, match="lag must be an integer of at least 1; got 0"):
+        fixed_lag(pf, 0)
+    with pytest.raises(ValueError, match="inner must be made by extended"):
+        fixed_lag_rts(pf, 2)
+    with pytest.raises(ValueError, match="inner must have particles"):
+        run(fixed_lag(gaussian, 2), KEY, jnp.asarray(YS))
+    with pytest.raises(ValueError, match="control of fixed_lag_rts"):
+        run(fixed_lag_rts(gaussian, 2), KEY, jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32))
+    assert isinstance(fixed_lag_rts(gaussian, 2), Filter)
