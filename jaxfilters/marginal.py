@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int32, PyTree
 from jaxfilters import kalman, weights
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.linalg import cholesky, solve_triangular
+from jaxfilters.linalg import cholesky, matmul, solve_triangular
 from jaxfilters.particle import (
     ParticleInfo,
     StandardNormal,
@@ -185,12 +185,13 @@ def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics)
     Conditions on $z = A_n l + w_n$ with gain $P A_n^T N^{-1}$, in Joseph form, then propagates through $A_l$: the same
     as the general recursion of Schön, Gustafsson and Nordlund 2005, without its cancellation.
     """
-    spread = step.A_n @ covariance @ step.A_n.T + step.Q_n
+    ahead = matmul(step.A_n, covariance)
+    spread = matmul(ahead, step.A_n.T) + step.Q_n
     root = cholesky(spread)
-    gain = solve_triangular(root, solve_triangular(root, step.A_n @ covariance), transpose=True).T
-    kept = jnp.eye(gain.shape[0], dtype=gain.dtype) - gain @ step.A_n
-    conditioned = kept @ covariance @ kept.T + gain @ step.Q_n @ gain.T
-    return spread, step.A_l @ gain, step.A_l @ conditioned @ step.A_l.T + step.Q_l
+    gain = matmul(step.A_l, solve_triangular(root, solve_triangular(root, ahead), transpose=True).T)
+    kept = step.A_l - matmul(gain, step.A_n)
+    conditioned = matmul(matmul(kept, covariance), kept.T) + matmul(matmul(gain, step.Q_n), gain.T)
+    return spread, gain, conditioned + step.Q_l
 
 
 def propagate(belief: Gaussian, delta: Float[Array, " n"], step: MixedDynamics) -> Gaussian:

@@ -37,7 +37,7 @@ from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
 from jaxfilters.trackers.detect import nearest_hand
 
-TRUE = HandProportions(0.93, np.array([0.95, 0.9, 0.92, 0.93, 1.0]), 1.05)
+TRUE = HandProportions(*(jnp.asarray(factor) for factor in (0.93, [0.95, 0.9, 0.92, 0.93, 1.0], 1.05)))
 NOISE = 0.003
 NUM_STILLS, NUM_HANDS = 4, 5
 WINDOW, STRIDE = (64, 64), 3
@@ -96,7 +96,7 @@ def recorded(path: Path) -> Stills:
     camera = Pinhole.from_matrix(K, millimetres.shape[1:])
     surface = CapsuleHand(hand_geometry())
     likelihood = HandLikelihood(surface, jnp.asarray(0.002), MAX_ERROR, union, gibbs_abs)
-    windows, starts = [], []
+    windows, starts = [], list[Array]()
     for frame, hand in zip(millimetres, is_hand, strict=True):
         depth = np.where(hand, np.where(frame > 0, frame / 1000, np.nan), np.inf).astype(np.float32)
         sighting = nearest_hand(camera, np.nan_to_num(depth, nan=np.inf))
@@ -199,12 +199,13 @@ def _draw(path: Path, stills: Stills, theta: HandStills) -> None:
     """Observed depth above, the learnt hand as rendered below."""
     poses = _poses(stills, theta)
     hand = theta.proportions.of(hand_geometry())
-    rows = [np.asarray(stills.observed), []]
+    rendered_rows = []
     for i in range(len(poses)):
         camera = jax.tree.map(lambda leaf, i=i: leaf[i], stills.cameras)
-        rows[1].append(np.asarray(render_capsules(camera, forward_kinematics(poses[i], hand).capsules)))
-    nearest = float(np.nanmin(rows[0]))
-    shades = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+        rendered_rows.append(np.asarray(render_capsules(camera, forward_kinematics(poses[i], hand).capsules)))
+    seen = np.asarray(stills.observed)
+    nearest = float(np.nanmin(seen))
+    shades = np.concatenate([np.concatenate(list(row), axis=1) for row in (seen, np.stack(rendered_rows))])
     bright = np.where(np.isfinite(shades), np.clip(255 - 1000 * (shades - nearest), 60, 255), 0)
     picture = cv2.resize(bright.astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     if not cv2.imwrite(str(path), picture):

@@ -10,7 +10,7 @@ place of what was learnt; `bias` learns a constant excess of the ranges, `scale`
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import cv2
 import jax
@@ -65,9 +65,10 @@ def untrained() -> NetworkExcess:
 
 def penalty(robot: RangeRobot) -> Float[Array, ""]:
     """Log prior of a network: weights of a metre or so, units that stay about where they were."""
-    excess, start = robot.excess, untrained()
+    excess: Any = robot.excess
+    start = untrained()
     strayed = (excess.places - start.places) / 10, jnp.log(excess.slopes / start.slopes), excess.weights
-    return -0.5 * sum(jnp.sum(part**2) for part in strayed)
+    return -0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in strayed]))
 
 
 FREE = LinearExcess(fit.free, fit.free)

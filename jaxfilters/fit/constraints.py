@@ -5,7 +5,7 @@ everywhere, and fixed values look at it.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -194,10 +194,16 @@ class Fixed:
         return origin
 
 
-free, positive, simplex, spd, rotation, fixed = Free(), Positive(), Simplex(), PositiveDefinite(), Rotation(), Fixed()
+# To a type checker they may stand wherever a parameter stands: constraints are laid out as parameters are.
+free: Any = Free()
+positive: Any = Positive()
+simplex: Any = Simplex()
+spd: Any = PositiveDefinite()
+rotation: Any = Rotation()
+fixed: Any = Fixed()
 
 
-def interval(lower: float | int, upper: float | int) -> Interval:
+def interval(lower: float | int, upper: float | int) -> Any:
     """Numbers strictly between two bounds; methods that know bounds may reach them.
 
     Raises:

@@ -7,10 +7,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
+import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -21,49 +22,6 @@ from jaxfilters.typing import as_pytree
 _SMOOTHING = 0.9
 _ARMIJO = 1e-4
 _SHORTEST = 1e-10
-
-
-@runtime_checkable
-class GradientTransformation(Protocol):
-    """What turns gradients into steps: any `optax.GradientTransformation`."""
-
-    @property
-    def init(self) -> Callable[..., Any]: ...
-
-    @property
-    def update(self) -> Callable[..., Any]: ...
-
-
-class AdamState(NamedTuple):
-    """Running moments of the gradients."""
-
-    steps: Int[Array, ""]
-    mean: Float[Array, " d"]
-    square: Float[Array, " d"]
-
-
-@dataclass(frozen=True)
-class Adam:
-    """D. Kingma and J. Ba, "Adam: a method for stochastic optimization", 2015, algorithm 1."""
-
-    learning_rate: float
-    decay: float = 0.9
-    square_decay: float = 0.999
-
-    def init(self, z: Float[Array, " d"]) -> AdamState:
-        """Moments before the first gradient."""
-        return AdamState(jnp.zeros((), jnp.int32), jnp.zeros_like(z), jnp.zeros_like(z))
-
-    def update(
-        self, gradient: Float[Array, " d"], state: AdamState, z: Float[Array, " d"] | None = None
-    ) -> tuple[Float[Array, " d"], AdamState]:
-        """What to add to z, and the moments after this gradient."""
-        del z
-        steps = state.steps + 1
-        mean = self.decay * state.mean + (1 - self.decay) * gradient
-        square = self.square_decay * state.square + (1 - self.square_decay) * gradient**2
-        unbiased, unbiased_square = mean / (1 - self.decay**steps), square / (1 - self.square_decay**steps)
-        return -self.learning_rate * unbiased / (jnp.sqrt(unbiased_square) + 1e-8), AdamState(steps, mean, square)
 
 
 class FirstOrderState(NamedTuple):
@@ -80,7 +38,7 @@ class FirstOrderState(NamedTuple):
 class FirstOrder:
     """Steps that a gradient transformation makes; it ends when the smoothed loss has long not improved."""
 
-    transformation: GradientTransformation
+    transformation: optax.GradientTransformation
     max_steps: int
     tolerance: float
     patience: int
@@ -246,12 +204,12 @@ class LeastSquares:
 def adam(
     learning_rate: float = 0.03, *, max_steps: int = 500, tolerance: float = 1e-3, patience: int = 30
 ) -> FirstOrder:
-    """Adam, for large or noisy problems; arguments as `first_order`."""
-    return FirstOrder(Adam(learning_rate), max_steps, tolerance, patience)
+    """Adam by optax, for large or noisy problems; arguments as `first_order`."""
+    return FirstOrder(optax.adam(learning_rate), max_steps, tolerance, patience)
 
 
 def first_order(
-    transformation: GradientTransformation, *, max_steps: int = 500, tolerance: float = 1e-3, patience: int = 30
+    transformation: optax.GradientTransformation, *, max_steps: int = 500, tolerance: float = 1e-3, patience: int = 30
 ) -> FirstOrder:
     """First-order search with any optax transformation.
 

@@ -3,12 +3,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.scipy.stats import norm
 from scipy.spatial.transform import Rotation
 
 from jaxfilters import fit
-from jaxfilters.fit.methods import Adam
 from jaxfilters.lie import quaternion_to_matrix
 
 RNG = np.random.default_rng(5)
@@ -114,9 +114,12 @@ def test_rotations_covariances_and_shares_have_their_closed_forms(x64):
     np.testing.assert_allclose(variances, np.sqrt(2 / 30) * np.diagonal(covariance), rtol=1e-2)
 
 
+SLOW_STEPS = optax.adam(0.1)
+
+
 def test_a_search_continues_where_it_ended():
     def at_most(steps):
-        return fit.first_order(ADAM, max_steps=steps, patience=1000)
+        return fit.first_order(SLOW_STEPS, max_steps=steps, patience=1000)
 
     whole = fit.maximize(density(), START, LIMITS, method=at_most(20), errors=fit.no_errors)
     half = fit.maximize(density(), START, LIMITS, method=at_most(10), errors=fit.no_errors)
@@ -130,26 +133,11 @@ def test_a_search_continues_where_it_ended():
     assert np.isnan(other.standard_errors["mean"])
 
 
-ADAM = Adam(0.1)
-
-
-def test_adam_takes_the_published_steps():
-    rng, rate = np.random.default_rng(0), 0.1
-    state, mean, square = ADAM.init(jnp.zeros(2)), np.zeros(2), np.zeros(2)
-    for step in range(1, 4):
-        gradient = rng.normal(size=2)
-        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
-        expected = -rate * mean / (1 - 0.9**step) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
-        update, state = ADAM.update(jnp.asarray(gradient, jnp.float32), state)
-        np.testing.assert_allclose(update, expected, rtol=1e-4)
-
-
-def test_optax_transformations_serve():
-    optax = pytest.importorskip("optax")
-    ours = fit.maximize(density(), START, LIMITS, method=fit.adam(0.1, max_steps=50), errors=fit.no_errors)
-    method = fit.first_order(optax.adam(0.1), max_steps=50)
+def test_any_optax_transformation_serves():
+    ours = fit.maximize(density(), START, LIMITS, errors=fit.no_errors)
+    method = fit.first_order(optax.chain(optax.clip_by_global_norm(1.0), optax.sgd(0.01)), max_steps=400)
     theirs = fit.maximize(density(), START, LIMITS, method=method, errors=fit.no_errors)
-    np.testing.assert_allclose(theirs.theta["std"], ours.theta["std"], rtol=1e-4)
+    np.testing.assert_allclose(theirs.log_density, ours.log_density, atol=0.5)
 
 
 def cliff(theta):
