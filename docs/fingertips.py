@@ -1,4 +1,4 @@
-"""The picture of the README from the results of `jaxfilters track fingertips --out DIR`: python docs/fingertips.py DIR."""
+"""The README's picture from the results of `jaxfilters track fingertips --out DIR`: python docs/fingertips.py DIR."""
 
 import sys
 from pathlib import Path
