@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters import linalg
 from jaxfilters.gaussian import GaussianRoot
-from jaxfilters.linalg import _tria
+from jaxfilters.linalg import tria
 
 
 class LinearModel(NamedTuple):
@@ -142,7 +142,7 @@ def _combined(past: _Past, then: _Past) -> _Past:
     n = past.b.shape[0]
     eye = jnp.eye(n, dtype=past.b.dtype)
     blocks = jnp.block([[_product(past.U.T, then.Z), eye], [then.Z, jnp.zeros_like(eye)]])
-    root = _tria(blocks)
+    root = tria(blocks)
     turned = solve_triangular(root[:n, :n], past.U.T, lower=True).T
     kept = eye - _product(turned, root[n:, :n].T)
     through = _product(then.A, kept)
@@ -151,9 +151,9 @@ def _combined(past: _Past, then: _Past) -> _Past:
     return _Past(
         _product(through, past.A),
         _product(through, mean) + then.b,
-        _tria(jnp.hstack([_product(then.A, turned), then.U])),
+        tria(jnp.hstack([_product(then.A, turned), then.U])),
         _product(past.A.T, _product(kept.T, information)) + past.eta,
-        _tria(jnp.hstack([_product(past.A.T, root[n:, n:]), past.Z])),
+        tria(jnp.hstack([_product(past.A.T, root[n:, n:]), past.Z])),
     )
 
 
@@ -179,7 +179,7 @@ def _chained(later: _Future, earlier: _Future) -> _Future:
     return _Future(
         _product(earlier.E, later.E),
         _product(earlier.E, later.g) + earlier.g,
-        _tria(jnp.hstack([_product(earlier.E, later.L), earlier.L])),
+        tria(jnp.hstack([_product(earlier.E, later.L), earlier.L])),
     )
 
 

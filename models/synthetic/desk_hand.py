@@ -135,13 +135,6 @@ def desk_video(
         yield frame_of(rng, during, desk, blur=blur, time=float(frame))
 
 
-def finger_schedule(num_frames: int, *, hold: int = 45) -> Bool[np.ndarray, "frames 5"]:
-    """Which fingers are out: one, two, .. five, then thumb and forefinger, forefinger, thumb, fist; and again."""
-    steps = ["01000", "01100", "01110", "01111", "11111", "11000", "01000", "10000", "00000"]
-    table = np.array([[int(c) for c in step] for step in steps], bool)
-    return table[(np.arange(num_frames) // hold) % len(table)]
-
-
 def frame_of(
     rng: np.random.Generator, poses: list[HandPose], desk: Desk, *, blur: float, time: float = 0.0
 ) -> DeskFrame:

@@ -10,8 +10,6 @@ x is to the image's right, y down, z away from a camera that the face faces. `ja
 """
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +20,7 @@ from jaxfilters.models.face.mirroring import Pairs, mirror_map
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
+from jaxfilters.trackers.shell.npz_files import read_arrays
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters face model", 1
@@ -101,18 +100,7 @@ def default_face_model() -> FaceModelFile:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    try:
-        with path.open("rb") as content:
-            archive = np.load(content, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: a single array; {_WANTED}.")
-            arrays = {name: archive[name] for name in archive.files}
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {_WANTED}.") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a complete .npz file ({error}); {_WANTED}.") from None
+    arrays = read_arrays(path, _WANTED)
     if missing := [name for name in (*_ARRAYS, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
     try:

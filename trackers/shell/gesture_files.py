@@ -11,8 +11,6 @@ kind `codes` `log_codes` (m, Q, 17) and `log_counts` (m, Q, 6). `jaxfilters fit 
 """
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +23,7 @@ from jaxfilters.models.gesture.codes import MOST_TIPS, STILL
 from jaxfilters.models.gesture.symbols import Symbols
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
+from jaxfilters.trackers.shell.npz_files import read_arrays
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters symbols", 1
@@ -132,18 +131,7 @@ def default_symbols() -> SymbolsFile:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    try:
-        with path.open("rb") as content:
-            archive = np.load(content, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: a single array; {_WANTED}.")
-            arrays = {name: archive[name] for name in archive.files}
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {_WANTED}.") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a complete .npz file ({error}); {_WANTED}.") from None
+    arrays = read_arrays(path, _WANTED)
     try:
         header = json.loads(str(arrays["header"]))
     except (KeyError, json.JSONDecodeError):

@@ -13,8 +13,6 @@ called `neutral` is the one that faces are aligned to.
 """
 
 import csv
-import zipfile
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +21,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import FROM_68, NAMES
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs, mirror_map
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.npz_files import read_arrays
 
 _COLUMNS = ["expression", "name", "x_mm", "y_mm", "z_mm"]
 NAMES_68 = tuple(str(k) for k in range(68))
@@ -82,16 +81,7 @@ def ten_of(sets: LandmarkSets) -> LandmarkSets:
 
 
 def _of_npz(path: Path) -> LandmarkSets:
-    try:
-        with path.open("rb") as content:
-            archive = np.load(content, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: a single array; {_WANTED_NPZ}.")
-            arrays = {name: archive[name] for name in archive.files}
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a complete .npz file ({error}); {_WANTED_NPZ}.") from None
+    arrays = read_arrays(path, _WANTED_NPZ)
     shapes = arrays.get("shapes", np.zeros(0))
     if shapes.ndim != 4 or shapes.shape[3] != 3 or shapes.dtype.kind not in "fiu" or 0 in shapes.shape:
         raise InputError(f"{path}: {_WANTED_NPZ}; got {shapes.shape} {shapes.dtype}.")

@@ -13,8 +13,6 @@ in such a folder in the folder of a person. A file of UNIPEN is read by `unipen_
 """
 
 import csv
-import zipfile
-import zlib
 from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +23,7 @@ from jaxfilters.models.gesture.coded import voted
 from jaxfilters.models.gesture.codes import MOST_TIPS
 from jaxfilters.models.gesture.stroke import Drawn
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.npz_files import read_arrays
 from jaxfilters.trackers.shell.unipen_files import SUFFIXES, read_unipen
 
 ARRAYS = {
@@ -79,17 +78,9 @@ def read_strokes(path: Path) -> StrokeSet:
 
 
 def _of_npz(path: Path) -> StrokeSet:
-    try:
-        with path.open("rb") as content:
-            archive = np.load(content, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: a single array; {_WANTED_NPZ}.")
-            names = {wanted: name for wanted, known in ARRAYS.items() for name in known if name in archive.files}
-            arrays = {wanted: archive[name] for wanted, name in names.items()}
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a complete .npz file ({error}); {_WANTED_NPZ}.") from None
+    known = [name for names in ARRAYS.values() for name in names]
+    held = read_arrays(path, _WANTED_NPZ, known)
+    arrays = {wanted: held[name] for wanted, names in ARRAYS.items() for name in names if name in held}
     points, lengths = arrays.get("points", np.zeros(0)), arrays.get("length", np.zeros(0))
     if points.ndim != 2 or points.shape[1] not in (2, 3) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {_WANTED_NPZ}; got points {points.shape} {points.dtype}.")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.npz_files import read_arrays
 
 _WANTED = "expected .npz with points (frames, points, coordinates), or CSV with id, frame or time_s, and coordinates"
 _AXES = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("x_mm", "y_mm", "z_mm"), ("u", "v"))
@@ -28,13 +29,10 @@ def read_points(path: Path, fps: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _from_arrays(path: Path, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with np.load(path) as held:
-            points = np.asarray(held["points"], float)
-            times = np.asarray(held["t_s"], float) if "t_s" in held else np.arange(len(points)) / fps
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {_WANTED}.") from None
-    if points.ndim != 3 or times.shape != points.shape[:1]:
+    arrays = read_arrays(path, _WANTED, ("points", "t_s"))
+    points = arrays.get("points", np.zeros(0))
+    times = arrays.get("t_s", np.arange(len(points)) / fps)
+    if points.ndim != 3 or times.shape != points.shape[:1] or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {_WANTED}; points have shape {points.shape}, t_s {times.shape}.")
     return points, times
 

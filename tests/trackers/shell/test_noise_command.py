@@ -41,3 +41,11 @@ def test_another_table_is_refused(tmp_path, text):
 def test_a_file_that_is_not_there_is_refused(tmp_path, capsys):
     assert main(["fit", "noise", str(tmp_path / "none.npz")]) != 0
     assert "cannot be read" in capsys.readouterr().err
+
+
+def test_a_damaged_archive_is_refused(tmp_path):
+    whole = tmp_path / "whole.npz"
+    np.savez(whole, points=np.zeros((4, 1, 2)))
+    (tmp_path / "half.npz").write_bytes(whole.read_bytes()[:-40])
+    with pytest.raises(InputError, match=r"half\.npz: not a complete \.npz file"):
+        read_points(tmp_path / "half.npz", 30.0)
