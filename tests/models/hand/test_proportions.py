@@ -9,6 +9,7 @@ from jaxfilters.models.hand.observation import crop
 from jaxfilters.models.hand.proportions import HandProportions, HandStills, StillsDensity, learn
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_center, hand_geometry, open_palm, retract
 from jaxfilters.models.rendering.depth import render_capsules
+from jaxfilters.models.rendering.silhouette import soft_silhouette
 
 TRUE = HandProportions(jnp.float32(0.93), jnp.array([0.95, 0.9, 0.92, 0.93, 1.0]), jnp.float32(1.0))
 AVERAGE = HandProportions(jnp.float32(1), jnp.ones(5), jnp.float32(1))
@@ -44,22 +45,26 @@ def test_size_and_noise_of_a_rendered_hand_are_learnt_through_the_renderer():
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.15)
 
 
-def test_the_density_is_that_of_a_pixel_worked_out_by_hand():
-    """One pixel on a ball of 5 cm at half a metre: covered, hit, and 4 mm off."""
+@pytest.mark.parametrize("softness", [0.05, 40.0])
+def test_the_density_is_that_of_a_pixel_worked_out_by_hand(softness):
+    """One pixel that the hand covers, wholly or in part, with a reading 4 mm off, background, or none."""
     camera = Pinhole.from_intrinsics(500.0, (0.0, 0.0), (1, 1))
-    hand = hand_geometry()
+    hand, noise = hand_geometry(), 0.003
     pose = open_palm(jnp.array([0.0, 0.05, 0.5]))
     capsules = forward_kinematics(pose, hand).capsules
     depth = float(render_capsules(camera, capsules)[0, 0])
-    density = StillsDensity(hand, None, None, None, None, softness=0.05)
-    noise = 0.003
+    covered = float(soft_silhouette(camera, capsules, softness=softness)[0, 0])
+    within = 0.95 * (2 * covered - 1)
+    near = np.exp(-8 / 9) / (noise * np.sqrt(2 * np.pi))
+    density = StillsDensity(hand, None, None, None, None, softness=softness)
     for observed, expected in (
-        (depth + 0.004, 0.95 * np.exp(-8 / 9) / (noise * np.sqrt(2 * np.pi)) + 0.05 / 0.28),
-        (np.inf, 0.05),
+        (depth + 0.004, within * near + (0.95 * covered - within + 0.05) / 0.28),
+        (np.inf, 1 - 0.95 * covered),
         (np.nan, 1.0),
     ):
         found = density.pixels(camera, jnp.full((1, 1), observed), hand, pose, jnp.float32(noise))
         np.testing.assert_allclose(found, np.log(expected), rtol=2e-3, atol=1e-4)
+    assert softness < 1 or 0.5 < covered < 0.9
 
 
 def test_proportions_are_factors():
