@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
 from jaxfilters.least_squares import BoxLevenbergMarquardt, cauchy, huber
+from jaxfilters.linalg import safe_sqrt
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
 from jaxfilters.models.face.rig import CameraRig, project_shape
@@ -27,6 +28,8 @@ OUTLIER = 3.0
 """Standard deviations from which on a landmark's distance counts less (Huber's loss, then Cauchy's)."""
 _SMALLEST = 1e-12
 """Of steps and gradients: the number of steps is the limit."""
+UNTOLD = 1e-6
+"""Information, as a share of that about each parameter itself, about what the past frames do not tell."""
 HIDDEN_PX = 1e4
 """Residual of a point behind the camera, pixels."""
 Loss = Callable[[Array, float], Array]
@@ -59,6 +62,16 @@ class Bundle(NamedTuple):
     person: Person
 
 
+class Past(NamedTuple):
+    """What frames that are no longer adjusted told of the person: a Gaussian, in information form.
+
+    Minus its logarithm is `p . information p / 2 - pull . p` for the parameters p: identity, then offset.
+    """
+
+    information: Float[Array, "d d"]
+    pull: Float[Array, " d"]
+
+
 class Prior(NamedTuple):
     """What holds a bundle beside the images; a weight of 0 lets go, 1 is Bayes' rule."""
 
@@ -70,6 +83,8 @@ class Prior(NamedTuple):
     """Millimetres between the centres of the eyes, if that is known: the size of everything follows from it."""
     eyes_apart_std: Float[ArrayLike, ""] = 0.0
     """Millimetres; 0 where it is not known."""
+    past: Past | None = None
+    """Of frames that were adjusted before."""
 
 
 class Reach(NamedTuple):
@@ -104,6 +119,17 @@ def square(distance: Float[Array, "*shape"], scale: float) -> Float[Array, "*sha
 def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
     """Landmarks of a person with an expression in the model frame, millimetres ([4.15] and the offset)."""
     return shape(face, person.identity, expression) + person.offset
+
+
+def parameters(person: Person) -> Float[Array, " d"]:
+    """Identity, then offset, as `Past` has them."""
+    return jnp.concatenate([person.identity, person.offset.ravel()])
+
+
+def nothing_past(face: MultilinearFace) -> Past:
+    """Of a person who is new."""
+    size = face.num_identities + face.mean.size
+    return Past(jnp.zeros((size, size), face.mean.dtype), jnp.zeros(size, face.mean.dtype))
 
 
 def eyes_apart(face: MultilinearFace, person: Person) -> Float[Array, ""]:
@@ -202,7 +228,27 @@ def all_residuals(
     measured = jnp.asarray(prior.eyes_apart_std) > 0
     wrong = eyes_apart(face, bundle.person) - prior.eyes_apart
     size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
-    return jnp.concatenate([_of_views(face, rig, views, bundle, loss).ravel(), held, offset.ravel(), size[None]])
+    before = jnp.zeros(0, offset.dtype) if prior.past is None else _of_past(face, prior.past, bundle.person)
+    return jnp.concatenate(
+        [_of_views(face, rig, views, bundle, loss).ravel(), held, offset.ravel(), size[None], before]
+    )
+
+
+def _of_past(face: MultilinearFace, past: Past, person: Person) -> Array:
+    """Residuals of which half the sum of squares is the past's part of the energy, but for a constant.
+
+    In units of each parameter's own information and about the mean person, so that one small constant can stand for
+    what the past does not tell, and rounding does not grow with what it does.
+    """
+    product = lambda a, b: jnp.matmul(a, b, precision="highest")
+    scale = safe_sqrt(jnp.diagonal(past.information))
+    unit = jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 1.0)
+    mean = parameters(Person(face.identity_mean, jnp.zeros_like(face.mean)))
+    pull = unit * (past.pull - product(past.information, mean))
+    untold = UNTOLD * jnp.eye(unit.size, dtype=unit.dtype)
+    root = jnp.linalg.cholesky(past.information * unit[:, None] * unit + untold)
+    towards = jax.scipy.linalg.solve_triangular(root, pull, lower=True)
+    return product(root.T, (parameters(person) - mean) / unit) - towards
 
 
 def _of_views(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, loss: Loss) -> Array:

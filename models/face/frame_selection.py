@@ -67,6 +67,8 @@ class Told(NamedTuple):
     """Once the frame's own pose and expression have had their part: a Schur complement of the normal matrix."""
     response: Float[Array, "6+A d"]
     """How the pose (mm, rad) and the expression found in this frame change with identity and offset."""
+    gradient: Float[Array, " d"]
+    """Of the frame's energy, in the same units, at the person that the frame was given."""
 
 
 def told(face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prior: Prior) -> Told:
@@ -93,9 +95,16 @@ def told(face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prio
 
     of_person, own = jnp.zeros(count + frame.person.offset.size), jnp.zeros_like(units)
     J, L = jax.jacfwd(residuals, (0, 1))(of_person, own)
+    r = residuals(of_person, own)
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
     usual = a_std[:, None] * jnp.linalg.inv(face.expression_covariance) * a_std
     held = jax.scipy.linalg.block_diag(jnp.zeros((6, 6)), jnp.square(prior.weight) * usual)
     root = (jnp.linalg.cholesky(product(L.T, L) + held + 1e-6 * jnp.eye(len(held))), True)
     by_person = -jax.scipy.linalg.cho_solve(root, product(L.T, J))
-    return Told(product(J.T, J) + product(product(L.T, J).T, by_person), units[:, None] * by_person)
+    apart = jnp.concatenate([jnp.zeros(6), (frame.expressions[0] - face.expression_mean) / a_std])
+    of_own = product(L.T, r) + product(held, apart)
+    return Told(
+        product(J.T, J) + product(product(L.T, J).T, by_person),
+        units[:, None] * by_person,
+        product(J.T, r) + product(by_person.T, of_own),
+    )

@@ -5,6 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optimistix
@@ -74,24 +75,51 @@ def fitted_up_to_size(model: MultilinearFace, shapes: Float[Array, "F K 3"]) -> 
 
     Measured coordinates err by `MEASURED_MM`; parameters have their means and covariances, any size is as likely.
     """
+    start = _start(model, shapes)
+    return _parameters(model, _solved(lambda x: _weighed(model, shapes, x), start, {}))
+
+
+@jax.jit
+def likeliest(
+    model: MultilinearFace, shapes: Float[Array, "F K 3"]
+) -> tuple[Fit, Float[Array, "S S"], Float[Array, "K 3"]]:
+    """The likeliest parameters of shapes in millimetres, the covariance of the identity, and what is left on average.
+
+    As `fitted_up_to_size`, but of the size that was measured. The covariance is that of Laplace's approximation.
+    """
+    start = _start(model, shapes)
+    held = lambda x: _weighed(model, shapes, x._replace(log_size=jnp.zeros_like(x.log_size)))
+    found = _solved(held, start, {})
+    flat, unravel = jax.flatten_util.ravel_pytree((found.identity, found.expressions))
+    J = jax.jacfwd(lambda y: jax.flatten_util.ravel_pytree(held(Fit(*unravel(y), found.log_size)))[0])(flat)
+    inverse = jnp.linalg.inv(_product(J.T, J))[: found.identity.size, : found.identity.size]
+    who, _ = _roots(model)
+    fit = _parameters(model, found)
+    return fit, _product(_product(who, inverse), who.T), jnp.mean(shapes - _faces(model, fit), axis=0)
+
+
+def _roots(model):
     # A singular covariance is possible: fewer people than parameters.
-    who, how = (
-        linalg.cholesky(_regular(model.identity_covariance)),
-        linalg.cholesky(_regular(model.expression_covariance)),
-    )
-    product = partial(jnp.matmul, precision="highest")
-    parameters = lambda x: Fit(
-        model.identity_mean + product(who, x.identity),
-        model.expression_mean + product(x.expressions, how.T),
+    return linalg.cholesky(_regular(model.identity_covariance)), linalg.cholesky(_regular(model.expression_covariance))
+
+
+def _parameters(model, x):
+    """Of numbers that have a standard normal distribution."""
+    who, how = _roots(model)
+    return Fit(
+        model.identity_mean + _product(who, x.identity),
+        model.expression_mean + _product(x.expressions, how.T),
         x.log_size,
     )
 
-    def residuals(x):
-        fit = parameters(x)
-        near = (shapes - jnp.exp(-fit.log_size) * _faces(model, fit)) / MEASURED_MM
-        return near, x.identity, x.expressions
 
-    return parameters(_solved(residuals, _start(model, shapes), {}))
+def _weighed(model, shapes, x):
+    fit = _parameters(model, x)
+    near = (shapes - jnp.exp(-fit.log_size) * _faces(model, fit)) / MEASURED_MM
+    return near, x.identity, x.expressions
+
+
+_product = partial(jnp.matmul, precision="highest")
 
 
 def leave_one_out(

@@ -9,12 +9,24 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.least_squares import cauchy, huber
-from jaxfilters.models.face.bundle import Bundle, Person, Prior, Views, adjust, eyes_apart, posed_shape, square
+from jaxfilters.models.face.bundle import (
+    Adjustment,
+    Bundle,
+    Past,
+    Person,
+    Prior,
+    Views,
+    adjust,
+    eyes_apart,
+    posed_shape,
+    square,
+)
 from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.state import POSE
+from jaxfilters.trackers.head_mono.past import joined, left_behind, seen_by, units
 from jaxfilters.trackers.head_mono.person import Modes, model_of
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, Window
 
@@ -57,33 +69,38 @@ def frame_of(
 def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Person, prior: Prior) -> Window:
     """The window with what its frames tell of the person."""
 
-    def one(inputs: tuple) -> Array:
+    def one(inputs: tuple) -> tuple[Array, Array]:
         view, pose, expression = inputs
         alone = jax.tree.map(lambda leaf: leaf[None], view)
-        return told(face, rig, alone, Bundle(pose[None], expression[None], person), prior).information
+        found = told(face, rig, alone, Bundle(pose[None], expression[None], person), prior)
+        return found.information, found.gradient
 
     # One by one: batches of factorisations can stand still on two cores.
-    information = jax.lax.map(one, (window.views, window.poses, window.expressions))
-    return window._replace(information=information)
+    information, gradient = jax.lax.map(one, (window.views, window.poses, window.expressions))
+    return window._replace(information=information, gradient=gradient)
 
 
 def uncertainty(
-    face: MultilinearFace, window: Window, response: Float[Array, "m d"], options: MonoOptions
+    face: MultilinearFace,
+    window: Window,
+    past: Past | None,
+    response: Float[Array, "m d"],
+    options: MonoOptions,
 ) -> Float[Array, "m m"]:
     """Covariance of what responds to identity and offset, by what is not known of them."""
-    total = _known(face, options) + jnp.sum(window.information, axis=0)
+    total = known(face, past, options) + jnp.sum(window.information, axis=0)
     root = jnp.linalg.cholesky(total)
     part = jax.scipy.linalg.solve_triangular(root, response.T, lower=True)
     return jnp.matmul(part.T, part, precision="highest")
 
 
 def choose(
-    face: MultilinearFace, window: Window, frame: Frame, options: MonoOptions
+    face: MultilinearFace, window: Window, past: Past | None, frame: Frame, options: MonoOptions
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Which frame of the window the new one replaces, and whether it does."""
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
-        place, gain = by_information(window.information, frame.told.information, _known(face, options), may_go)
+        place, gain = by_information(window.information, frame.told.information, known(face, past, options), may_go)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
@@ -92,6 +109,7 @@ def choose(
 
 
 def adjusted(
+    stranger: MultilinearFace,
     face: MultilinearFace,
     rig: CameraRig,
     state: MonoState,
@@ -99,26 +117,75 @@ def adjusted(
     place: Int[Array, ""],
     options: MonoOptions,
 ) -> MonoState:
-    """The state after an adjustment to the window with a new frame; not finite if that came to nothing."""
-    window = _with(state.window, frame, place)
+    """The state after an adjustment to the window with a new frame; not finite if that came to nothing.
+
+    Args:
+        stranger: The model.
+        face: Whom the state is about: the same, or somebody who is remembered.
+        rig: One camera.
+        state: Before.
+        frame: The new one.
+        place: Which frame of the window it replaces.
+        options: Constants.
+    """
+    past = state.past
+    if past is not None and options.past == "marginalised":
+        past = joined(past, left_behind(stranger, face, state.window, state.person, place, options))
+    state = state._replace(window=_with(state.window, frame, place), past=past, num_adjusted=state.num_adjusted + 1)
     start = state.person
     if options.is_published:
         start = start._replace(identity=_average(state))
+    bundle, info = fitted(stranger, face, rig, state, state.window.bundle(start), options)
+    identity = jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan)
+    bundle = bundle._replace(person=bundle.person._replace(identity=identity))
+    state = state._replace(identities=jnp.concatenate([identity[None], state.identities[:-1]]))
+    return settled(face, rig, state, bundle, bundle.poses[place], bundle.expressions[place], options)
+
+
+def fitted(
+    stranger: MultilinearFace,
+    face: MultilinearFace,
+    rig: CameraRig,
+    state: MonoState,
+    start: Bundle,
+    options: MonoOptions,
+    steps: tuple[int, int] = STEPS,
+) -> tuple[Bundle, Adjustment]:
+    """The window adjusted to one of the faces that it may be of; arguments are those of `adjusted` and `adjust`."""
+    prior = options.prior
+    if state.past is not None:
+        prior = prior._replace(past=seen_by(state.past, stranger, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
-    bundle, info = adjust(
-        face, rig, window.views, window.bundle(start), options.prior, options.reach, steps=STEPS, losses=losses
-    )
-    window = window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    person = bundle.person._replace(identity=jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan))
-    state = state._replace(
-        window=informed(face, rig, window, person, options.prior),
-        identities=jnp.concatenate([person.identity[None], state.identities[:-1]]),
-        num_adjusted=state.num_adjusted + 1,
-    )
+    return adjust(face, rig, state.window.views, start, prior, options.reach, steps=steps, losses=losses)
+
+
+def settled(
+    face: MultilinearFace,
+    rig: CameraRig,
+    state: MonoState,
+    bundle: Bundle,
+    pose: Float[Array, " 6"],
+    expression: Float[Array, " A"],
+    options: MonoOptions,
+) -> MonoState:
+    """The state with its window adjusted: the person, the face that the search works with, particles and belief.
+
+    Args:
+        face: Whom the bundle is of.
+        rig: One camera.
+        state: Before.
+        bundle: Of the window.
+        pose: Of the frame at hand, now that the face is another.
+        expression: The same.
+        options: Constants.
+    """
+    person = bundle.person
+    window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
+    state = state._replace(window=informed(face, rig, window, person, options.prior))
     if options.is_published:
         person = person._replace(identity=_average(state))
     model, modes = model_of(face, person, state.registered.templates)
-    x = jnp.concatenate([bundle.poses[place], modes.coefficients(face, bundle.expressions[place])])
+    x = jnp.concatenate([pose, modes.coefficients(face, expression)])
     state = _at(state._replace(person=person, modes=modes), x, model)
     return state if options.is_published else _registered_anew(face, rig, state, bundle)
 
@@ -155,6 +222,7 @@ def _with(window: Window, frame: Frame, place: Array) -> Window:
         put(window.expressions, frame.expression),
         put(window.ages, jnp.zeros((), window.ages.dtype)),
         put(window.information, frame.told.information),
+        put(window.gradient, frame.told.gradient),
     )
 
 
@@ -164,15 +232,24 @@ def _average(state: MonoState) -> Array:
     return jnp.sum(jnp.where(used[:, None], state.identities, 0.0), axis=0) / jnp.sum(used)
 
 
-def _known(face: MultilinearFace, options: MonoOptions) -> Array:
-    """Information about identity and offset beforehand, in standard deviations."""
+def known(face: MultilinearFace, past: Past | None, options: MonoOptions) -> Float[Array, "d d"]:
+    """Information about identity and offset beside the window's, in standard deviations."""
+    both = prior_information(face, options) + _of_eyes(face, options)
+    if past is not None:
+        unit = units(face, options)
+        both = both + unit[:, None] * past.information * unit
+    return both
+
+
+def prior_information(face: MultilinearFace, options: MonoOptions) -> Float[Array, "d d"]:
+    """Information about identity and offset before anything is measured, in standard deviations."""
     std = face.identity_std
     identity = options.prior_weight**2 * std[:, None] * jnp.linalg.inv(face.identity_covariance) * std
     if not options.prior_weight:
         # The box of two deviations to either side is all that is known: as much as its variance of 4 / 3.
         identity = 0.75 * jnp.eye(std.size, dtype=std.dtype)
     offset = jnp.eye(3 * face.num_landmarks, dtype=std.dtype) * (options.offset_std > 0)
-    both = jax.scipy.linalg.block_diag(identity, offset) + _of_eyes(face, options)
+    both = jax.scipy.linalg.block_diag(identity, offset)
     return both + UNKNOWN * jnp.eye(len(both), dtype=std.dtype)
 
 

@@ -11,13 +11,15 @@ from jaxtyping import Float, UInt8
 from jaxfilters.models.face.bundle import Person
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.following import Beginning, Following
 from jaxfilters.trackers.head.session import check_points
 from jaxfilters.trackers.head.state import INITIALISING, POSE
 from jaxfilters.trackers.head_mono.detections import Collector, Detections
-from jaxfilters.trackers.head_mono.start import Start, begin, initialise, search_of, with_person
+from jaxfilters.trackers.head_mono.recognition import as_remembered, one_of, people, recognised
+from jaxfilters.trackers.head_mono.start import Start, begin, initialise, search_of
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head_mono.track import System, advance
 
@@ -25,12 +27,6 @@ MOST_REPROJECTION = 0.05
 """Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
 DEPTH_MM = (100.0, 5000.0)
 """In which a face may be."""
-SAME_PERSON = 2.0
-"""Mahalanobis distance between two identities, in the covariance of people, up to which they are taken for one person.
-
-Of 30 people of the general model, with landmarks to 1 px, starts of the same person were .7 to 2.0 apart, of strangers
-2.0 to 4.3 (5 % and 95 %); the specification's 3 (section 1) takes half of all strangers for the same.
-"""
 _begun = jax.jit(begin, static_argnames="options")
 
 
@@ -55,6 +51,7 @@ class MonoSession:
         points: Float[np.ndarray, "K 2"] | None = None,
         *,
         detections: Detections | None = None,
+        remembered: Remembered | None = None,
     ) -> None:
         """A session before its first frame.
 
@@ -64,10 +61,12 @@ class MonoSession:
             options: Constants.
             points: The ten landmarks in the first image, pixels, (u, v); detected in several images where not given.
             detections: Landmarks that were found otherwise in several images, the last of which is still to come.
+            remembered: People of the same model who may be before the camera, beside strangers.
 
         Raises:
-            ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks, or
-                `points` are not ten finite pixels.
+            ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
+                `points` are not ten finite pixels, or `remembered` is not of the model or for the tracker of the
+                thesis, which knows nobody.
         """
         if rig.num_cameras != 1:
             raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
@@ -76,7 +75,9 @@ class MonoSession:
         if face.num_landmarks != NUM_LANDMARKS:
             raise ValueError(f"face must have {NUM_LANDMARKS} landmarks; got {face.num_landmarks}.")
         check_points(points)
-        self._tracker = _MonoTracker(rig, face, options or MonoOptions(), points, detections)
+        options = options or MonoOptions()
+        _check_remembered(remembered, face, options)
+        self._tracker = _MonoTracker(rig, face, options, points, detections, remembered)
         self._following = Following(self._tracker)
 
     @property
@@ -93,6 +94,11 @@ class MonoSession:
     def person(self) -> Person | None:
         """Who it is, as adjusted so far; `None` before there was a face."""
         return None if self._following.state is None else self._following.state.person
+
+    @property
+    def remembered(self) -> Remembered | None:
+        """The person who is followed, for later sessions with the same model; `None` before there was a face."""
+        return None if self._following.state is None else self._tracker.remembered(self._following.state)
 
     def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
         """Track of the next frames, a row each.
@@ -117,12 +123,17 @@ class _MonoTracker:
         options: MonoOptions,
         points: np.ndarray | None,
         detections: Detections | None,
+        remembered: Remembered | None,
     ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
         self._face, self._options, self._points, self._detections = face, options, points, detections
         # What is compiled knows its options, but need not be compiled anew for another seed.
         self._compiled = replace(options, seed=0)
-        self._system = System(face, rig, search_of(rig, options))
+        self._remembered = remembered
+        self._people = people(face, remembered)
+        self._system = System(face, face, rig, search_of(rig, options))
+        self._num_told = 0
+        """Adjustments when it was last asked who it is."""
         self._collector = Collector()
 
     @property
@@ -154,9 +165,9 @@ class _MonoTracker:
 
     def begin(self, found: _Found, old: MonoState | None, frame: int) -> Beginning:
         key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
-        start, detections, what = found.start, found.detections, "registered"
-        if old is not None and self._is_same(start.bundle.person, old.person):
-            start, what = self._known(start, detections, old.person), "registered, a face that is known"
+        start, detections = found.start, found.detections
+        if old is not None:
+            self._remember(old)
         images, points = detections.images[[found.frame, -1]], jnp.asarray(detections.points, float)
         std_px = jnp.asarray(detections.std_px, points.dtype)
         zero = jnp.zeros((), points.dtype)
@@ -172,10 +183,33 @@ class _MonoTracker:
             options=self._compiled,
             detected_px=std_px,
         )
+        self._num_told, self._system = 0, self._system._replace(face=self._face)
+        state = self._recognised(state)
+        what = "registered, a face that is known" if int(state.who) else "registered"
         return Beginning(state, detections.time, what)
 
     def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
-        return advance(self._system, state, images, clock, is_frame, self._compiled)
+        state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
+        return self._recognised(state), track
+
+    def remembered(self, state: MonoState) -> Remembered:
+        return as_remembered(self._system.stranger, self._system.face, state, self._compiled)
+
+    def _recognised(self, state: MonoState) -> MonoState:
+        """Asked again whenever the face has been adjusted twice as often: what is learnt of it grows ever slower."""
+        if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_told:
+            self._num_told = int(state.num_adjusted)
+            state = recognised(self._people, self.rig, state, self._compiled)
+            self._system = self._system._replace(face=one_of(self._people, int(state.who)))
+        return state
+
+    def _remember(self, old: MonoState) -> None:
+        """Who was followed may come back, beside those who were remembered from the first."""
+        if self._options.is_published:
+            return
+        last = self.remembered(old)
+        known = last if self._remembered is None else joined(self._remembered, last)
+        self._people = people(self._face, known)
 
     def empty(self, count: int) -> MonoTrack:
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)
@@ -189,6 +223,7 @@ class _MonoTracker:
             effective_sample_size=np.zeros(count, np.float32),
             identity=nothing(self._face.num_identities),
             offset=nothing(NUM_LANDMARKS, 3),
+            who=np.full(count, -1, np.int32),
             is_adjusted=np.zeros(count, bool),
             status=np.full(count, INITIALISING, np.int32),
         )
@@ -208,11 +243,16 @@ class _MonoTracker:
             return None, [f"the face would be {depth.mean():.0f} mm away"]
         return _Found(detections, start), []
 
-    def _known(self, start: Start, detections: Detections, person: Person) -> Start:
-        points = jnp.asarray(detections.points, float)
-        return with_person(self._face, self.rig, points, start, person, self._options.prior)
 
-    def _is_same(self, one: Person, other: Person) -> bool:
-        apart = np.asarray(one.identity - other.identity, float)
-        covariance = np.asarray(self._face.identity_covariance, float)
-        return bool(apart @ np.linalg.solve(covariance, apart) < SAME_PERSON**2)
+def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoOptions) -> None:
+    if remembered is None:
+        return
+    if options.is_published:
+        raise ValueError('remembered must be None where options.landmarks is not "aligned": that tracker knows nobody.')
+    count = len(remembered.identity)
+    expected = Remembered(
+        (count, face.num_identities), (count, face.num_identities, face.num_identities), (count, *face.mean.shape)
+    )
+    shapes = jax.tree.map(jnp.shape, remembered)
+    if shapes != expected:
+        raise ValueError(f"remembered must be of the model, with shapes {tuple(expected)}; got {tuple(shapes)}.")

@@ -14,11 +14,13 @@ from jaxfilters.gaussian import Gaussian
 from jaxfilters.models.face.bundle import (
     Adjustment,
     Bundle,
+    Past,
     Person,
     Prior,
     Reach,
     Views,
     adjust,
+    nothing_past,
     posed_shape,
     projected,
 )
@@ -96,19 +98,6 @@ def initialise(
     return _fitted(face, rig, points, Bundle(poses, expressions, person), prior, WIDE, detected_px)
 
 
-def with_person(
-    face: MultilinearFace, rig: CameraRig, points: Float[Array, "n K 2"], start: Start, person: Person, prior: Prior
-) -> Start:
-    """The start with a person who is known: poses and expressions anew, and what the offset makes of it.
-
-    Heads begin as much farther away as that face is larger. Arguments are those of `initialise`.
-    """
-    size = lambda who: jnp.sqrt(jnp.sum(jnp.square(posed_shape(face, who, face.expression_mean))))
-    poses = start.bundle.poses.at[:, :3].multiply(size(person) / size(start.bundle.person))
-    known = WIDE._replace(identity=0.0)
-    return _fitted(face, rig, points, Bundle(poses, start.bundle.expressions, person), prior, known, DETECTED_PX)
-
-
 def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
     numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, points.dtype), tree)
     return _adjusted(face, rig, points, bundle, numbers(prior), numbers(reach), numbers(detected_px))
@@ -133,6 +122,7 @@ def begin(
     time: Float[Array, ""],
     options: MonoOptions,
     detected_px: Float[ArrayLike, ""] = DETECTED_PX,
+    past: Past | None = None,
 ) -> MonoState:
     """State in the last frame of the start, with templates from one of its frames.
 
@@ -147,6 +137,7 @@ def begin(
         time: Of the last frame, seconds.
         options: Constants.
         detected_px: Standard deviation of each coordinate of the points.
+        past: What is known of the person beside these landmarks.
     """
     bundle, uv, person = start.bundle, start.uv[frame], start.bundle.person
     first, last = jnp.asarray(images, uv.dtype)[:, None]
@@ -161,7 +152,9 @@ def begin(
     return MonoState(
         search=start_search(x, search_options(options)),
         belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
+        who=jnp.zeros((), jnp.int32),
         person=person,
+        past=nothing_past(face) if past is None and options.past == "marginalised" else past,
         model=model,
         modes=modes,
         response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
@@ -229,6 +222,7 @@ def _first_window(
         bundle.expressions[order],
         jnp.arange(n)[::-1][order],
         jnp.zeros((n, size, size)),
+        jnp.zeros((n, size)),
     )
 
 

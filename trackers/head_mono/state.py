@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.bundle import Bundle, Person, Prior, Reach, Views
+from jaxfilters.models.face.bundle import Bundle, Past, Person, Prior, Reach, Views
 from jaxfilters.models.face.patches import Patches, Slopes
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.state import Recent
@@ -30,6 +30,7 @@ EYES_APART_MM, EYES_APART_STD_MM = (40.0, 80.0), 1.0
 CHOICES = {
     "landmarks": ("aligned", "recalculated", "projected"),
     "selection": ("information", "angles", "latest"),
+    "past": ("dropped", "marginalised"),
 }
 
 
@@ -46,6 +47,9 @@ class MonoOptions:
     selection: str = "information"
     """Which frames are adjusted to: those of most `information` about the person, of the largest variance of `angles`,
     as published, or the `latest`."""
+    past: str = "dropped"
+    """What frames that are replaced leave behind: nothing, or, `marginalised`, what they told of the person. The
+    latter forgets nothing, neither the errors that landmarks have in common over many frames."""
     adjust: bool = True
     """Whether the face is adjusted while it is followed; otherwise at the start alone."""
     prior_weight: float = 1.0
@@ -111,6 +115,8 @@ class Window(NamedTuple):
     """Frames since each; of those of the start only the order."""
     information: Float[Array, "n d d"]
     """Of each frame about identity and offset, in standard deviations."""
+    gradient: Float[Array, "n d"]
+    """Of each frame's energy by them, at the person as believed."""
 
     def bundle(self, person: Person) -> Bundle:
         """All that is adjusted."""
@@ -135,7 +141,12 @@ class MonoState(NamedTuple):
     """Particles of pose and mode coefficients."""
     belief: Gaussian
     """Of the last estimate, for the person as believed."""
+    who: Int[Array, ""]
+    """0 for a stranger, else one of those who are remembered."""
     person: Person
+    """About that face."""
+    past: Past | None
+    """What is known from beyond the window, if anything ever is; about the model's face, that of a stranger."""
     model: FaceModel
     """Of the person: the expressions as orthonormal modes."""
     modes: Modes
@@ -147,6 +158,7 @@ class MonoState(NamedTuple):
     identities: Float[Array, "m S"]
     """Of the last adjustments, the newest first."""
     num_adjusted: Int[Array, ""]
+    """Adjustments so far, the start included."""
     recent: Recent
     windows: Float[Array, "1 K T T"]
     """About the landmarks of the frame before, as recalculated."""
@@ -190,6 +202,8 @@ class MonoTrack(NamedTuple):
     """In standard deviations of the training set's about their mean."""
     offset: Float[Array | np.ndarray, "b K 3"]
     """What the model lacks of this face, millimetres."""
+    who: Int[Array | np.ndarray, " b"]
+    """Whom of the people who are remembered this is taken for, from 0 on; -1 for a stranger."""
     is_adjusted: Bool[Array | np.ndarray, " b"]
     """Whether the face was adjusted in this frame."""
     status: Int[Array | np.ndarray, " b"]

@@ -43,7 +43,10 @@ LEAST_STEPS = 0.1
 class System(NamedTuple):
     """What does not change while a head is followed."""
 
+    stranger: MultilinearFace
+    """The model."""
     face: MultilinearFace
+    """Whom the state is about: the same, or somebody who is remembered."""
     rig: CameraRig
     searches: Searches
 
@@ -170,7 +173,7 @@ def _adjusted(
     system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoOptions
 ) -> tuple[MonoState, Array]:
     """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
-    face, rig, _ = system
+    stranger, face, rig, _ = system
     frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, options.prior)
     response = jnp.where(missed, state.response, frame.told.response)
     state = state._replace(response=jnp.where(jnp.all(jnp.isfinite(response)), response, state.response))
@@ -180,10 +183,12 @@ def _adjusted(
     allowed = ~missed & (score >= adjustment.LEAST_SCORE)
     allowed &= jnp.abs(frame.pose[4]) <= further * adjustment.MOST_YAW
     allowed &= jnp.abs(frame.pose[5]) <= further * adjustment.MOST_PITCH
-    place, deserves = adjustment.choose(face, state.window, frame, options)
+    place, deserves = adjustment.choose(face, state.window, state.past, frame, options)
     tried = allowed & deserves
-    after = jax.lax.cond(tried, lambda: adjustment.adjusted(face, rig, state, frame, place, options), lambda: state)
-    believed = lambda state: (state.person, state.belief, state.model, state.modes, state.window, state.registered)
+    anew = lambda: adjustment.adjusted(stranger, face, rig, state, frame, place, options)
+    after = jax.lax.cond(tried, anew, lambda: state)
+    parts = ("person", "past", "belief", "model", "modes", "window", "registered")
+    believed = lambda state: [getattr(state, part) for part in parts]
     sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(believed(after))]))
     return jax.lax.cond(sound, lambda: after, lambda: state), tried & sound
 
@@ -191,25 +196,26 @@ def _adjusted(
 def _track(
     system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, options: MonoOptions
 ) -> MonoTrack:
-    face, rig, _ = system
+    stranger, face, rig, _ = system
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
     x = state.belief.mean
     M = shape(state.model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
-    of_person = adjustment.uncertainty(face, state.window, state.response, options)
+    of_person = adjustment.uncertainty(face, state.window, state.past, state.response, options)
     variance = jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
     expression = state.modes.expression(face, x[POSE:])
     return MonoTrack(
         pose=known(x[:POSE]),
         pose_std=known(jnp.sqrt(variance)),
-        deformation=known((expression - face.expression_mean) / face.expression_std),
+        deformation=known((expression - stranger.expression_mean) / stranger.expression_std),
         shape=known(M),
         image_points=known(uv),
         score=score,
         effective_sample_size=ess,
-        identity=known((state.person.identity - face.identity_mean) / face.identity_std),
-        offset=known(state.person.offset),
+        identity=known((state.person.identity - stranger.identity_mean) / stranger.identity_std),
+        offset=known(state.person.offset + face.mean - stranger.mean),
+        who=jnp.where(lost, -1, state.who - 1).astype(jnp.int32),
         is_adjusted=is_adjusted,
         status=jnp.where(lost, LOST, DEFORMABLE).astype(jnp.int32),
     )

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import (
     Bundle,
+    Past,
     Person,
     Prior,
     Reach,
@@ -18,6 +19,8 @@ from jaxfilters.models.face.bundle import (
     adjust,
     all_residuals,
     box,
+    nothing_past,
+    parameters,
     posed_shape,
     projected,
 )
@@ -192,3 +195,32 @@ def test_the_offset_takes_up_what_the_model_lacks(x64):
 def test_a_point_behind_the_camera_is_a_large_residual_and_no_nan(x64):
     behind = preset()._replace(poses=preset().poses.at[0, 2].set(-500.0))
     assert np.isfinite(_residuals(face(), rig(), views_of(preset()), behind, HELD)).all()
+
+
+def test_a_past_is_the_gaussian_that_it_says(x64):
+    """Energies of two people differ by what the information form says, also where it tells nothing of a direction."""
+    rng = np.random.default_rng(11)
+    true = truth(10)
+    views = views_of(true)
+    root = rng.normal(size=(12, 40))
+    past = Past(jnp.asarray(root.T @ root), jnp.asarray(root.T @ rng.normal(size=12)))
+
+    def energy(bundle, prior):
+        return 0.5 * np.sum(np.square(all_residuals(face(), rig(), views, bundle, prior)))
+
+    def told(bundle):
+        p = np.asarray(parameters(bundle.person))
+        return 0.5 * p @ np.asarray(past.information) @ p - p @ np.asarray(past.pull)
+
+    other = true._replace(person=truth(12).person._replace(offset=jnp.asarray(rng.normal(0, 0.5, (10, 3)))))
+    held = HELD._replace(past=past)
+    added = [energy(bundle, held) - energy(bundle, HELD) for bundle in (true, other)]
+    assert added[0] - added[1] == pytest.approx(told(true) - told(other), rel=1e-4)
+
+
+def test_a_past_that_tells_nothing_changes_nothing(x64):
+    views = views_of(truth(13), noise=np.random.default_rng(2).normal(0, 1, (NUM, 10, 2)))
+    one, _ = _adjusted(views, preset(), HELD)
+    other, _ = _adjusted(views, preset(), HELD._replace(past=nothing_past(face())))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)

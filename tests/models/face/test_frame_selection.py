@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Person, Prior, Views, projected
+from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Person, Prior, Views, all_residuals, projected
 from jaxfilters.models.face.frame_selection import by_angles, by_information, told
 from jaxfilters.models.face.multilinear import learn
 from jaxfilters.models.face.rig import monocular
@@ -126,3 +127,42 @@ def test_hidden_landmarks_tell_less(x64, scene):
     more, less = (told(face, rig, v, frame, Prior(1.0, 1.0)).information for v in (view, some))
     assert np.linalg.eigvalsh(np.asarray(more - less)).min() > -1e-8
     assert np.trace(more) > np.trace(less)
+
+
+def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scene):
+    """Of the least energy over pose and expression as a function of the person, by central differences.
+
+    At the frame's own best pose and expression for the person, where the derivative by them vanishes.
+    """
+    face, rig, view, frame = scene
+    prior = Prior(1.0, 0.8)
+    noisy = view._replace(uv=view.uv + 0.3 * jax.random.normal(jax.random.key(3), view.uv.shape))
+    units = np.concatenate([face.identity_std, np.full(30, 0.8)])
+
+    def best(y):
+        """Pose and expression by SciPy, and their energy; without the prior of the person."""
+        y = jnp.asarray(units * y)
+        who = Person(frame.person.identity + y[:10], y[10:].reshape(10, 3))
+        root = np.linalg.cholesky(np.asarray(face.expression_covariance))
+
+        def residuals(own):
+            bundle = Bundle(frame.poses + POSE_UNITS * own[:6], frame.expressions + face.expression_std * own[6:], who)
+            seen = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
+            apart = bundle.expressions[0] - face.expression_mean
+            return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True)])
+
+        found = least_squares(
+            jax.jit(residuals), np.zeros(11), jax.jit(jax.jacfwd(residuals)), xtol=1e-15, ftol=1e-15, gtol=1e-12
+        )
+        return found.x, found.cost
+
+    own, _ = best(np.zeros(40))
+    at = frame._replace(
+        poses=frame.poses + POSE_UNITS * own[:6], expressions=frame.expressions + face.expression_std * own[6:]
+    )
+    found = told(face, rig, noisy, at, prior)
+    h = 1e-4
+    for i in (0, 3, 9, 11, 25, 39):
+        along = h * np.eye(40)[i]
+        difference = (best(along)[1] - best(-along)[1]) / (2 * h)
+        assert float(found.gradient[i]) == pytest.approx(difference, abs=2e-4)

@@ -12,7 +12,7 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.trackers.head.state import DEFORMABLE, INITIALISING, LOST, PATIENCE
 from jaxfilters.trackers.head_mono.session import MonoSession
-from jaxfilters.trackers.head_mono.start import initialise, with_person
+from jaxfilters.trackers.head_mono.start import initialise
 from jaxfilters.trackers.head_mono.state import PUBLISHED, MonoOptions
 
 DEGREES = np.array([1.0, 1, 1, *np.rad2deg(np.ones(3))])
@@ -104,16 +104,6 @@ def test_a_known_distance_of_the_eyes_sets_the_scale(rig, face, detected):
         assert float(eyes_apart(face, start.bundle.person)) == pytest.approx(apart, abs=1.5)
 
 
-def test_the_start_with_a_known_person_keeps_who_it_is_and_fits(rig, face, detected):
-    points, prior = jnp.asarray(detected.points, float), MonoOptions().prior
-    start = initialise(face, rig, points, prior)
-    person = start.bundle.person._replace(identity=start.bundle.person.identity + 0.5 * face.identity_std)
-    other = with_person(face, rig, points, start, person, prior)
-    np.testing.assert_allclose(other.bundle.person.identity, person.identity, atol=1e-6)
-    assert np.abs(np.asarray(other.bundle.poses - start.bundle.poses)).max() > 0.01
-    assert other.adjustment.reprojection_px < 2 * start.adjustment.reprojection_px + 0.5
-
-
 def test_the_tracker_of_the_thesis_runs_and_averages_identities(rig, face, talking, detected):
     made, images = talking
     session = MonoSession(rig, face, PUBLISHED, detections=detected)
@@ -158,6 +148,7 @@ def test_wrong_arguments_are_named(rig, face):
     [
         (dict(landmarks="seen"), "landmarks must be one of"),
         (dict(selection="all"), "selection must be one of"),
+        (dict(past="kept"), "past must be one of"),
         (dict(num_particles=0), "num_particles must be at least 1"),
         (dict(prior_weight=-1.0), "prior_weight must be finite and at least 0"),
         (dict(offset_std=np.nan), "offset_std must be finite"),
