@@ -6,10 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.multilinear import MultilinearFace, learn
+from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.synthetic.face import Identity
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, speech_schedule
@@ -47,6 +48,11 @@ class MonoRun(NamedTuple):
         return np.isin(self.track.status, TRACKED)
 
     @property
+    def who(self) -> Int[np.ndarray, " t"]:
+        """Whom of those who are remembered the face is taken for; -1 for a stranger."""
+        return np.asarray(self.track.who)
+
+    @property
     def means(self) -> Float[np.ndarray, " 6"]:
         """Mean sizes of the errors; infinite if nothing is tracked."""
         return np.mean(np.abs(self.errors[self.is_tracked]), axis=0) if self.is_tracked.any() else np.full(6, np.inf)
@@ -62,6 +68,16 @@ class Contender(NamedTuple):
 
     face: MultilinearFace
     options: MonoOptions
+    remembered: Remembered | None = None
+    """Whom it may recognise."""
+
+
+class Learnt(NamedTuple):
+    """From the training faces of some people."""
+
+    face: MultilinearFace
+    people: Remembered
+    """The same people."""
 
 
 def camera() -> CameraRig:
@@ -75,18 +91,21 @@ def talking_head(user: int, num_frames: int) -> FaceSequence:
     return face_sequence(jax.random.key(user), poses, rig=camera(), expressions=speech_schedule(num_frames))
 
 
-def learnt_from(people: list[Identity], identities: int, seed: int) -> MultilinearFace:
-    """The model of the specification's training faces of some people."""
+def learnt_from(people: list[Identity], identities: int, seed: int) -> Learnt:
+    """The model of the specification's training faces of some people, and these people."""
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *people)
     key = jax.random.fold_in(jax.random.key(TRAINING_KEY), seed)
-    return learn(generator_shapes(key, together), identities=identities)
+    shapes = generator_shapes(key, together)
+    face = learn(shapes, identities=identities)
+    return Learnt(face, remember(face, shapes))
 
 
 def follow_all(made: FaceSequence | IctSequence, contenders: Mapping[str, Contender], seed: int) -> dict[str, MonoRun]:
     """Runs of all trackers over one sequence, which is rendered once; they start from landmarks with noise."""
     found = _detections(made, seed)
     sessions = {
-        name: MonoSession(made.rig, one.face, one.options, detections=found) for name, one in contenders.items()
+        name: MonoSession(made.rig, one.face, one.options, detections=found, remembered=one.remembered)
+        for name, one in contenders.items()
     }
     tracks: dict[str, list[MonoTrack]] = {name: [] for name in contenders}
     for start, images in made.chunks(BLOCK):
@@ -107,10 +126,19 @@ def judged(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:
     return MonoRun(track, errors, np.linalg.norm(apart, axis=-1).mean(axis=1), np.degrees(made.poses[first:, 4]))
 
 
-def averaged(runs: list[MonoRun], of: Callable[[MonoRun], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and largest over users."""
+class OverUsers(NamedTuple):
+    """Of one quantity of several runs."""
+
+    mean: np.ndarray
+    median: np.ndarray
+    worst: np.ndarray
+    """The largest."""
+
+
+def over_users(runs: list[MonoRun], of: Callable[[MonoRun], np.ndarray]) -> OverUsers:
+    """Of what the function makes of each run."""
     values = np.stack([np.asarray(of(run), float) for run in runs])
-    return np.asarray(values.mean(axis=0)), np.asarray(values.max(axis=0))
+    return OverUsers(values.mean(axis=0), np.median(values, axis=0), values.max(axis=0))
 
 
 def eyes_apart_of(identity: Identity) -> float:

@@ -26,6 +26,7 @@ def test_errors_are_means_over_users_of_tracked_frames_beside_the_thesis():
     metrics = head_mono.errors_of("a", [one, other])
     assert metrics["error_a_z"].value == pytest.approx(2.0)
     assert metrics["error_a_z_worst"].value == pytest.approx(3.0)
+    assert head_mono.errors_of("a", [one, one, other])["error_a_z_median"].value == pytest.approx(1.0)
     assert metrics["ratio_to_thesis_a_z"].value == pytest.approx(2.0 / 9.56)
     assert metrics["ratio_to_thesis_a_pitch"].value == pytest.approx(2.0 / 2.45)
     assert metrics["ratio_to_thesis_a_yaw"].value == pytest.approx(2.0 / 2.33)
@@ -57,7 +58,7 @@ def test_users_are_who_the_training_faces_say():
 
 
 def test_wider_turns_make_better_starts():
-    face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0)
+    face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0).face
     metrics = start_metrics(face, 0, 6)
     assert metrics["start_free_spread_2_pitch"].value < metrics["start_free_spread_0.1_pitch"].value
     assert metrics["start_spread_1_reprojection"].value < 1.0

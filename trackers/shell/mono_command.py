@@ -18,9 +18,11 @@ from jaxfilters.trackers.shell.head_run import HeadRun, warn
 from jaxfilters.trackers.shell.head_summary import Labels, write_summary
 from jaxfilters.trackers.shell.head_table import STATUS_WORDS
 from jaxfilters.trackers.shell.mono_table import mono_table
+from jaxfilters.trackers.shell.person_files import People, read_people, write_people
 from jaxfilters.trackers.shell.track_command import given, refusing
 from jaxfilters.trackers.shell.video_input import LiveCamera
 
+PERSON_FILE = "person.npz"
 LABELS = Labels("expression, standard deviations", "a", "mode ", "how this face changes with expressions")
 """Of the summary: what is a parameter of the expression, and what moves the most."""
 
@@ -38,7 +40,9 @@ def track_mono(options: argparse.Namespace) -> str:
     place = place_of_one(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
         settings = dataclasses.replace(settings, chunk=1, live=True)
-    session = refusing(lambda: MonoSession(place.rig, model.model, settings, place.points))
+    known = None if options.known is None else read_people(options.known, model.model)
+    remembered = None if known is None else known.remembered
+    session = refusing(lambda: MonoSession(place.rig, model.model, settings, place.points, remembered=remembered))
     run = HeadRun(options, place, session, mono_table(model.model), chunk=settings.chunk)
     if place.note:
         warn(f"{place.note}: distances are wrong in proportion")
@@ -49,14 +53,17 @@ def track_mono(options: argparse.Namespace) -> str:
         "is_focal_length_assumed": place.truth is None and options.camera is None,
         "eyes_apart_mm": None if person is None else finite(float(eyes_apart(model.model, person))),
         "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
+        "taken_for": _taken_for(run, known),
         "face_model": {"source": model.source, "parameters": model.parameters},
         "config": dataclasses.asdict(settings),
         "options": {
-            name: str(value) if value is not None else None
-            for name, value in (("model", options.model), ("camera", options.camera), ("points", options.points))
+            name: None if value is None else [str(one) for one in value] if isinstance(value, list) else str(value)
+            for name, value in ((name, getattr(options, name)) for name in ("model", "camera", "points", "known"))
         },
     }
     run.writer.finish(report, **_learnt(session))
+    if session.remembered is not None:
+        write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.remembered), model.model)
     truth = None if place.truth is None else place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
     run.conclude(followed)
@@ -72,6 +79,13 @@ def _model(options: argparse.Namespace) -> FaceModelFile:
             f"{len(NAMES)} that `jaxfilters fit face-model --points 10` makes a model of."
         )
     return file
+
+
+def _taken_for(run: HeadRun, known: People | None) -> dict[str, int]:
+    """In how many frames each of those who are known was before the camera; nobody without frames."""
+    who = np.asarray(run.writer.results.who)
+    names = () if known is None else known.names
+    return {name: int(np.sum(who == i)) for i, name in enumerate(names) if np.any(who == i)}
 
 
 def _learnt(session: MonoSession) -> dict[str, np.ndarray]:

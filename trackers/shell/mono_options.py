@@ -43,6 +43,13 @@ def add_mono(what: Any, seed: Callable[[str], int]) -> None:
         metavar="MM",
         help="distance between the pupils, if it is known: without it, size and distance are known to some 3 %%",
     )
+    mono.add_argument(
+        "--known",
+        type=Path,
+        nargs="+",
+        metavar="PERSON.npz",
+        help="people who may be before the camera: person.npz of earlier runs with the same model",
+    )
     mono.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 750)")
     mono.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
     mono.add_argument("--fps", type=float, metavar="FPS", help="of the recording, in place of what it says")

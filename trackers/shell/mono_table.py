@@ -34,6 +34,8 @@ class TimedMonoTrack(NamedTuple):
     """(frames, S) in standard deviations of the training set's."""
     offset: np.ndarray
     """(frames, 10, 3) what the model lacks of this face, millimetres."""
+    who: np.ndarray
+    """(frames,) place among those who are known, -1 for a stranger."""
     is_adjusted: np.ndarray
     """(frames,) 1 where the face was adjusted."""
     status: np.ndarray
@@ -44,12 +46,13 @@ def mono_table(face: MultilinearFace) -> TrackTable:
     """How the track of a head with a model of faces becomes rows."""
     expressions = (f"a{i}_sd" for i in range(1, face.num_expressions + 1))
     identities = (f"s{i}_sd" for i in range(1, face.num_identities + 1))
-    columns = (*AXES, *(f"sd_{axis}" for axis in AXES), *expressions, *identities, "is_adjusted", "score")
+    columns = (*AXES, *(f"sd_{axis}" for axis in AXES), *expressions, *identities, "who", "is_adjusted", "score")
     return TrackTable(columns, _numbers, partial(_empty, face.num_expressions, face.num_identities), STATUS_WORDS)
 
 
 def _numbers(track: TimedMonoTrack, i: int) -> np.ndarray:
-    pose, std, last = in_degrees(track.pose[i]), in_degrees(track.pose_std[i]), [track.is_adjusted[i], track.score[i]]
+    pose, std = in_degrees(track.pose[i]), in_degrees(track.pose_std[i])
+    last = [track.who[i], track.is_adjusted[i], track.score[i]]
     return np.concatenate([pose, std, track.deformation[i], track.identity[i], last])
 
 
@@ -66,6 +69,7 @@ def _empty(num_expressions: int, num_identities: int, frames: int) -> TimedMonoT
         effective_sample_size=zeros(),
         identity=zeros(num_identities),
         offset=zeros(NUM_LANDMARKS, 3),
+        who=zeros() - 1,
         is_adjusted=zeros(),
         status=np.zeros(frames, np.int32),
     )

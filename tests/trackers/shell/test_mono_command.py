@@ -11,6 +11,7 @@ import pytest
 
 from jaxfilters.models.face.bundle import Person
 from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.remembered import Remembered
 from jaxfilters.trackers.head_mono.state import MonoTrack
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell import head_input, mono_command
@@ -20,7 +21,7 @@ from jaxfilters.trackers.shell.head_table import with_gaps
 from jaxfilters.trackers.shell.mono_table import mono_table
 
 ROWS, COLS, FRAMES = 48, 64, 20
-OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4"}
+OUTPUTS = {"person.npz", "track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4"}
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +46,7 @@ def made_track(means, times, status, face):
         effective_sample_size=np.full(b, 100.0),
         identity=np.full((b, face.num_identities), 1.5),
         offset=np.zeros((b, 10, 3)),
+        who=np.where(np.arange(b) < b // 2, -1, 0),
         is_adjusted=np.arange(b) % 2 == 0,
         status=status,
     )
@@ -56,9 +58,10 @@ def fake(monkeypatch):
     made = []
 
     class FakeSession(mono_command.MonoSession):
-        events, model, person = (), None, None
+        events, model, person, remembered = (), None, None, None
 
-        def __init__(self, rig, face, options, points):
+        def __init__(self, rig, face, options, points, *, remembered=None):
+            self.known = remembered
             self.rig, self.face, self.options, self.points, self.frames = rig, face, options, points, 0
             self.events = []
             made.append(self)
@@ -69,6 +72,8 @@ def fake(monkeypatch):
             self.frames += len(images)
             if self.person is None:
                 self.person = Person(self.face.identity_mean, jnp.zeros((10, 3)))
+                who = (self.face.identity_mean, self.face.identity_covariance, self.person.offset)
+                self.remembered = Remembered(*(leaf[None] for leaf in who))
                 self.events.append((2, "registered"))
             return made_track(images.mean(axis=(1, 2, 3)), times, np.where(index < 2, 0, 2).astype(np.int32), self.face)
 
@@ -113,6 +118,25 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     captured = capsys.readouterr()
     assert "assumed focal length" in captured.err
     assert "90 % tracked" in captured.out
+
+
+def test_whom_one_run_followed_the_next_may_know(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "ann", "--no-video") == 0
+    assert run(pictures, "--out", tmp_path / "again", "--known", tmp_path / "ann" / "person.npz", "--no-video") == 0
+    assert fake[0].known is None
+    np.testing.assert_allclose(fake[1].known.identity[0], fake[1].face.identity_mean)
+    reports = [json.loads((tmp_path / name / "report.json").read_text()) for name in ("ann", "again")]
+    assert reports[0]["taken_for"] == {}
+    assert reports[1]["taken_for"] == {"ann": FRAMES // 2}
+    assert reports[1]["options"]["known"] == [str(tmp_path / "ann" / "person.npz")]
+    with (tmp_path / "again" / "track.csv").open(newline="") as file:
+        assert [float(row["who"]) for row in csv.DictReader(file)][3:5] == [-1, 0]
+    file = default_face_model()
+    other = dataclasses.replace(file.model, mean=1.01 * file.model.mean)
+    save_face_model(tmp_path / "other.npz", file._replace(model=other))
+    wrong = ("--model", tmp_path / "other.npz", "--known", tmp_path / "ann" / "person.npz")
+    assert run(pictures, "--out", tmp_path / "wrong", *wrong) == 2
+    assert "people of another model of the face" in capsys.readouterr().err
 
 
 def test_marked_landmarks_reach_the_session(pictures, fake, tmp_path):
@@ -178,7 +202,7 @@ def mono_options(**given):
     from argparse import Namespace
 
     usual = dict(video_source=None, camera=None, points=None, fps=None, seed=None, num_particles=None, video=False)
-    return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None) | given)
+    return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, known=None) | given)
 
 
 def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
