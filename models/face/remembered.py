@@ -44,8 +44,12 @@ def remember(face: MultilinearFace, shapes: Float[Array, "P A K 3"], pairs: Pair
         raise ValueError(f"shapes must be (P, A, {face.num_landmarks}, 3), as the model's; got {shapes.shape}.")
     if not bool(jnp.all(jnp.isfinite(shapes))):
         raise ValueError("shapes must be finite.")
-    T = shape_tensor(shapes, pairs)
-    right, left = jnp.split(T, 2, axis=PEOPLE_MODE)
+    return of_tensor(face, shape_tensor(shapes, pairs))
+
+
+def of_tensor(face: MultilinearFace, tensor: Float[Array, "K 3 halves A"]) -> Remembered:
+    """The people of a data tensor (`jaxfilters.models.face.multilinear.shape_tensor`)."""
+    right, left = jnp.split(tensor, 2, axis=PEOPLE_MODE)
     both = jnp.moveaxis((right + left) / 2, (2, 3), (0, 1))
     # One by one: batches of factorisations can stand still on two cores.
     fit, covariance, left_over = jax.lax.map(lambda own: likeliest(face, own), both)

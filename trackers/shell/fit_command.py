@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters.models.face import remembered
 from jaxfilters.models.face.landmarks import EYES, FROM_68, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs
 from jaxfilters.models.face.multilinear import (
@@ -25,6 +26,7 @@ from jaxfilters.multilinear import numerical_ranks
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.face_model_files import FaceModelFile, save_face_model
 from jaxfilters.trackers.shell.landmark_sets import NAMES_68, LandmarkSets, read_landmark_sets, ten_of
+from jaxfilters.trackers.shell.person_files import People, write_people
 from jaxfilters.trackers.shell.track_command import refusing
 
 _ICT_FILE = "ict_landmarks68.npz"
@@ -79,8 +81,13 @@ def fit(options: argparse.Namespace) -> str:
         sets = examples.sets
         file = FaceModelFile(model, sets.names, sets.pairs, examples.source, parameters)
         save_face_model(options.out, file)
-        told = _told(sets, examples.source, quality, options)
-        return "\n".join([*told, *_generalisation(tensor, options), f"model in {options.out}"])
+        told = [*_told(sets, examples.source, quality, options), *_generalisation(tensor, options)]
+        told.append(f"model in {options.out}")
+        if options.remember is not None:
+            names = tuple(f"{examples.source}, {i + 1}" for i in range(len(sets.shapes)))
+            write_people(options.remember, People(names, remembered.of_tensor(model, tensor)), model)
+            told.append(f"people in {options.remember}")
+        return "\n".join(told)
 
 
 def _examples(options: argparse.Namespace) -> Examples:

@@ -42,6 +42,12 @@ def add_fit(commands: Any, seed: Callable[[str], int]) -> None:
         help="how many to draw from the generator or the ICT face model (default: %(default)s)",
     )
     face.add_argument("--seed", type=seed, default=0, metavar="SEED", help="of that draw (default: %(default)s)")
+    face.add_argument(
+        "--remember",
+        type=Path,
+        metavar="PEOPLE.npz",
+        help="a file to write of who the people of DATA are, so that `jaxfilters track head-mono --known` knows them",
+    )
     add_fit_gestures(what, seed)
     _add_noise(what, seed)
 

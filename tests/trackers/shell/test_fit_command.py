@@ -6,11 +6,13 @@ from jaxfilters.models.face.landmarks import EYES, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS
 from jaxfilters.models.face.multilinear import learn, shape_tensor
 from jaxfilters.models.face.people_alignment import aligned_people
+from jaxfilters.models.face.remembered import remember
 from jaxfilters.models.synthetic.face_training import NOISE_MM, generator_shapes, people_of
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.cli import FAILURE, main
 from jaxfilters.trackers.shell.face_model_files import default_face_model, load_face_model
 from jaxfilters.trackers.shell.landmark_sets import NAMES_68, read_landmark_sets, ten_of
+from jaxfilters.trackers.shell.person_files import read_people
 
 FEW = ("--identities", 4, "--expressions", 3)
 
@@ -59,6 +61,20 @@ def test_a_file_of_landmarks_with_holes(tmp_path, capsys, shapes):
     assert NOISE_MM / 3 < read.parameters["rms_mm"] < 2
     whole = learn(jax.numpy.asarray(shapes, float), identities=4, expressions=3)
     np.testing.assert_allclose(read.model.mean, whole.mean, atol=0.5)
+
+
+def test_people_are_remembered_for_the_tracker(tmp_path, capsys, shapes):
+    np.savez(tmp_path / "faces.npz", shapes=shapes)
+    asked = ("--out", tmp_path / "model.npz", "--remember", tmp_path / "people.npz", *FEW)
+    assert fit(tmp_path / "faces.npz", *asked) == 0
+    assert "people in " in capsys.readouterr().out
+    model = load_face_model(tmp_path / "model.npz").model
+    known = read_people([tmp_path / "people.npz"], model)
+    assert known.names == tuple(f"landmark sets faces.npz, {i}" for i in range(1, 6))
+    expected = remember(model, jax.numpy.asarray(shapes, float))
+    # Written from double precision, and compared with single.
+    np.testing.assert_allclose(known.remembered.identity, expected.identity, atol=2e-3)
+    np.testing.assert_allclose(known.remembered.offset, expected.offset, atol=2e-2)
 
 
 def test_a_folder_of_people_is_the_same_as_a_file(tmp_path, shapes):
