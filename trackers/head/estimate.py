@@ -12,26 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import weights
 from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.alignment import Alignment, align, relocated
+from jaxfilters.models.face.alignment import Alignment, align
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.pose import rotation, turning_axes
 from jaxfilters.models.face.refinement import Refined, displaced, refine
-from jaxfilters.models.face.rig import CameraRig, project_shape
+from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
 from jaxfilters.trackers.head import recent
-from jaxfilters.trackers.head.search import KAPPA
+from jaxfilters.trackers.head.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState, Recent
 
 FEWEST_SEEN = 4
 """Landmarks without which there is no fit."""
 RESTING_STD = 0.012
 """Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
-UNLEARNT_STD = 0.01
-"""Millimetres: of the coefficient of a mode that is not learnt, or not used."""
 MEMORY = 0.95
 """Of the running variances, a frame."""
 LOOSENESS = (0.02**2, 10.0**2)
@@ -69,14 +66,11 @@ class Estimate(NamedTuple):
 
 def around_mode(search: AdaptiveState, state: HeadState, model: FaceModel) -> Estimate:
     """The paper's estimate ([P18], [P19]), which the search has made, with the spread of the particles."""
-    x = search.estimate
-    apart = jnp.where(jnp.isfinite(search.log_weights), search.particles - x[:, None], 0.0)
-    w = weights.linear(search.log_weights)
-    covariance = jnp.matmul(apart * w, apart.T, precision="highest")
+    belief = spread(search)
+    x = belief.mean
     M = shape(model, x[POSE:])
     found = jnp.ones((), bool)
     all_of_them = jnp.full((), float(len(M)), x.dtype)
-    belief = Gaussian(x, covariance)
     doubt = jnp.zeros((POSE, POSE), x.dtype)
     return Estimate(belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
 
@@ -99,11 +93,11 @@ def refined(
         rig: Cameras.
         moved: What the head was predicted to move since the last estimate, millimetres and radians.
     """
-    prior = _prior(search, state, model, moved)
+    prior = predicted(search, state.belief, model, moved)
     x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
-    found, _, _ = _aligned(align, state, model, images, rig, x)
+    found, _, _ = looked_for(align, state, model, images, rig, x)
     x = refine(prior, found, state.slopes, model, _looseness(state, 1.0), rig, x).belief.mean
-    found, anchored, is_followed = _aligned(_align_anywhere, state, model, images, rig, x)
+    found, anchored, is_followed = looked_for(anywhere, state, model, images, rig, x)
 
     fit = lambda strength: refine(prior, found, state.slopes, model, _looseness(state, strength), rig, x, ~is_followed)
     # One by one: batches of factorisations can stand still on two cores.
@@ -169,37 +163,6 @@ def _at_rest(
     rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0), is_own)
     a = model.basis.T @ (state.registered.shape - model.mean).ravel()
     return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
-
-
-def _align_anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
-    found = align(patches, slopes, images, uv, M, pose, rig)
-    return relocated(patches, slopes, images, found, uv, M, pose, rig)
-
-
-def _aligned(
-    way, state: HeadState, model: FaceModel, images: Array, rig: CameraRig, x: Array
-) -> tuple[Alignment, Array, Array]:
-    """Landmarks in the images, which of them look as registered, and which are followed from the last frame."""
-    M = shape(model, x[POSE:])
-    uv, _ = project_shape(rig, M, x[:POSE])
-    found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
-    anchored = recent.is_anchored(found)
-    found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
-    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
-    return found._replace(covariance=state.misfit * found.covariance + drift), anchored, is_followed
-
-
-def _prior(search: AdaptiveState, state: HeadState, model: FaceModel, moved: Array) -> Gaussian:
-    """Of this frame before its images: the last belief, moved on, and no deformation too large."""
-    spread = jnp.square(search.spread[:POSE])
-    before = state.belief
-    pose_covariance = before.covariance[:POSE, :POSE] + jnp.diag(spread)
-    usual = jnp.square(jnp.where(model.deviation > 0, model.deviation, UNLEARNT_STD))
-    walked = jnp.maximum(jnp.diagonal(before.covariance)[POSE:], 0.0) + KAPPA**2 * usual
-    variance = 1 / (1 / walked + 1 / usual)
-    mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])
-    covariance = jnp.zeros_like(before.covariance).at[:POSE, :POSE].set(pose_covariance)
-    return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
 
 
 def _with_gauge(belief: Gaussian, deformation: Array, state: HeadState, model: FaceModel) -> Gaussian:

@@ -5,10 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import weights
 from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.alignment import Alignment, align, relocated
+from jaxfilters.models.face.alignment import align
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.point_recalculation import point_windows, recalculate_points
@@ -16,8 +15,8 @@ from jaxfilters.models.face.refinement import LEAST_SCORE, PIXEL_FLOOR, refine
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.trackers.head import recent
-from jaxfilters.trackers.head.estimate import FEWEST_SEEN, LOOSENESS, MEMORY, MISFIT, UNLEARNT_STD
-from jaxfilters.trackers.head.search import KAPPA
+from jaxfilters.trackers.head.estimate import FEWEST_SEEN, LOOSENESS, MEMORY, MISFIT
+from jaxfilters.trackers.head.near_mode import anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.state import POSE, Recent
 from jaxfilters.trackers.head_mono.state import MonoState
 
@@ -59,12 +58,12 @@ def aligned(
         rig: One camera.
         moved: What the head was predicted to move since the last estimate, millimetres and radians.
     """
-    prior = _prior(search, state, moved)
+    prior = predicted(search, state.belief, state.model, moved)
     loose = state.looseness[:, None, None] * jnp.eye(3)
     x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
-    found, _, _ = _aligned(align, state, images, rig, x)
+    found, _, _ = looked_for(align, state, state.model, images, rig, x)
     x = refine(prior, found, state.slopes, state.model, loose, rig, x).belief.mean
-    found, anchored, is_followed = _aligned(_anywhere, state, images, rig, x)
+    found, anchored, is_followed = looked_for(anywhere, state, state.model, images, rig, x)
     fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
     M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
     sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
@@ -115,7 +114,7 @@ def projected(
 ) -> Estimate:
     """The particles' estimate and its own projections for landmarks; arguments are those of `aligned`."""
     del images, moved
-    belief = around_mode(search)
+    belief = spread(search)
     x = belief.mean
     uv, in_front = project_shape(rig, shape(state.model, x[POSE:]), x[:POSE])
     covariance = RECALCULATED_PX**2 * jnp.tile(jnp.eye(2, dtype=uv.dtype), (*uv.shape[:2], 1, 1))
@@ -132,38 +131,3 @@ def projected(
         state.looseness,
         state.misfit,
     )
-
-
-def around_mode(search: AdaptiveState) -> Gaussian:
-    """The mean around the particles' mode, with the spread of the particles."""
-    x = search.estimate
-    apart = jnp.where(jnp.isfinite(search.log_weights), search.particles - x[:, None], 0.0)
-    return Gaussian(x, jnp.matmul(apart * weights.linear(search.log_weights), apart.T, precision="highest"))
-
-
-def _anywhere(patches, slopes, images, uv, M, pose, rig) -> Alignment:
-    found = align(patches, slopes, images, uv, M, pose, rig)
-    return relocated(patches, slopes, images, found, uv, M, pose, rig)
-
-
-def _aligned(way, state: MonoState, images: Array, rig: CameraRig, x: Array) -> tuple[Alignment, Array, Array]:
-    """Landmarks in the image, which of them look as registered, and which are followed from the last frame."""
-    M = shape(state.model, x[POSE:])
-    uv, _ = project_shape(rig, M, x[:POSE])
-    found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
-    anchored = recent.is_anchored(found)
-    found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
-    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
-    return found._replace(covariance=state.misfit * found.covariance + drift), anchored, is_followed
-
-
-def _prior(search: AdaptiveState, state: MonoState, moved: Array) -> Gaussian:
-    """Of this frame before its image: the last belief, moved on, and no expression too strong."""
-    before, deviation = state.belief, state.model.deviation
-    pose_covariance = before.covariance[:POSE, :POSE] + jnp.diag(jnp.square(search.spread[:POSE]))
-    usual = jnp.square(jnp.where(deviation > 0, deviation, UNLEARNT_STD))
-    walked = jnp.maximum(jnp.diagonal(before.covariance)[POSE:], 0.0) + KAPPA**2 * usual
-    variance = 1 / (1 / walked + 1 / usual)
-    mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])
-    covariance = jnp.zeros_like(before.covariance).at[:POSE, :POSE].set(pose_covariance)
-    return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))

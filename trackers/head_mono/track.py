@@ -16,6 +16,7 @@ from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle import ParticleInfo
+from jaxfilters.trackers.head.near_mode import spread
 from jaxfilters.trackers.head.recent import latest_templates
 from jaxfilters.trackers.head.search import KAPPA, Searches, at, gathered, score_at
 from jaxfilters.trackers.head.state import DEFORMABLE, FRAME_S, LOST, PATIENCE, POSE
@@ -28,7 +29,7 @@ from jaxfilters.trackers.head.track import (
     at_last_good,
 )
 from jaxfilters.trackers.head_mono import adjustment
-from jaxfilters.trackers.head_mono.estimate import Estimate, aligned, around_mode, projected, recalculated
+from jaxfilters.trackers.head_mono.estimate import Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.typing import AnyKey
 
@@ -85,7 +86,7 @@ def _step(
     estimate = ESTIMATES[options.landmarks](search, state, images, rig, moved)
     if not options.is_published:
         search = _followed(search, state, estimate, steps)
-    belief = jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, around_mode(search))
+    belief = jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, spread(search))
     score = score_at(state.model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(state.model, looks, rig, belief.mean, images))
     strange = jnp.where(estimate.num_anchored < FEWEST_ANCHORED, state.strange + 1, jnp.maximum(state.strange - 2, 0))
