@@ -4,10 +4,13 @@
     options = {"lower": lower, "upper": upper}
     optimistix.least_squares(fn, solver, y0, args, options, adjoint=BoxAdjoint())
 
-Damping follows the gain ratio (H. B. Nielsen 1999), variables that a bound holds are frozen, and a step that does not
-decrease the error is shortened, or gives way to a projected gradient (C. Kanzow, N. Yamashita, M. Fukushima,
-"Levenberg-Marquardt methods with strong local convergence properties for solving nonlinear equations with convex
-constraints", 2004). All iterates lie within the bounds, and the error never grows.
+Damping follows the gain ratio (H. B. Nielsen 1999) and variables that a bound holds are frozen. A step that does not
+decrease the error is shortened along its way or, where that does not help or the way does not descend, damped more,
+which turns it towards a projected gradient (C. Kanzow, N. Yamashita, M. Fukushima, "Levenberg-Marquardt methods with
+strong local convergence properties for solving nonlinear equations with convex constraints", 2004; D. P. Bertsekas, "On
+the Goldstein-Levitin-Polyak gradient projection method", 1976). All iterates lie within the bounds, and the error never
+grows. Where residuals remain large `J^T J` is no good Hessian; what it lacks is learnt from the steps and used where it
+predicts better (J. E. Dennis, D. M. Gay, R. E. Welsch, "An adaptive nonlinear least-squares algorithm", 1981).
 """
 
 from collections.abc import Callable
@@ -21,18 +24,27 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-_SUFFICIENT = 0.99995**2
-"""Factor of the error from which on a step counts as a success without looking at the model."""
-_LEAST_GAIN, _ARMIJO = 1e-3, 1e-4
-_MOST_HALVINGS = 40
-_FIRST_DAMPING = 1e-3
-"""Of the largest diagonal element of the normal matrix."""
+from jaxfilters.box_steps import Model, boxed, by_gradient, damped_on, damping_of, held, is_still, searched
+from jaxfilters.linalg import cholesky, safe_norm, solve_triangular
+
+_SMALL = 8
+"""Variables up to which `jaxfilters.linalg` is faster than LAPACK, of batches ten times."""
 
 
 class _State(eqx.Module):
     damping: Float[Array, ""]
     """0 before the first step."""
     growth: Float[Array, ""]
+    lacking: Float[Array, "n n"]
+    """What the normal matrix lacks of the Hessian."""
+    is_corrected: Bool[Array, ""]
+    """Whether the next step uses it."""
+    step: Float[Array, " n"]
+    """The last one, 0 where none was taken."""
+    gradient: Float[Array, " n"]
+    """Where it began."""
+    crossed: Float[Array, " n"]
+    """The residuals after it, times the Jacobian before it."""
     terminate: Bool[Array, ""]
     result: optimistix.RESULTS
 
@@ -55,40 +67,48 @@ class BoxLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """Damping is chosen in the first step, where the Jacobian is known."""
         del fn, args, options, f_struct, aux_struct, tags
-        dtype = ravel_pytree(y)[0].dtype
+        flat = ravel_pytree(y)[0]
+        none, zeros, no = jnp.zeros((), flat.dtype), jnp.zeros_like(flat), jnp.zeros((), bool)
         # equinox declares the items of an enumeration as the strings that they are written with.
         underway = cast(optimistix.RESULTS, optimistix.RESULTS.successful)
-        return _State(jnp.zeros((), dtype), jnp.full((), 2.0, dtype), jnp.zeros((), bool), underway)
+        lacking = jnp.zeros((flat.size, flat.size), flat.dtype)
+        return _State(none, none + 2, lacking, no, zeros, zeros, zeros, no, underway)
 
     def step(self, fn, y, args, options, state: _State, tags) -> tuple[PyTree, _State, Any]:
-        """One step that is taken, or none if nothing decreases the error."""
+        """One step that is taken, or none and more damping of the next one."""
         del tags
         flat, unravel = ravel_pytree(y)
         lower, upper = bounds_of(options, y)
         x = jnp.clip(flat, lower, upper)
         residuals = lambda x: ravel_pytree(fn(unravel(x), args)[0])[0]
-        r, J = residuals(x), jax.jacfwd(residuals)(x)
-        gradient, normal = _product(J.T, r), _product(J.T, J)
-        energy = 0.5 * jnp.sum(r * r)
-        damping = jnp.where(state.damping > 0, state.damping, _FIRST_DAMPING * jnp.max(jnp.diagonal(normal)))
-        # A Jacobian of zeros is the end, not a division by zero.
-        damping = jnp.maximum(damping, jnp.finfo(x.dtype).tiny ** 0.5)
+        J, r = jax.jacfwd(lambda x: (residuals(x),) * 2, has_aux=True)(x)
+        gradient, normal = _product(r, J), _product(J.T, J)
+        damping = damping_of(state.damping, jnp.diagonal(normal))
+        lacking = _learnt(x, state, gradient)
+        hessian = jnp.where(state.is_corrected, normal + lacking, normal)
         free = ~held(x, gradient, lower, upper)
-        direction = _damped(normal, gradient, damping, free)
-        energy_at = lambda x: 0.5 * jnp.sum(jnp.square(residuals(x)))
-        product = lambda step: _product(normal, step)
-        taken, success, gain = searched(energy_at, x, direction, gradient, product, energy, lower, upper)
-        factor = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-        moved = jnp.max(jnp.abs(taken - x), initial=0.0) > self.rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
-        small = jnp.max(jnp.abs(x - jnp.clip(x - gradient, lower, upper)), initial=0.0) <= self.atol
-        finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(J)) & jnp.all(lower <= upper)
+        largest = jnp.max(jnp.diagonal(normal), initial=0.0)
+        product = lambda step: _product(normal, step) + jnp.where(state.is_corrected, _product(lacking, step), 0.0)
+        model = Model(x, r, gradient, product, 1 / jnp.maximum(damping, largest))
+        solve = lambda rest, free: _damped(hessian, rest, damping, free)
+        direction, led = boxed(solve, model, free, (lower, upper))
+        found = searched(residuals, model, direction, (lower, upper), ~state.terminate)
+        # What the whole step gained beyond what the normal matrix foresees: does what it lacks explain that?
+        bent = lambda matrix: 0.5 * jnp.sum(found.tried * _product(matrix, found.tried))
+        surplus = found.decrease + jnp.sum(gradient * found.tried) + bent(normal)
+        small = by_gradient(x, gradient, (lower, upper)) <= self.atol
+        finite = jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(J)) & jnp.all(lower <= upper)
         after = _State(
-            jnp.where(success, damping * factor, damping * state.growth),
-            jnp.where(success, 2.0, 2 * state.growth).astype(x.dtype),
-            ~moved | small | ~finite,
+            *damped_on(damping, state.growth, found.is_success & led, found.gain, largest),
+            lacking,
+            jnp.abs(surplus + bent(lacking)) < jnp.abs(surplus),
+            found.point - x,
+            gradient,
+            _product(found.residuals, J),
+            found.is_exhausted | is_still(model, found, (lower, upper), self.rtol) | small | ~finite,
             optimistix.RESULTS.where(finite, optimistix.RESULTS.successful, optimistix.RESULTS.nonlinear_divergence),
         )
-        best = unravel(jnp.where(small | ~finite, x, taken))
+        best = unravel(jnp.where(small | ~finite, x, found.point))
         return best, after, fn(best, args)[1]
 
     def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Array, optimistix.RESULTS]:
@@ -141,7 +161,7 @@ def bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Float[Array, " n"], F
     lower = _flat_bound("lower", options.get("lower"), y, -jnp.inf)
     upper = _flat_bound("upper", options.get("upper"), y, jnp.inf)
     if not isinstance(lower, jax.core.Tracer) and not isinstance(upper, jax.core.Tracer):
-        wrong = ~np.asarray(lower <= upper)
+        wrong = ~(np.asarray(lower) <= np.asarray(upper))
         if wrong.any():
             i = int(np.argmax(wrong))
             raise ValueError(f"lower must be at most upper; variable {i} has {lower[i]} and {upper[i]}.")
@@ -159,13 +179,6 @@ def _flat_bound(name, bound, y, none):
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number, or have the structure and shapes of y: {error}") from None
     return ravel_pytree(full)[0]
-
-
-def held(
-    x: Float[Array, " n"], gradient: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]
-) -> Bool[Array, " n"]:
-    """Which variables a bound holds against the descent direction."""
-    return ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
 
 
 def covariance(
@@ -199,87 +212,35 @@ def cauchy(residual: Float[Array, "*shape"], scale: float) -> Float[Array, "*sha
     return residual * jnp.where(small, 1 - ratio2 / 4, factor)
 
 
-def schur(
-    U: Float[Array, "s s"],
-    W: Float[Array, "frames s f"],
-    V: Float[Array, "frames f f"],
-    b_shared: Float[Array, " s"],
-    b_frames: Float[Array, "frames f"],
-) -> tuple[Float[Array, " s"], Float[Array, "frames f"]]:
-    """Solution of normal equations in which frames share some variables, in time linear in the frames.
-
-    `[[U, W], [W^T, V]] (x, y) = (b_shared, b_frames)` with a block of V for each frame, by the Schur complement of V.
-    """
-    solve = lambda V, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(V), True), b)
-    # One by one: batches of factorisations can stand still on two cores.
-    both = jnp.concatenate([jnp.swapaxes(W, 1, 2), b_frames[..., None]], axis=-1)
-    solved = jax.lax.map(lambda frame: solve(*frame), (V, both))
-    VW, Vb = solved[..., :-1], solved[..., -1]
-    S = U - jnp.einsum("nsf,nft->st", W, VW, precision="highest")
-    x = solve(S, b_shared - jnp.einsum("nsf,nf->s", W, Vb, precision="highest"))
-    return x, Vb - jnp.einsum("nfs,s->nf", VW, x, precision="highest")
-
-
-def _damped(normal, gradient, damping, free):
-    """The damped step of the free variables; the others stay."""
+def _damped(hessian, gradient, damping, free):
     both = free[:, None] & free
-    matrix = jnp.where(both, normal, 0.0) + jnp.diag(jnp.where(free, damping, 1.0))
-    step = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), jnp.where(free, gradient, 0.0))
-    # Rounding can take a nearly singular matrix below zero; the gradient then leads on.
-    return jnp.where(jnp.all(jnp.isfinite(step)), step, -jnp.where(free, gradient, 0.0) / damping)
+    matrix = jnp.where(both, hessian, 0.0) + jnp.diag(jnp.where(free, damping, 1.0))
+    rest = jnp.where(free, gradient, 0.0)
+    if rest.size > _SMALL:
+        return -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), rest)
+    L = cholesky(matrix)
+    return -solve_triangular(L, solve_triangular(L, rest), transpose=True)
 
 
-def searched(
-    energy_at: Callable[[Array], Array],
-    x: Float[Array, " n"],
-    direction: Float[Array, " n"],
-    gradient: Float[Array, " n"],
-    product: Callable[[Array], Array],
-    energy: Float[Array, ""],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-) -> tuple[Float[Array, " n"], Bool[Array, ""], Float[Array, ""]]:
-    """The next point within the bounds, whether the whole step was a success, and its gain ratio, 0 to 1.
+def _learnt(x, state: _State, gradient):
+    """What the normal matrix lacks of the Hessian, by one more step: the update of Dennis, Gay and Welsch (1981).
 
-    A step that fails is halved, or where it does not descend the projected gradient is, until the energy falls enough
-    (L. Armijo 1966); where nothing does, the point stays.
-
-    Args:
-        energy_at: `x -> energy`, half the sum of squares.
-        x: Where the step begins.
-        direction: The step.
-        gradient: Of the energy at `x`.
-        product: `step -> N step` with the normal matrix.
-        energy: At `x`.
-        lower: Bounds.
-        upper: Bounds.
+    Of all symmetric matrices that explain how the Jacobian's change turned the residuals, the nearest to the last one,
+    once this is made smaller where it is too large for the step.
     """
-    trial = jnp.clip(x + direction, lower, upper)
-    step = trial - x
-    predicted = -jnp.sum(gradient * step) - 0.5 * jnp.sum(step * product(step))
-    there = energy_at(trial)
-    gain = (energy - there) / jnp.where(predicted > 0, predicted, 1.0)
-    success = (there <= _SUFFICIENT * energy) | ((predicted > 0) & (gain > _LEAST_GAIN))
-    descends = jnp.sum(gradient * step) < 0
-
-    def at(t):
-        along = x + t * step
-        projected = jnp.clip(x - t * gradient, lower, upper)
-        return jnp.where(descends, along, projected)
-
-    def enough(t):
-        point = at(t)
-        return energy_at(point) <= energy + _ARMIJO * jnp.sum(gradient * (point - x))
-
-    def shorten(carry):
-        t, count, _ = carry
-        t = 0.5 * t
-        return t, count + 1, enough(t)
-
-    start = (jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), success)
-    t, _, found = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < _MOST_HALVINGS), shorten, start)
-    point = jnp.where(success, trial, jnp.where(found, at(t), x))
-    return point, success, jnp.clip(gain, 0.0, 1.0)
+    step, last = state.step, state.lacking
+    change, turned = gradient - state.gradient, gradient - state.crossed
+    by_last = _product(last, step)
+    curvature, had, needed = jnp.sum(change * step), jnp.abs(jnp.sum(step * by_last)), jnp.abs(jnp.sum(step * turned))
+    sized = jnp.where(had > needed, needed / jnp.where(had > 0, had, 1.0), 1.0)
+    # Of short steps rounding is all that is seen.
+    longest = jnp.finfo(x.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(x), initial=0.0))
+    tells = (jnp.max(jnp.abs(step), initial=0.0) > longest) & (curvature > 1e-6 * safe_norm(change) * safe_norm(step))
+    along = change / jnp.where(tells, curvature, 1.0)
+    missing = turned - sized * by_last
+    outer = missing[:, None] * along
+    after = sized * last + outer + outer.T - jnp.sum(missing * step) * along[:, None] * along
+    return jnp.where(tells, after, last)
 
 
 def _product(a, b):

@@ -16,12 +16,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxfilters.least_squares import bounds_of, held, schur, searched
-
-_FIRST_DAMPING = 1e-3
-"""Of the largest diagonal element of the normal matrix."""
-_SMALLEST = 1e-30
-"""Of the damping: a Jacobian of zeros is the end, not a division by zero."""
+from jaxfilters.box_steps import Model, boxed, by_gradient, damped_on, damping_of, held, is_still, searched
+from jaxfilters.least_squares import bounds_of
 
 
 class Split(NamedTuple):
@@ -97,21 +93,19 @@ def solve_shared(
     problem = _problem(residuals, prior, start, data)
     advance = partial(_advance, problem, low, high, rtol, atol)
     x = jnp.clip(flat, low, high)
-    zero = jnp.zeros((), x.dtype)
-    begin = _Walk(
-        x, problem.energy(x), zero, zero + 2, jnp.zeros((), jnp.int32), jnp.ones((), bool), jnp.ones((), bool)
-    )
+    zero, yes = jnp.zeros((), x.dtype), jnp.ones((), bool)
+    begin = _Walk(x, problem.residuals(x), zero, zero + 2, jnp.zeros((), jnp.int32), yes, yes)
     end = jax.lax.while_loop(lambda walk: walk.goes_on & (walk.steps < steps), advance, begin)
     blocks = _blocks(problem, end.x)
-    rest = _projected(end.x, problem.join(blocks.shared, blocks.frames), low, high)
-    return SharedSolution(whole(end.x), end.energy, rest, end.steps, end.finite)
+    rest = by_gradient(end.x, problem.join(blocks.shared, blocks.frames), (low, high))
+    return SharedSolution(whole(end.x), 0.5 * jnp.sum(jnp.square(end.residuals)), rest, end.steps, end.finite)
 
 
 class _Walk(NamedTuple):
     """Between two steps."""
 
     x: Array
-    energy: Array
+    residuals: Array
     damping: Array
     """0 before the first step."""
     growth: Array
@@ -126,32 +120,25 @@ def _advance(problem: "_Problem", low: Array, high: Array, rtol: float, atol: fl
     blocks = _blocks(problem, x)
     gradient = join(blocks.shared, blocks.frames)
     diagonal = join(jnp.diagonal(blocks.U), jnp.diagonal(blocks.V, axis1=1, axis2=2))
-    damping = jnp.where(walk.damping > 0, walk.damping, _FIRST_DAMPING * jnp.max(diagonal))
-    damping = jnp.maximum(damping, _SMALLEST)
+    damping = damping_of(walk.damping, diagonal)
     free = ~held(x, gradient, low, high)
-    direction = join(*_step(blocks, damping, *split(free)))
-    # Rounding can take a nearly singular matrix below zero; the gradient then leads on.
-    direction = jnp.where(jnp.all(jnp.isfinite(direction)), direction, -jnp.where(free, gradient, 0.0) / damping)
+    largest = jnp.max(diagonal)
     product = lambda step: join(*blocks.product(*split(step)))
-    y, success, gain = searched(problem.energy, x, direction, gradient, product, walk.energy, low, high)
-    finite = jnp.isfinite(walk.energy) & jnp.all(jnp.isfinite(gradient))
-    moved = jnp.max(jnp.abs(y - x), initial=0.0) > rtol * (1 + jnp.max(jnp.abs(x), initial=0.0))
-    eased = damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-    y = jnp.where(finite, y, x)
+    model = Model(x, walk.residuals, gradient, product, 1 / jnp.maximum(damping, largest))
+    solve = lambda gradient, free: join(*_step(blocks, damping, split(gradient), split(free)))
+    direction, leads = boxed(solve, model, free, (low, high))
+    found = searched(problem.residuals, model, direction, (low, high), walk.goes_on)
+    finite = jnp.all(jnp.isfinite(walk.residuals)) & jnp.all(jnp.isfinite(gradient))
+    ends = found.is_exhausted | is_still(model, found, (low, high), rtol)
+    ends |= by_gradient(x, gradient, (low, high)) <= atol
     return _Walk(
-        y,
-        problem.energy(y),
-        jnp.where(success, eased, damping * walk.growth),
-        jnp.where(success, 2.0, 2 * walk.growth),
+        jnp.where(finite, found.point, x),
+        jnp.where(finite, found.residuals, walk.residuals),
+        *damped_on(damping, walk.growth, found.is_success & leads, found.gain, largest),
         walk.steps + 1,
-        moved & (_projected(x, gradient, low, high) > atol) & finite,
+        ~ends & finite,
         finite,
     )
-
-
-def _projected(x: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """Largest component of the projected gradient."""
-    return jnp.max(jnp.abs(x - jnp.clip(x - gradient, low, high)), initial=0.0)
 
 
 def _flattened(start: Split) -> tuple[Array, Callable[[Array], Split]]:
@@ -185,11 +172,11 @@ class _Problem(NamedTuple):
         """The other way round."""
         return jnp.concatenate([shared, frames.ravel()])
 
-    def energy(self, x: Array) -> Array:
-        """Half of the sum of squares."""
+    def residuals(self, x: Array) -> Array:
+        """All of them."""
         s, f = self.split(x)
         of_frames = jax.vmap(self.of_frame, (None, 0, 0))(s, f, self.data)
-        return 0.5 * (jnp.sum(of_frames**2) + jnp.sum(self.own(s) ** 2))
+        return jnp.concatenate([of_frames.ravel(), self.own(s)])
 
 
 def _problem(residuals, prior, start: Split, data: PyTree) -> _Problem:
@@ -219,11 +206,33 @@ def _blocks(problem: _Problem, x: Array) -> _Blocks:
     )
 
 
-def _step(blocks: _Blocks, damping: Array, free_shared: Array, free_frames: Array) -> tuple[Array, Array]:
-    """The damped step of the free variables; the others stay."""
+def _step(blocks: _Blocks, damping: Array, gradient: tuple, free: tuple) -> tuple[Array, Array]:
+    """The damped step of the free variables; the others stay. Both arguments as `_Problem.split` has them."""
+    (of_shared, of_frames), (free_shared, free_frames) = gradient, free
     U = jnp.where(free_shared[:, None] & free_shared, blocks.U, 0.0)
     W = jnp.where(free_shared[:, None] & free_frames[:, None], blocks.W, 0.0)
     V = jnp.where(free_frames[:, :, None] & free_frames[:, None], blocks.V, 0.0)
     U += jnp.diag(jnp.where(free_shared, damping, 1.0))
     V += jax.vmap(jnp.diag)(jnp.where(free_frames, damping, 1.0))
-    return schur(U, W, V, -jnp.where(free_shared, blocks.shared, 0.0), -jnp.where(free_frames, blocks.frames, 0.0))
+    return schur(U, W, V, -jnp.where(free_shared, of_shared, 0.0), -jnp.where(free_frames, of_frames, 0.0))
+
+
+def schur(
+    U: Float[Array, "s s"],
+    W: Float[Array, "frames s f"],
+    V: Float[Array, "frames f f"],
+    b_shared: Float[Array, " s"],
+    b_frames: Float[Array, "frames f"],
+) -> tuple[Float[Array, " s"], Float[Array, "frames f"]]:
+    """Solution of normal equations in which frames share some variables, in time linear in the frames.
+
+    `[[U, W], [W^T, V]] (x, y) = (b_shared, b_frames)` with a block of V for each frame, by the Schur complement of V.
+    """
+    solve = lambda V, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(V), True), b)
+    # One by one: batches of factorisations can stand still on two cores.
+    both = jnp.concatenate([jnp.swapaxes(W, 1, 2), b_frames[..., None]], axis=-1)
+    solved = jax.lax.map(lambda frame: solve(*frame), (V, both))
+    VW, Vb = solved[..., :-1], solved[..., -1]
+    S = U - jnp.einsum("nsf,nft->st", W, VW, precision="highest")
+    x = solve(S, b_shared - jnp.einsum("nsf,nf->s", W, Vb, precision="highest"))
+    return x, Vb - jnp.einsum("nfs,s->nf", VW, x, precision="highest")

@@ -1,12 +1,14 @@
-"""Least squares within bounds: the box Levenberg-Marquardt against SciPy, jaxopt and optimistix; shared variables.
+"""Least squares within bounds: the box Levenberg-Marquardt against SciPy, jaxopt, optimistix, Ceres and NLopt.
 
 300 random problems of 2 to 4 variables and 8 residuals, in double precision: solutions have to be feasible and
-stationary, and are compared with those of SciPy's trust-region reflective method. Where both are stationary in
-different places the problem has several minima, which is counted apart. Then 256 of them at once: this library and the
-peers that know bounds (`scipy`: one after the other; `jaxopt_lbfgsb` and `jaxopt_projected`, L-BFGS-B and projected
-gradients, under vmap), and optimistix's own Levenberg-Marquardt, which takes bounds without a word and leaves them, on
-the same problems without bounds. All stop at a projected gradient of 1e-6. At last the adjustment of frames that share
-variables, dense and by the Schur complement.
+stationary, and are compared with those of SciPy's trust-region reflective method from the same starts. Where SciPy,
+started again at a solution that is worse than its own, stays there, the problem has several minima, which is counted
+apart. Then 256 of them at once: this library and the peers that know bounds (`jaxopt_lbfgsb` and `jaxopt_projected`,
+L-BFGS-B and projected gradients, under vmap; `scipy`, and with `pip install 'jaxfilters[peers]'` `pyceres`, the
+Levenberg-Marquardt of Ceres, and `nlopt`, its SLSQP, one after the other with residuals in numpy), and optimistix's own
+Levenberg-Marquardt, which takes bounds without a word and leaves them, on the same problems without bounds. All stop at
+a projected gradient of 1e-6. At last the adjustment of frames that share variables, dense and by the Schur complement:
+`shared_exponent_*` is the slope of the logarithm of time by that of the number of frames.
 """
 
 import sys
@@ -23,6 +25,7 @@ import scipy.optimize
 from jaxtyping import Array
 
 from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.scenarios import _least_squares_peers as peers
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.least_squares import BoxLevenbergMarquardt
 from jaxfilters.shared_least_squares import Split, solve_shared
@@ -30,8 +33,12 @@ from jaxfilters.shared_least_squares import Split, solve_shared
 NUM_PROBLEMS, QUICK_NUM_PROBLEMS, BATCH = 300, 30, 256
 SIZE, NUM_RESIDUALS, MOST_STEPS = 4, 8, 400
 STATIONARY = 1e-6
-FRAMES, QUICK_FRAMES = (8, 32, 128, 512), (8, 32)
-MOST_DENSE = 128
+FRAMES, QUICK_FRAMES = (5, 10, 20, 40, 80, 160, 320, 640), (5, 10, 20)
+MOST_DENSE = 80
+FEWEST = 20
+"""Frames from which on the growth of time is fitted: with fewer, what does not depend on them counts."""
+SAME = 1e-6
+"""Relative difference of two costs that are the same."""
 NUM_POINTS, NUM_SHARED = 10, 12
 MEAN = np.random.default_rng(0).normal(0, 1, 3 * NUM_POINTS)
 BASIS = np.random.default_rng(1).normal(0, 0.3, (3 * NUM_POINTS, NUM_SHARED))
@@ -87,19 +94,20 @@ def answer_metrics(problems: tuple[np.ndarray, ...]) -> dict[str, Metric]:
     """Are the answers right, and as good as SciPy's?"""
     A, b, c, lower, upper, _ = problems
     y, steps = (np.asarray(part) for part in box_solve(*problems))
-    peers = [scipy_solve(*one) for one in zip(*problems, strict=True)]
-    cost, stationary = jax.vmap(energy)(jnp.asarray(y), (A, b, c)), projected_gradient(y, problems)
-    ratio = np.asarray(cost) / np.array([peer.cost for peer in peers])
-    elsewhere = projected_gradient(np.stack([peer.x for peer in peers]), problems) < 1e-4
-    elsewhere &= (stationary < 1e-4) & (ratio > 1 + 1e-6)
+    others = [scipy_solve(*one) for one in zip(*problems, strict=True)]
+    cost, stationary = np.asarray(jax.vmap(energy)(jnp.asarray(y), (A, b, c))), projected_gradient(y, problems)
+    ratio = cost / np.array([other.cost for other in others])
+    worse = np.flatnonzero(ratio > 1 + SAME)
+    again = [scipy_solve(*(a[i] for a in problems[:5]), y[i]).cost for i in worse]
+    elsewhere = np.array(again) >= cost[worse] * (1 - SAME)
     return {
         "infeasible": Metric(float(np.sum((y < lower) | (y > upper))), "", "lower"),
         "projected_gradient_worst": Metric(float(stationary.max()), "", "lower"),
-        "worse_than_scipy": Metric(float(np.sum((ratio > 1 + 1e-6) & ~elsewhere)), "problems", "lower"),
+        "worse_than_scipy": Metric(float(np.sum(~elsewhere)), "problems", "lower"),
         "worse_than_scipy_in_another_minimum": Metric(float(np.sum(elsewhere)), "problems", "lower"),
-        "better_than_scipy": Metric(float(np.sum(ratio < 1 - 1e-6)), "problems", "higher"),
+        "better_than_scipy": Metric(float(np.sum(ratio < 1 - SAME)), "problems", "higher"),
         "steps_median": Metric(float(np.median(steps)), "", "lower"),
-        "scipy_evaluations_median": Metric(float(np.median([peer.nfev for peer in peers])), "", "lower"),
+        "scipy_evaluations_median": Metric(float(np.median([other.nfev for other in others])), "", "lower"),
     }
 
 
@@ -110,10 +118,10 @@ def projected_gradient(y: np.ndarray, problems: tuple[np.ndarray, ...]) -> np.nd
     return np.abs(y - np.clip(y - gradient, lower, upper)).max(axis=1)
 
 
-def scipy_solve(
+def written(
     A: np.ndarray, b: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray
-) -> scipy.optimize.OptimizeResult:
-    """One problem by the trust-region reflective method, with the exact Jacobian."""
+) -> peers.Written:
+    """One problem with its exact Jacobian, for solvers that are not of JAX."""
 
     def value(y: np.ndarray) -> np.ndarray:
         turned = A @ y
@@ -123,8 +131,21 @@ def scipy_solve(
         slope = 2 / np.cosh(A @ y) ** 2 + 0.3
         return slope[:, None] * A + 0.2 * c[:, None] * y
 
+    return peers.Written(value, jacobian, lower, upper, start, NUM_RESIDUALS)
+
+
+def scipy_solve(*problem: np.ndarray) -> scipy.optimize.OptimizeResult:
+    """One problem, as `written` takes it, by the trust-region reflective method."""
+    one = written(*problem)
     return scipy.optimize.least_squares(
-        value, start, jacobian, (lower, upper), gtol=STATIONARY, xtol=1e-14, ftol=1e-14, max_nfev=MOST_STEPS
+        one.value,
+        one.start,
+        one.jacobian,
+        (one.lower, one.upper),
+        gtol=STATIONARY,
+        xtol=1e-14,
+        ftol=1e-14,
+        max_nfev=MOST_STEPS,
     )
 
 
@@ -138,6 +159,12 @@ def batch_metrics(problems: tuple[np.ndarray, ...], rounds: int) -> dict[str, Me
         "optimistix_unbounded": lambda: unbounded_solve(*arrays),
         "scipy": lambda: np.stack([scipy_solve(*one).x for one in zip(*problems, strict=True)]),
     }
+    by_name: dict[str, Callable] = {"pyceres": peers.pyceres, "nlopt": peers.nlopt}
+    for name in peers.installed():
+        calls[name] = partial(_one_by_one, by_name[name], [written(*one) for one in zip(*problems, strict=True)])
+    absent = set(by_name) - set(calls)
+    if absent:
+        sys.stdout.write(f"not installed, and missing below: {', '.join(sorted(absent))}\n")
     seconds = interleaved(calls, rounds)
     metrics = {f"batch_ms_{name}": Metric(1e3 * value, "ms", "lower") for name, value in seconds.items()}
     for name, call in calls.items():
@@ -150,6 +177,10 @@ def batch_metrics(problems: tuple[np.ndarray, ...], rounds: int) -> dict[str, Me
         if name != "box":
             metrics[f"ratio_batch_to_{name}"] = Metric(seconds["box"] / seconds[name], "", "lower")
     return metrics
+
+
+def _one_by_one(solve: Callable[..., np.ndarray], problems: list[peers.Written]) -> np.ndarray:
+    return np.stack([solve(problem, STATIONARY, MOST_STEPS) for problem in problems])
 
 
 @jax.jit
@@ -196,13 +227,12 @@ def shared_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str,
             apart = max(apart, float(jnp.max(jnp.abs(ends[0] - ends[1]))))
     seconds = interleaved(calls, rounds)
     metrics = {f"shared_ms_{name}": Metric(1e3 * value, "ms", "lower") for name, value in seconds.items()}
-    first, last = counts[-2], counts[-1]
-    growth = seconds[f"schur_{last}_frames"] / seconds[f"schur_{first}_frames"] / (last / first)
-    sys.stderr.write(f"  shared variables: {growth:.2f} times linear from {first} to {last} frames\n")
-    return metrics | {
-        "shared_growth_over_linear": Metric(growth, "", "lower"),
-        "shared_apart_from_dense": Metric(apart, "", "lower"),
-    }
+    for kind in ("schur", "dense"):
+        timed = [n for n in counts if n >= min(FEWEST, counts[-2]) and f"{kind}_{n}_frames" in calls]
+        times = [seconds[f"{kind}_{n}_frames"] for n in timed]
+        exponent = np.polyfit(np.log(timed), np.log(times), 1)[0]
+        metrics[f"shared_exponent_{kind}"] = Metric(float(exponent), "", "lower")
+    return metrics | {"shared_apart_from_dense": Metric(apart, "", "lower")}
 
 
 def shared_problem(seed: int, count: int) -> tuple[Split, Array]:

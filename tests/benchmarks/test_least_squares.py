@@ -2,7 +2,9 @@
 
 import jax
 import numpy as np
+import pytest
 
+from jaxfilters.benchmarks.scenarios import _least_squares_peers as peers
 from jaxfilters.benchmarks.scenarios import least_squares
 
 
@@ -22,6 +24,22 @@ def test_shared_variables_are_solved_alike(x64):
     metrics = least_squares.shared_metrics(0, (4, 8), 1)
     assert metrics["shared_apart_from_dense"].value < 1e-7
     assert metrics["shared_ms_schur_8_frames"].value > 0
+    assert np.isfinite([metrics[f"shared_exponent_{kind}"].value for kind in ("schur", "dense")]).all()
+
+
+@pytest.mark.parametrize("name", ["pyceres", "nlopt"])
+def test_peers_that_are_not_of_python_solve_the_same_problems(name):
+    """Where no bound is near. Within near ones they stay too, though Ceres, which only clips its steps, may stall."""
+    pytest.importorskip(name)
+    solve = getattr(peers, name)
+    for one in zip(*least_squares.random_problems(2, 9), strict=True):
+        near = least_squares.written(*one)
+        y = solve(near, 1e-6, 400)
+        assert np.all((y >= near.lower) & (y <= near.upper))
+        assert np.sum(near.value(y) ** 2) <= np.sum(near.value(near.start) ** 2)
+    far = near._replace(lower=np.full(4, -50.0), upper=np.full(4, 50.0))
+    y = solve(far, 1e-6, 400)
+    assert np.abs(far.jacobian(y).T @ far.value(y)).max() < 1e-3
 
 
 def test_the_peers_own_derivatives_are_right():

@@ -8,7 +8,9 @@ import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose
 
-from jaxfilters.least_squares import BoxAdjoint, BoxLevenbergMarquardt, bounds_of, cauchy, covariance, huber, schur
+from jaxfilters.box_steps import Model, boxed
+from jaxfilters.least_squares import BoxAdjoint, BoxLevenbergMarquardt, bounds_of, cauchy, covariance, huber
+from jaxfilters.shared_least_squares import schur
 
 SOLVER = BoxLevenbergMarquardt(rtol=1e-12, atol=1e-9)
 NUM_PROBLEMS = 300
@@ -47,29 +49,81 @@ def solved():
                 residuals, SOLVER, start, (A, b, c), options, max_steps=400, throw=False
             )
             energy = lambda y: 0.5 * jnp.sum(residuals(y, (A, b, c)) ** 2)
-            return solution.value, jax.grad(energy)(solution.value), energy(solution.value), energy(start)
+            steps = solution.stats["num_steps"]
+            return solution.value, jax.grad(energy)(solution.value), energy(solution.value), energy(start), steps
 
         found = jax.jit(jax.vmap(solve))(A, b, c, lower, upper, start)
         return problems(), jax.tree.map(np.asarray, found)
 
 
 def test_solutions_are_feasible_and_stationary(solved):
-    (_, _, _, lower, upper, _), (y, gradient, after, before) = solved
+    (_, _, _, lower, upper, _), (y, gradient, after, before, _) = solved
     assert np.all((y >= lower) & (y <= upper))
     assert np.abs(y - np.clip(y - gradient, lower, upper)).max() < 1e-6
     assert np.all(after <= before)
 
 
 def test_scipy_finds_nothing_better(solved):
-    (A, b, c, lower, upper, start), (_, _, energy, _) = solved
-    worse = 0
+    """From the same start, or, where the two end in different minima, from where this solver ended."""
+    (A, b, c, lower, upper, start), (y, _, energy, _, _) = solved
+    elsewhere = 0
     for i in range(NUM_PROBLEMS):
-        peer = scipy.optimize.least_squares(
-            residuals_numpy, start[i], bounds=(lower[i], upper[i]), args=(A[i], b[i], c[i]), xtol=1e-14, ftol=1e-14
+        solve = lambda x, i=i: scipy.optimize.least_squares(
+            residuals_numpy, x, bounds=(lower[i], upper[i]), args=(A[i], b[i], c[i]), xtol=1e-14, ftol=1e-14
         )
-        worse += energy[i] > peer.cost * (1 + 1e-6)
-    # The problems have several minima: seen are 1 % where the two end in different ones.
-    assert worse <= 6
+        if energy[i] > solve(start[i]).cost * (1 + 1e-6):
+            assert solve(y[i]).cost >= energy[i] * (1 - 1e-6)
+            elsewhere += 1
+    # Some problems have several minima: seen are 4 of 300 where SciPy's is the better one, and one the other way round.
+    assert elsewhere <= 12
+
+
+def test_large_residuals_do_not_slow_it_down(solved):
+    """Most residuals stay: Gauss-Newton steps alone, which then converge linearly, take 38 in one problem of ten."""
+    steps = solved[1][4]
+    assert np.quantile(steps, 0.9) <= 20
+
+
+def test_every_iterate_is_feasible_and_none_is_worse_than_the_last():
+    with jax.enable_x64(True):
+        A, b, c, lower, upper, start = map(jnp.asarray, problems(1))
+        fn = lambda y, args: (residuals(y, args), None)
+        energy = lambda y: 0.5 * jnp.sum(jax.vmap(residuals)(y, (A, b, c)) ** 2, axis=1)
+
+        @jax.jit
+        @jax.vmap
+        def advance(y, state, args, lower, upper):
+            return SOLVER.step(fn, y, args, {"lower": lower, "upper": upper}, state, frozenset())[:2]
+
+        y, state = start, jax.vmap(lambda y: SOLVER.init(fn, y, None, {}, None, None, frozenset()))(start)
+        last = energy(y)
+        for _ in range(40):
+            y, state = advance(y, state, (A, b, c), lower, upper)
+            assert np.all((y >= lower) & (y <= upper))
+            # The solver adds the squares in another order.
+            assert np.all(energy(y) <= last * (1 + 1e-15 * NUM_RESIDUALS))
+            last = energy(y)
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_step_stops_at_a_bound_and_the_others_answer():
+    """Without damping, and with one bound to meet, it is the least of a quadratic form within the box."""
+    rng = np.random.default_rng(6)
+    J, r = rng.normal(size=(8, 4)), rng.normal(size=8)
+    free_step = -np.linalg.lstsq(J, r)[0]
+    lower, upper = np.full(4, -9.0), np.full(4, 9.0)
+    upper[0], lower[0] = max(0.3 * free_step[0], 0.0), min(0.3 * free_step[0], 0.0)
+    N = jnp.asarray(J.T @ J)
+    model = Model(jnp.zeros(4), jnp.asarray(r), jnp.asarray(J.T @ r), lambda step: N @ step, jnp.asarray(0.1))
+
+    def solve(rest, free):
+        masked = jnp.where(free[:, None] & free, N, jnp.diag(jnp.where(free, 0.0, 1.0)))
+        return -jnp.linalg.solve(masked, jnp.where(free, rest, 0.0))
+
+    step, leads = boxed(solve, model, jnp.ones(4, bool), (jnp.asarray(lower), jnp.asarray(upper)))
+    assert bool(leads)
+    assert_allclose(step, scipy.optimize.lsq_linear(J, -r, (lower, upper), tol=1e-14).x, atol=1e-8)
+    assert np.abs(step[1:] - free_step[1:]).max() > 0.01
 
 
 @pytest.mark.usefixtures("x64")
@@ -133,6 +187,12 @@ def test_contradictory_bounds_are_named():
         lambda y, args: y - 3, SOLVER, jnp.ones(2), None, {"lower": 2.0, "upper": 1.0}, throw=False
     )
     assert found.result != optimistix.RESULTS.successful
+
+
+def test_bounds_that_are_constants_may_be_used_in_a_compiled_function():
+    lower, upper = jnp.zeros(2), jnp.ones(2)
+    found = jax.jit(lambda y: bounds_of({"lower": lower, "upper": upper}, y))(jnp.ones(2))
+    assert_allclose(found[1], upper)
 
 
 def test_a_residual_of_nan_ends_with_the_start():

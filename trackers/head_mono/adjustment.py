@@ -131,10 +131,10 @@ def adjusted(
     past = state.past
     if past is not None and options.past == "marginalised":
         past = joined(past, left_behind(stranger, face, state.window, state.person, place, options))
-    state = state._replace(window=_with(state.window, frame, place), past=past, num_adjusted=state.num_adjusted + 1)
     start = state.person
     if options.is_published:
         start = start._replace(identity=_average(state))
+    state = state._replace(window=_with(state.window, frame, place), past=past, num_adjusted=state.num_adjusted + 1)
     bundle, info = fitted(stranger, face, rig, state, state.window.bundle(start), options)
     identity = jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan)
     bundle = bundle._replace(person=bundle.person._replace(identity=identity))
