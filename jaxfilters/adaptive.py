@@ -15,11 +15,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import diffusion, weights
+from jaxfilters.differentiable_resampling import EnsembleScheme
 from jaxfilters.diffusion import DiffusionFit
 from jaxfilters.filter import Filter
 from jaxfilters.layered import EnsembleLogLikelihood, Layers, in_one_group, layered_update
 from jaxfilters.linalg import safe_sqrt
-from jaxfilters.particle import ParticleInfo, check_ensemble, resample, reweight, sample_ensemble, untempered
+from jaxfilters.noise import standard_normal
+from jaxfilters.particle import ParticleInfo, check_ensemble, resample, reweight, untempered
+from jaxfilters.priors import sample_ensemble
 from jaxfilters.resampling import systematic
 from jaxfilters.typing import AnyKey, ResamplingScheme, SamplePrior, as_pytree
 
@@ -63,7 +66,7 @@ class AdaptiveParticles:
     mode_distance: float | Float[Array, ""]
     layers: Layers | None
     num_particles: int = field(metadata={"static": True})
-    scheme: ResamplingScheme = field(metadata={"static": True})
+    scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
 
 
 def adaptive_particle_filter(
@@ -79,7 +82,7 @@ def adaptive_particle_filter(
     learn: Callable[[DiffusionFit, Array, Array], DiffusionFit] = diffusion.update,
     layers: Layers | None = None,
     mode_distance: float = 2.0,
-    scheme: ResamplingScheme = systematic,
+    scheme: ResamplingScheme | EnsembleScheme = systematic,
 ) -> Filter:
     r"""Particle filter for a vector that coasts with the velocity of its estimate, in noise that adapts to it.
 
@@ -101,7 +104,7 @@ def adaptive_particle_filter(
         learn: `diffusion.update`, `diffusion.keep`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
         layers: Weighs every observation in two stages; `None` in one.
         mode_distance: For `mean_around_mode`.
-        scheme: Resampling scheme.
+        scheme: Resampling scheme; of `jaxfilters.differentiable_resampling`, `soft`, and without layers `transport`.
 
     Raises:
         ValueError: If `num_particles < 1`, a scale, a distance or a limit is out of range, or sizes do not agree.
@@ -154,7 +157,7 @@ def _predict(model: AdaptiveParticles, key: AnyKey, state: AdaptiveState, contro
     changing = tau * diffusion.spread(state.fit, state.velocity, low=model.low, high=model.high)
     spread = jnp.concatenate([changing, safe_sqrt(tau) * model.steady_std])
     drift = jnp.pad(tau * state.velocity, (0, model.steady_std.shape[0]))
-    noise = jax.random.normal(noise_key, particles.shape, particles.dtype)
+    noise = standard_normal(noise_key, particles.shape, particles.dtype)
     displacement = drift[:, None] + spread[:, None] * noise
     if model.layers is not None:
         displacement = in_one_group(displacement, model.layers.groups)

@@ -3,8 +3,13 @@ r"""Resampling that passes derivatives in other ways: soft, and by optimal trans
 The schemes of `jaxfilters.resampling` choose ancestors, which have no derivative; a particle filter that uses them
 keeps the derivative of the weights instead, which makes that of its log evidence a consistent estimate of the score
 (A. Ścibior and F. Wood, "Differentiable particle filtering without modifying the forward pass", 2021). It is the
-default. What is here changes the forward pass for a derivative with less noise and more bias. Pass it as the `scheme`
-of `bootstrap`; `docs/gradients.md` has measured numbers and says when to use which.
+default. What is here changes the forward pass for a derivative with less noise and more bias. `docs/gradients.md` has
+measured numbers and says when to use which.
+
+Pass it as the `scheme` of a filter. `soft` chooses ancestors and goes wherever a scheme goes. `transport` makes
+averages of particles: for `bootstrap`, and `adaptive_particle_filter` without layers, whose particles are vectors. The
+average of several particles' Gaussians is no particle's Gaussian, hence not for Rao-Blackwellized filters; and an
+average has no ancestor, hence not within `fixed_lag`.
 """
 
 import math

@@ -18,6 +18,7 @@ from jaxfilters import kalman, linalg
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian, GaussianRoot
 from jaxfilters.kalman import Arithmetic, KalmanInfo, factor, info
+from jaxfilters.last_axis import batch_last
 from jaxfilters.linearize import Linearization, Linearize, taylor
 from jaxfilters.manifold import Belief, Manifold, dimension, euclidean, hashable, increments, moved, settle
 from jaxfilters.typing import AnyKey, as_pytree
@@ -120,6 +121,11 @@ def _init(model: Extended, key: AnyKey) -> Belief:
 
 def _predict(model: Extended, key: AnyKey, belief: Belief, control: PyTree) -> Belief:
     del key
+    ahead = _ahead if dimension(belief) > factor.UNROLLED else batch_last(_ahead)
+    return ahead(model, belief, control)
+
+
+def _ahead(model: Extended, belief: Belief, control: PyTree) -> Belief:
     origin, step = linear_transition(model, belief, control)
     noise = noise_of_step(model, control)
     ahead = model.arithmetic.predict(increments(belief), step.F, noise, step.value, step.lost_root)
@@ -129,6 +135,13 @@ def _predict(model: Extended, key: AnyKey, belief: Belief, control: PyTree) -> B
 
 def _update(model: Extended, key: AnyKey, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
     del key
+    y = observation.y if isinstance(observation, Measured) else observation
+    small = max(dimension(belief), jnp.size(y)) <= factor.UNROLLED
+    given = batch_last(_given) if small else _given
+    return given(model, belief, observation)
+
+
+def _given(model: Extended, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
     return condition(
         belief,
         observation,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from jaxfilters.differentiable_resampling import Transport
 from jaxfilters.extended import Extended, linear_transition, noise_of_step
 from jaxfilters.filter import Filter
 from jaxfilters.manifold import Belief, increments, seen_from, settle
@@ -26,7 +27,7 @@ class LineageState(NamedTuple):
 
     @property
     def delayed(self) -> PyTree:
-        """Particles `lag` frames ago, leaves `(..., n)`; their weights are `inner.log_weights`."""
+        """Particles `lag` frames ago, leaves `(..., n)`; their weights are those of the particles now."""
         return jax.tree.map(lambda leaf: leaf[0], self.window)
 
 
@@ -56,16 +57,20 @@ class FixedLag:
 
 
 def fixed_lag(inner: Filter, lag: int) -> Filter:
-    """Fixed-lag smoother by lineages of any particle filter whose state has `particles`, weights and `ancestors`.
+    """Fixed-lag smoother by lineages of any particle filter whose state has `particles`, `log_weights` and `ancestors`.
 
-    The shorter the lag, the more different particles are left; five to fifty frames are usual (G. Kitagawa, "Monte
-    Carlo filter and smoother for non-Gaussian nonlinear state space models", 1996, section 4). The state is a
+    So have those of `bootstrap`, `rao_blackwell` and `adaptive_particle_filter`; of `guided`, the state's `ensemble`
+    has them. The shorter the lag, the more different particles are left; five to fifty frames are usual (G. Kitagawa,
+    "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models", 1996, section 4). The state is a
     `LineageState`.
 
     Raises:
-        ValueError: If `lag < 1`, or, when it runs, if the state of `inner` is another one.
+        ValueError: If `lag < 1`; if `inner` resamples by transport, whose particles are averages and have no ancestors;
+            or, when it runs, if the state of `inner` is another one.
     """
     _check(lag)
+    if any(isinstance(leaf, Transport) for leaf in _schemes(inner.params)):
+        raise ValueError("inner must choose ancestors when it resamples; particles moved by transport have none.")
     return Filter(FixedLag(inner, None, lag), _begin_lineages, _predict_lineages, _update_lineages)
 
 
@@ -93,22 +98,47 @@ def _check(lag: int) -> None:
 
 def _begin_lineages(model: FixedLag, key: AnyKey) -> LineageState:
     inner = model.inner.init(model.inner.params, key)
-    if not all(hasattr(inner, name) for name in ("particles", "log_weights", "ancestors")):
-        raise ValueError(f"inner must have particles, log_weights and ancestors in its state; got {type(inner)}.")
-    return LineageState(inner, _repeated(inner.particles, model.lag + 1))
+    return LineageState(inner, _repeated(_ensemble(inner).particles, model.lag + 1))
 
 
 def _predict_lineages(model: FixedLag, key: AnyKey, state: LineageState, control: PyTree) -> LineageState:
     inner = model.inner.predict(model.inner.params, key, state.inner, control)
-    follow = lambda leaf: jnp.take(leaf, inner.ancestors, axis=-1, mode="clip")
-    return LineageState(inner, _pushed(jax.tree.map(follow, state.window), inner.particles))
+    ensemble = _ensemble(inner)
+    return LineageState(inner, _pushed(_followed(state.window, ensemble.ancestors), ensemble.particles))
 
 
 def _update_lineages(
     model: FixedLag, key: AnyKey, state: LineageState, observation: PyTree
 ) -> tuple[LineageState, PyTree]:
+    before = _ensemble(state.inner).ancestors
     inner, info = model.inner.update(model.inner.params, key, state.inner, observation)
-    return LineageState(inner, _renewed(state.window, inner.particles)), info
+    ensemble = _ensemble(inner)
+
+    def children_of_the_same() -> PyTree:
+        # Layered filters resample in their update, too: any sibling has the same past.
+        child = jnp.zeros_like(before).at[before].set(jnp.arange(before.size, dtype=before.dtype))
+        return _followed(state.window, child[ensemble.ancestors])
+
+    stayed = jnp.all(ensemble.ancestors == before)
+    window = jax.lax.cond(stayed, lambda: state.window, children_of_the_same)
+    return LineageState(inner, _renewed(window, ensemble.particles)), info
+
+
+def _ensemble(state: Any) -> Any:
+    """What holds the particles of a filter's state."""
+    ensemble = getattr(state, "ensemble", state)
+    if not all(hasattr(ensemble, name) for name in ("particles", "log_weights", "ancestors")):
+        raise ValueError(f"inner must have particles, log_weights and ancestors in its state; got {type(state)}.")
+    return ensemble
+
+
+def _schemes(params: Any) -> list:
+    """How a filter resamples, or the one inside it."""
+    return [getattr(part, "scheme", None) for part in (params, getattr(params, "marginal", None))]
+
+
+def _followed(window: PyTree, ancestors: Int[Array, " n"]) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), window)
 
 
 def _begin_beliefs(model: FixedLag, key: AnyKey) -> GaussianLagState:

@@ -20,6 +20,7 @@ from jaxfilters import marginal
 from jaxfilters.filter import Filter
 from jaxfilters.linalg import cholesky, matmul, solve_triangular
 from jaxfilters.marginal import MarginalState, Move, RaoBlackwell
+from jaxfilters.noise import standard_normal
 from jaxfilters.particle import ParticleInfo
 from jaxfilters.proposals import exact
 from jaxfilters.typing import AnyKey, as_pytree
@@ -139,7 +140,7 @@ def draw(
     is $(I + L^T \Lambda L)^{-1}$: float32 holds however unequal the units of the state are.
     """
     choice_key, noise_key = jax.random.split(key)
-    noise = jax.random.normal(noise_key, towards.shape)
+    noise = standard_normal(noise_key, towards.shape)
     root = cholesky(spread)
     precision_root = cholesky(jnp.eye(root.shape[0], dtype=root.dtype) + root.T @ information @ root)
 

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
+from jaxfilters.differentiable_resampling import EnsembleScheme, Transport
+from jaxfilters.noise import standard_normal
 from jaxfilters.particle import ParticleInfo, resample, reweight, untempered
 from jaxfilters.resampling import systematic
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, as_pytree
@@ -104,7 +106,7 @@ def layered_update(
     jitter: Float[Array, " d"],
     *,
     stage_weights: StageWeights = counted_twice,
-    scheme: ResamplingScheme = systematic,
+    scheme: ResamplingScheme | EnsembleScheme = systematic,
 ) -> tuple[Float[Array, "d n"], Float[Array, " n"], Int32[Array, " n"], ParticleInfo]:
     """Particles, log weights and ancestors after weighing, resampling, fine moves and weighing again.
 
@@ -121,14 +123,19 @@ def layered_update(
         jitter: Standard deviations of the fine moves.
         stage_weights: How the second stage weighs: `counted_twice` or `counted_once`.
         scheme: Resampling scheme between the stages.
+
+    Raises:
+        ValueError: If `scheme` is transport: what it makes are averages, of which no likelihood was evaluated.
     """
+    if isinstance(scheme, Transport):
+        raise ValueError("scheme must choose ancestors between the stages; transport averages particles.")
     resample_key, noise_key = jax.random.split(key)
     first_likelihood = log_likelihood(particles)
     log_weights, first = reweight(log_weights, first_likelihood, ancestors, untempered)
     (particles, first_likelihood), log_weights, chosen = resample(
         resample_key, (particles, first_likelihood), log_weights, scheme, 1.0
     )
-    noise = jax.random.normal(noise_key, particles.shape, particles.dtype)
+    noise = standard_normal(noise_key, particles.shape, particles.dtype)
     particles = particles + jitter[:, None] * noise
     second_likelihood = stage_weights(log_likelihood(particles), first_likelihood)
     log_weights, second = reweight(log_weights, second_likelihood, ancestors, untempered)

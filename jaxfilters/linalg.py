@@ -1,7 +1,7 @@
 """Small dense linear algebra that survives zero variances: triangularisation, Cholesky factors, triangular solves.
 
-Up to 8 rows everything but `tria` is plain algebra on the elements, so that `vmap(in_axes=-1, out_axes=-1)` runs it
-as vector arithmetic over an ensemble, ten times faster on a CPU than one LAPACK call each; above that LAPACK is faster.
+Up to 8 rows everything but `tria` is plain algebra on the elements, which `last_axis.vmap` runs as vector arithmetic
+over an ensemble, ten times faster on a CPU than one LAPACK call each; above that LAPACK is faster.
 """
 
 from functools import reduce
@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
 from jaxtyping import Array, Float
+
+from jaxfilters.materialize import materialized
 
 _UNROLLED = 8
 
@@ -30,7 +32,7 @@ def matmul(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"
     """Matrix product in full precision on every device."""
     if max(*a.shape, *b.shape) > _UNROLLED or a.shape[1] == 0:
         return jnp.matmul(a, b, precision="highest")
-    return reduce(add, (a[:, i, None] * b[None, i, :] for i in range(a.shape[1])))
+    return materialized(reduce(add, (a[:, i, None] * b[None, i, :] for i in range(a.shape[1]))))
 
 
 def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -54,7 +56,7 @@ def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
         scale = jnp.where(fixed, 0.0, 1 / jnp.where(fixed, 1.0, L[j][j]))
         for i in range(j + 1, n):
             L[i][j] = (S[i, j] - sum(L[i][k] * L[j][k] for k in range(j))) * scale
-    return jnp.stack([jnp.stack(row) for row in L])
+    return materialized(jnp.stack([jnp.stack(row) for row in L]))
 
 
 def solve_triangular(
@@ -62,19 +64,20 @@ def solve_triangular(
 ) -> Float[Array, " n"] | Float[Array, "n m"]:
     """`x` with `L x = b`, or `L^T x = b`, for a lower L; 0 for the unknowns whose diagonal element is 0."""
     n = L.shape[0]
-    diagonal = jnp.diagonal(L)
-    fixed = diagonal == 0
     if n > _UNROLLED:
+        fixed = jnp.diagonal(L) == 0
         rest = jnp.where(fixed.reshape((n,) + (1,) * (b.ndim - 1)), 0.0, b)
         # A fixed unknown is zero: its column must not matter, nor its row.
         square = jnp.where(fixed[:, None] | fixed, jnp.eye(n, dtype=L.dtype), L)
         return lapack_solve_triangular(square, rest, lower=True, trans=1 if transpose else 0)
+    diagonal = jnp.stack([L[i, i] for i in range(n)])
+    fixed = diagonal == 0
     scale = jnp.where(fixed, 0.0, 1 / jnp.where(fixed, 1.0, diagonal))
     x = [jnp.zeros(b.shape[1:], b.dtype)] * n
     for i in reversed(range(n)) if transpose else range(n):
         known = range(i + 1, n) if transpose else range(i)
         x[i] = (b[i] - sum((L[k, i] if transpose else L[i, k]) * x[k] for k in known)) * scale[i]
-    return jnp.stack(x)
+    return materialized(jnp.stack(x))
 
 
 def tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:

@@ -17,19 +17,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32, PyTree
 
-from jaxfilters import kalman, weights
+from jaxfilters import kalman, last_axis, weights
+from jaxfilters.differentiable_resampling import EnsembleScheme, Transport
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
+from jaxfilters.kalman import factor
+from jaxfilters.last_axis import batch_last
 from jaxfilters.linalg import cholesky, matmul, solve_triangular
+from jaxfilters.materialize import materialized
 from jaxfilters.particle import (
     ParticleInfo,
     StandardNormal,
     check_ensemble,
     resample,
     reweight,
-    sample_ensemble,
     untempered,
 )
+from jaxfilters.priors import sample_ensemble
 from jaxfilters.proposals import Proposal, exact
 from jaxfilters.resampling import systematic
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree
@@ -85,7 +89,7 @@ class RaoBlackwell:
     num_particles: int = field(metadata={"static": True})
     noise: StandardNormal = field(metadata={"static": True})
     proposal: Proposal = field(metadata={"static": True})
-    scheme: ResamplingScheme = field(metadata={"static": True})
+    scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
     covariance_axis: int | None = field(metadata={"static": True})
     """Ensemble axis of the covariance: -1, or `None` where it is shared."""
 
@@ -106,7 +110,7 @@ def rao_blackwell(
     observe: Callable[[PyTree], LinearObservation] | None = None,
     retract: Callable[[PyTree, Array], PyTree] = add,
     proposal: Proposal = exact,
-    scheme: ResamplingScheme = systematic,
+    scheme: ResamplingScheme | EnsembleScheme = systematic,
     ess_threshold: float = 0.5,
     temper: Temper | None = None,
 ) -> Filter:
@@ -123,14 +127,17 @@ def rao_blackwell(
         retract: `(x, delta) -> x`, how an increment moves the nonlinear state; addition by default.
         proposal: How the nonlinear state is drawn: `exact` (default), `paper` or `paper_corrected` of
             `jaxfilters.proposals`.
-        scheme: Resampling scheme.
+        scheme: Resampling scheme; of `jaxfilters.differentiable_resampling`, `soft`.
         ess_threshold: Resample before a prediction if the effective sample size is below this share of N.
         temper: Flattens log-likelihoods, e.g. `TemperToShare(0.2)`.
 
     Raises:
-        ValueError: If an argument is out of range, or not exactly one of `log_likelihood` and `observe` is given.
+        ValueError: If an argument is out of range, not exactly one of `log_likelihood` and `observe` is given, or
+            `scheme` is transport, which would average Gaussians of different particles.
     """
     check_ensemble(num_particles, ess_threshold)
+    if isinstance(scheme, Transport):
+        raise ValueError("scheme must choose ancestors: transport averages particles, and so their Gaussians.")
     return Filter(
         RaoBlackwell(
             as_pytree(sample_prior),
@@ -189,7 +196,7 @@ def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics)
     spread = matmul(ahead, step.A_n.T) + step.Q_n
     root = cholesky(spread)
     gain = matmul(step.A_l, solve_triangular(root, solve_triangular(root, ahead), transpose=True).T)
-    kept = step.A_l - matmul(gain, step.A_n)
+    kept = materialized(step.A_l - matmul(gain, step.A_n))
     conditioned = matmul(matmul(kept, covariance), kept.T) + matmul(matmul(gain, step.Q_n), gain.T)
     return spread, gain, conditioned + step.Q_l
 
@@ -231,9 +238,13 @@ def move(model: RaoBlackwell, key: AnyKey, state: MarginalState, control: PyTree
     (particles, linear_mean, covariance), log_weights, ancestors = resample(
         resample_key, carried, state.log_weights, model.scheme, model.ess_threshold
     )
-    covariance = state.covariance if axis is None else covariance
+    # Gathered in rows of one particle each; to be turned round once.
+    linear_mean = materialized(linear_mean)
+    covariance = state.covariance if axis is None else materialized(covariance)
     step_axes = MixedDynamics._make((-1, axis, axis, -1, axis, axis))
-    steps = jax.vmap(model.dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
+    small = max(state.linear_mean.shape[0], *state.noise.shape[:-1]) <= factor.UNROLLED
+    mapped = last_axis.vmap if small else jax.vmap
+    steps = mapped(model.dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
 
     def advance(step: MixedDynamics, mean: Array, covariance: Array, noise: Array) -> tuple:
         spread, gain, covariance = condition_on_increment(covariance, step)
@@ -243,7 +254,7 @@ def move(model: RaoBlackwell, key: AnyKey, state: MarginalState, control: PyTree
         x = model.retract(step.f_n, drift + delta)
         return x, mean, covariance, log_correction, Move(step.f_n, drift, delta, spread, gain)
 
-    particles, linear_mean, covariance, log_correction, moved = jax.vmap(
+    particles, linear_mean, covariance, log_correction, moved = mapped(
         advance, in_axes=(step_axes, -1, axis, -1), out_axes=(-1, -1, axis, -1, Move._make((-1, -1, -1, axis, axis)))
     )(steps, linear_mean, covariance, state.noise)
     noise = model.noise(noise_key, model.num_particles)
@@ -266,7 +277,10 @@ def weigh(model: RaoBlackwell, state: MarginalState, observation: PyTree) -> tup
         return belief.mean, belief.covariance, log_likelihood
 
     axis = model.covariance_axis
-    linear_mean, covariance, log_likelihood = jax.vmap(condition, in_axes=(-1, axis, -1), out_axes=(-1, axis, -1))(
+    # The likelihood of an image is not arithmetic on small arrays.
+    small = sum(map(jnp.size, jax.tree.leaves(observation))) <= factor.UNROLLED**2
+    mapped = last_axis.vmap if small else jax.vmap
+    linear_mean, covariance, log_likelihood = mapped(condition, in_axes=(-1, axis, -1), out_axes=(-1, axis, -1))(
         state.linear_mean, state.covariance, state.particles
     )
     log_weights, info = reweight(state.log_weights, log_likelihood, state.ancestors, model.temper)
@@ -287,5 +301,10 @@ def _unseen(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTre
 
 def _seen(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
     h, C, R = observe(x)
-    found = kalman.joseph.condition(belief.covariance, C, R, y - h - C @ belief.mean)
+    given = batch_last(_given) if max(C.shape) <= factor.UNROLLED else _given
+    return given(belief, y - h, C, R)
+
+
+def _given(belief: Gaussian, read: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
+    found = kalman.joseph.condition(belief.covariance, C, R, read - C @ belief.mean)
     return Gaussian(belief.mean + found.shift, found.covariance), found.log_density

@@ -12,6 +12,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.marginal import MixedDynamics, rao_blackwell, rao_blackwell_shared
 from jaxfilters.particle import StandardNormal, bootstrap
+from jaxfilters.priors import from_noise
 from jaxfilters.typing import AnyKey
 
 DT = 0.1
@@ -32,7 +33,11 @@ class Drift:
 
     def sample_prior(self, key: AnyKey) -> Float[Array, "10"]:
         """A state before the first reading."""
-        return 0.5 * jax.random.normal(key, (2 * POSE,))
+        return self.start(jax.random.normal(key, (2 * POSE,)))
+
+    def start(self, noise: Float[Array, "10"]) -> Float[Array, "10"]:
+        """The same from standard normal numbers."""
+        return 0.5 * noise
 
     def move(self, noise: Float[Array, "10"], x: Float[Array, "10"], control: None = None) -> Float[Array, "10"]:
         """A tenth of a second later."""
@@ -70,13 +75,14 @@ def drift(seed: int, num_steps: int) -> DriftProblem:
 
 
 def plain(model: Drift, num_particles: int) -> Filter:
-    """This library's particle filter of the model, resampling in every step."""
+    """This library's particle filter of the model, resampling in every step; it draws all particles at once."""
+    noise = StandardNormal(2 * POSE)
     return bootstrap(
-        model.sample_prior,
+        from_noise(model.start, noise),
         model.move,
         model.log_likelihood,
         num_particles=num_particles,
-        noise=StandardNormal(2 * POSE),
+        noise=noise,
         ess_threshold=1.0,
     )
 

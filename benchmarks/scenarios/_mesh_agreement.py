@@ -65,7 +65,7 @@ def turns(meshes: Float[np.ndarray, "t V 3"]) -> Rotation:
 def compared(one: Rotation, other: Rotation) -> dict[str, Metric]:
     """How two courses of rotations agree, each about its own mean; angles about the axes of the camera."""
     first, second = (np.degrees((turn * turn.mean().inv()).as_euler("ZYX")) for turn in (one, other))
-    metrics = {}
+    metrics: dict[str, Metric] = {}
     for i, axis in enumerate(AXES):
         apart = first[:, i] - second[:, i]
         metrics |= {

@@ -132,7 +132,7 @@ def errors_of(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
     """Errors, ratios to the thesis and coverage of one tracker."""
     errors = over_users(runs, lambda run: run.means[AXIS_ORDER])
     inside = over_users(runs, lambda run: run.coverage[AXIS_ORDER]).mean
-    metrics = {}
+    metrics: dict[str, Metric] = {}
     for i, (axis, unit) in enumerate(zip(AXES, AXIS_UNITS, strict=True)):
         mean, thesis = float(errors.mean[i]), THESIS[name[0]][i]
         metrics |= {

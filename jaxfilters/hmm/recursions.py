@@ -4,8 +4,8 @@ Probabilities inside a frame, logarithms between frames: with $e_t(j) = \log p(y
 
 $$\log \alpha_t(j) = \log \sum_i \alpha_{t-1}(i) A_{ij} + e_t(j)$$
 
-where the sum is a matrix product and $\alpha$ is shifted by its largest element anew in every frame (L. Rabiner, "A
-tutorial on hidden Markov models", Proc. IEEE 77(2), 1989, equations 19-35). A state that is 147 nats behind the best
+where the sum is a matrix product and $\alpha$ is shifted by about its largest element anew in every frame (L. Rabiner,
+"A tutorial on hidden Markov models", Proc. IEEE 77(2), 1989, equations 19-35). A state that is 147 nats behind the best
 one in float32, 1000 in float64, counts as impossible; `viterbi` has no such limit.
 
 `log_likelihoods` are `(T, Q)`, or `(T, Q, n)` for n sequences: with the sequences last this is vector arithmetic, a
@@ -14,6 +14,8 @@ of each sequence there are; frames after those are padding and contribute nothin
 the model cannot produce has the log-likelihood `-inf`, and zero for posteriors and derivatives.
 """
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +25,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxfilters.hmm.model import HiddenMarkovModel
 
 _UNROLLED = 16
+_BLOCK = 16
+"""Frames between two additions to the log-likelihood: for what is done for many frames at once, vectors are longer."""
 Lengths = Int[Array, "*batch"] | None
 
 
@@ -72,7 +76,7 @@ def log_likelihood(
 @jax.jit
 def forward(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"], lengths: Lengths = None) -> Filtered:
     """Probabilities of the states given the frames so far."""
-    total, (scaled, shifts) = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths, store=True)
+    total, scaled, shifts = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths)
     inside = _inside(log_likelihoods, lengths)
     sums = jnp.sum(scaled, axis=1)
     before = jnp.concatenate([jnp.ones_like(sums[:1]), sums[:-1]])
@@ -110,7 +114,7 @@ def posterior(
 ) -> Posterior:
     """Probabilities of the states given the whole sequence, and how often each transition is expected."""
     A = jnp.exp(model.log_transition)
-    total, (scaled, _) = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths, store=True)
+    total, scaled, _ = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths)
     inside = _inside(log_likelihoods, lengths)
     states, ratios = _smoothed(A, scaled, inside)
     return Posterior(total, states, _expected_transitions(A, scaled, ratios))
@@ -163,11 +167,29 @@ def best_origin(
 
 @jax.custom_vjp
 def _log_likelihood(log_initial, log_transition, log_likelihoods, lengths):
-    return _forward(log_initial, log_transition, log_likelihoods, lengths, store=False)[0]
+    step = _step(log_initial, log_transition, log_likelihoods)
+    num_frames, batch = len(log_likelihoods), log_likelihoods.shape[2:]
+    inside = None if lengths is None else _inside(log_likelihoods, lengths)
+
+    def block(carry: tuple, first: Any, count: int = _BLOCK) -> tuple[tuple, None]:
+        scaled, total = carry
+        here = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, count)
+        frames, is_inside = _usable(here(log_likelihoods)), jax.tree.map(here, inside)
+        scaled, shifts = jax.lax.scan(step, scaled, (frames, jnp.arange(count) + first == 0, is_inside))
+        return (scaled, _plus(total, jnp.sum(shifts, axis=0))), None
+
+    zero = jnp.zeros(batch, log_likelihoods.dtype)
+    carry = (_even(log_initial, log_likelihoods), (zero, zero))
+    whole = num_frames - num_frames % _BLOCK
+    if whole:
+        carry, _ = jax.lax.scan(block, carry, jnp.arange(0, whole, _BLOCK))
+    if whole < num_frames:
+        carry, _ = block(carry, whole, num_frames - whole)
+    return _total(*carry, log_likelihoods, lengths)
 
 
 def _log_likelihood_forward(log_initial, log_transition, log_likelihoods, lengths):
-    total, (scaled, _) = _forward(log_initial, log_transition, log_likelihoods, lengths, store=True)
+    total, scaled, _ = _forward(log_initial, log_transition, log_likelihoods, lengths)
     return total, (log_transition, scaled, _inside(log_likelihoods, lengths))
 
 
@@ -184,35 +206,71 @@ def _log_likelihood_backward(residuals, cotangent):
 _log_likelihood.defvjp(_log_likelihood_forward, _log_likelihood_backward)
 
 
-def _forward(log_initial, log_transition, log_likelihoods, lengths, *, store: bool) -> tuple[Array, Any]:
+def _forward(log_initial, log_transition, log_likelihoods, lengths) -> tuple[Array, Array, Array]:
     """Log p(y_1:T); and of every frame the probabilities, scaled, and by how many nats."""
-    batch = log_likelihoods.shape[2:]
-    A_transposed = jnp.exp(log_transition).T
-    initial = jnp.exp(_column(log_initial, log_likelihoods))
+    step = _step(log_initial, log_transition, log_likelihoods)
     inside = None if lengths is None else _inside(log_likelihoods, lengths)
 
-    def step(carry: tuple, inputs: tuple) -> tuple[tuple, Any]:
-        scaled, total, lost = carry
+    def accumulate(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+        scaled, total = carry
+        frame, *rest = inputs
+        scaled, shift = step(scaled, (_usable(frame), *rest))
+        return (scaled, _plus(total, shift)), (scaled, shift)
+
+    zero = jnp.zeros(log_likelihoods.shape[2:], log_likelihoods.dtype)
+    start = (_even(log_initial, log_likelihoods), (zero, zero))
+    is_first = jnp.arange(len(log_likelihoods)) == 0
+    carry, stored = jax.lax.scan(accumulate, start, (log_likelihoods, is_first, inside))
+    return _total(*carry, log_likelihoods, lengths), *stored
+
+
+def _step(log_initial, log_transition, log_likelihoods) -> Callable:
+    """How probabilities and their scale go from one frame to the next, with usable log-likelihoods."""
+    A_transposed = jnp.exp(log_transition).T
+    initial = jnp.exp(_column(log_initial, log_likelihoods))
+
+    def step(scaled: Array, inputs: tuple) -> tuple[Array, Array]:
         frame, is_first, is_inside = inputs
         # The first frame in the loop, too: a loop over the others would copy them all.
         predicted = jnp.where(is_first, initial, _matmul(A_transposed, scaled))
-        after, shift = _scaled(jnp.log(predicted) + _usable(frame))
-        if is_inside is not None:
-            after, shift = jnp.where(is_inside, after, scaled), jnp.where(is_inside, shift, 0.0)
-        # Compensated: over 10^4 frames a plain float32 sum is off by 0.05 nats.
-        term = shift - lost
-        moved = total + term
-        return (after, moved, (moved - total) - term), ((after, shift) if store else None)
+        # Near enough to choose a scale, and much cheaper than logarithms.
+        peak = jnp.max(jnp.where(predicted > 0, frame + _rough_log(predicted), -jnp.inf), axis=0)
+        shift = jax.lax.stop_gradient(_finite(peak)) - _headroom(predicted)
+        # The factors may be at opposite ends of the range of floats, the product in the middle: half a step at a time.
+        # Only where the state is impossible is the other factor still larger.
+        largest = _headroom(predicted) - math.log(jnp.finfo(predicted.dtype).tiny) + 1
+        root = jnp.exp(0.5 * jnp.minimum(frame - shift, largest))
+        after = predicted * root * root
+        if is_inside is None:
+            return after, shift
+        return jnp.where(is_inside, after, scaled), jnp.where(is_inside, shift, 0.0)
 
-    zero = jnp.zeros(batch, log_likelihoods.dtype)
+    return step
+
+
+def _rough_log(x: Array) -> Array:
+    """Logarithm of positive numbers to 0.06: the exponent, and the mantissa on straight lines between powers of 2."""
+    kind = jnp.finfo(x.dtype)
+    dropped = max(0, kind.bits - 32)
+    bits = jax.lax.bitcast_convert_type(x, f"int{kind.bits}") >> dropped
+    return math.log(2) * (bits.astype(jnp.int32).astype(x.dtype) * 2.0 ** (dropped - kind.nmant) - (kind.maxexp - 1))
+
+
+def _even(log_initial: Array, log_likelihoods: Array) -> Array:
     # Without a frame the probability of what was observed is one.
-    start = jnp.full((len(log_initial), *batch), 1 / len(log_initial), log_likelihoods.dtype)
-    is_first = jnp.arange(len(log_likelihoods)) == 0
-    (scaled, total, _), stored = jax.lax.scan(step, (start, zero, zero), (log_likelihoods, is_first, inside))
-    total = total + jnp.log(jnp.sum(scaled, axis=0))
-    if inside is not None:
-        total = jnp.where(lengths > 0, total, 0.0)
-    return total if len(log_likelihoods) else zero, stored
+    return jnp.full((len(log_initial), *log_likelihoods.shape[2:]), 1 / len(log_initial), log_likelihoods.dtype)
+
+
+def _plus(total: tuple[Array, Array], term: Array) -> tuple[Array, Array]:
+    """A sum, and what it has lost: over 10^4 frames a plain float32 sum is off by 0.05 nats."""
+    so_far, lost = total
+    term = term - lost
+    return so_far + term, (so_far + term - so_far) - term
+
+
+def _total(scaled: Array, shifts: tuple[Array, Array], log_likelihoods: Array, lengths: Array | None) -> Array:
+    total = shifts[0] + jnp.log(jnp.sum(scaled, axis=0)) if len(log_likelihoods) else shifts[0]
+    return total if lengths is None else jnp.where(lengths > 0, total, 0.0)
 
 
 def _smoothed(A: Array, scaled: Array, inside: Array) -> tuple[Array, Array]:
@@ -246,8 +304,12 @@ def _expected_transitions(A: Array, scaled: Array, ratios: Array) -> Array:
 def _scaled(log_values: Array) -> tuple[Array, Array]:
     """`exp(log_values - shift)` whose largest element has room above and below, and the shift; zeros if all are."""
     peak = jnp.max(log_values, axis=0)
-    shift = jnp.where(peak > -jnp.inf, peak, 0.0) - _headroom(log_values)
+    shift = _finite(peak) - _headroom(log_values)
     return jnp.exp(log_values - shift), shift
+
+
+def _finite(peak: Array) -> Array:
+    return jnp.where(peak > -jnp.inf, peak, 0.0)
 
 
 def _headroom(values: Array) -> float:

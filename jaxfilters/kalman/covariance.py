@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxfilters import linalg
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.kalman import factor, info
+from jaxfilters.materialize import materialized
 
 
 def predict(
@@ -99,7 +100,8 @@ def _cleared(H: Array, R: Array, seen: Array) -> tuple[Array, Array]:
         return info.observed(seen, H), among(seen, R)
 
     if max(H.shape) <= factor.UNROLLED:
-        return clear(H, R)
+        H, R = clear(H, R)
+        return materialized(H), materialized(R)
     # Selections would be computed inside the products that follow, and slow them down by more than a branch costs.
     return jax.lax.cond(jnp.all(seen), lambda H, R: (H, R), clear, H, R)
 

@@ -7,6 +7,7 @@ from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters import linalg
+from jaxfilters.materialize import materialized
 
 UNROLLED = 8
 """Up to this size `linalg.cholesky` is algebra on the elements, which finds dependent variables itself."""
@@ -45,7 +46,7 @@ def independent_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[
     L = linalg.cholesky(S)
     definite = ~jnp.any(jnp.isnan(diagonal(L)))
     counts = (diagonal(L) > 0) & definite
-    return _without(L, counts), counts, definite
+    return materialized(_without(L, counts)), counts, definite
 
 
 def _without(L, counts):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.kalman import factor
+from jaxfilters.materialize import materialized
 
 
 @jax.tree_util.register_dataclass
@@ -65,7 +66,7 @@ def rows(
     # Products show NaN and infinity, in a fraction of the time that testing all elements takes.
     ones = jnp.where(jnp.isfinite(mean), jnp.ones_like(mean), jnp.nan)
     shown = factor.apply(H, ones) + factor.apply(noise, jnp.ones(noise.shape[1], noise.dtype)) + y_hat
-    seen = read & jnp.isfinite(shown)
+    seen = materialized(read & jnp.isfinite(shown))
     wanted = jnp.ones(y.shape, bool) if mask is None else mask
     return Rows(jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen))
 

@@ -91,7 +91,12 @@ def likeliest(
     held = lambda x: _weighed(model, shapes, x._replace(log_size=jnp.zeros_like(x.log_size)))
     found = _solved(held, start, {})
     flat, unravel = jax.flatten_util.ravel_pytree((found.identity, found.expressions))
-    J = jax.jacfwd(lambda y: jax.flatten_util.ravel_pytree(held(Fit(*unravel(y), found.log_size)))[0])(flat)
+
+    def residuals(y: Array) -> Array:
+        identity, expressions = unravel(y)
+        return jax.flatten_util.ravel_pytree(held(Fit(identity, expressions, found.log_size)))[0]
+
+    J = jax.jacfwd(residuals)(flat)
     inverse = jnp.linalg.inv(_product(J.T, J))[: found.identity.size, : found.identity.size]
     who, _ = _roots(model)
     fit = _parameters(model, found)

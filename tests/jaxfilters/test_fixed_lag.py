@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 from jax.scipy.stats import norm
 
-from jaxfilters import kalman
+from jaxfilters import diffusion, kalman, weights
+from jaxfilters.adaptive import adaptive_particle_filter
+from jaxfilters.differentiable_resampling import transport
 from jaxfilters.extended import extended
 from jaxfilters.filter import Filter, run
 from jaxfilters.fixed_lag import fixed_lag, fixed_lag_rts
 from jaxfilters.gaussian import Gaussian, GaussianRoot
+from jaxfilters.guided import Guidance, guided
+from jaxfilters.layered import Layers, consecutive, over_ensemble
+from jaxfilters.marginal import MixedDynamics, rao_blackwell_shared
 from jaxfilters.particle import StandardNormal, bootstrap
 from jaxfilters.particle_smoothing import keep_history, lineages
+from jaxfilters.priors import gaussian_prior
 from jaxfilters.smoothing import smooth
 
 KEY = jax.random.key(1)
@@ -94,11 +100,72 @@ def test_delayed_particles_are_those_of_the_lineages():
     np.testing.assert_array_equal(history.particles, plain.particles)
 
 
+def any_window_and_history(state, info):
+    return state.delayed, keep_history(getattr(state.inner, "ensemble", state.inner), info)
+
+
+def layered():
+    prior, flat = (
+        gaussian_prior(Gaussian(jnp.zeros(2), jnp.eye(2))),
+        over_ensemble(lambda x, y: norm.logpdf(y[0], x[0])),
+    )
+    return adaptive_particle_filter(
+        prior,
+        flat,
+        diffusion.start(jnp.ones(2)),
+        num_particles=40,
+        mode_scale=jnp.ones(2),
+        layers=Layers(consecutive(1, 1)),
+    )
+
+
+def drift(x, control):
+    del control
+    one = jnp.ones((1, 1))
+    return MixedDynamics(x, 0.3 * one, 0.1 * one, jnp.zeros(1), 0.9 * one, 0.2 * one)
+
+
+def looked_at(num_particles):
+    start, linear = gaussian_prior(Gaussian(jnp.zeros(1), jnp.eye(1))), Gaussian(jnp.zeros(1), jnp.eye(1))
+    log_likelihood = lambda x, y: norm.logpdf(y[0], x[0], 0.4)
+    inner = rao_blackwell_shared(start, linear, drift, log_likelihood, num_particles=num_particles, noise_dim=1)
+    return guided(inner, lambda particles, log_weights, y: Guidance(y, jnp.eye(1) / 0.16))
+
+
+@pytest.mark.parametrize("make", [layered, lambda: looked_at(40)], ids=["layered", "guided"])
+def test_filters_that_move_or_resample_in_their_update_keep_their_lineages(make):
+    ys = jnp.asarray(YS, jnp.float32)
+    for end in (4, LENGTH):
+        _, (found, history) = run(fixed_lag(make(), LAG), KEY, ys[:end], collect=any_window_and_history)
+        np.testing.assert_array_equal(found[-1], lineages(history)[-1 - LAG])
+
+
+def test_delayed_particles_of_a_guided_filter_have_the_mean_of_the_kalman_smoother():
+    F, Q, H = np.array([[1, 0.3], [0, 0.9]]), np.diag([0.1, 0.2]), np.array([[1.0, 0]])
+    model = extended(
+        Gaussian(jnp.zeros(2), jnp.eye(2)), lambda x, u: F @ x, jnp.asarray(Q), lambda x: H @ x, 0.16 * jnp.eye(1)
+    )
+    ys = jnp.asarray(YS, jnp.float32)
+    exact = smooth(model, KEY, ys)[0].mean[-1 - LAG, 0]
+
+    def delayed_mean(key):
+        state, _ = run(fixed_lag(looked_at(400), LAG), key, ys)
+        return weights.mean(state.delayed[0], state.inner.ensemble.log_weights)
+
+    found = jax.lax.map(delayed_mean, jax.random.split(KEY, 100))
+    # 4 standard errors; the bias of weighted means, of the order of the variance of one, is far below that.
+    assert abs(found.mean() - exact) < 4 * found.std(ddof=1) / 10
+    assert found.std(ddof=1) < 0.1
+
+
 def test_what_does_not_fit_is_rejected():
     gaussian = extended(Gaussian(jnp.zeros(2), jnp.eye(2)), transition, jnp.eye(2), observe, jnp.eye(1))
     pf = bootstrap(sample_prior, move, log_likelihood, num_particles=3, noise=StandardNormal(1))
     with pytest.raises(ValueError, match="lag must be an integer of at least 1; got 0"):
         fixed_lag(pf, 0)
+    averaged = bootstrap(sample_prior, move, log_likelihood, num_particles=3, scheme=transport(0.5))
+    with pytest.raises(ValueError, match="inner must choose ancestors"):
+        fixed_lag(averaged, 2)
     with pytest.raises(ValueError, match="inner must be made by extended"):
         fixed_lag_rts(pf, 2)
     with pytest.raises(ValueError, match="inner must have particles"):

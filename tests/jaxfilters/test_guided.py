@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from jax.scipy.stats import norm
 
+from jaxfilters.differentiable_resampling import soft
 from jaxfilters.filter import keep_info, loglikelihood, run
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.guided import Guidance, draw, guided
 from jaxfilters.marginal import MixedDynamics, rao_blackwell, rao_blackwell_shared
+from jaxfilters.resampling import systematic
 
 DT, Q_N, Q_L, R = 0.1, 0.3, 40.0, 0.001
 
@@ -41,9 +43,9 @@ def look_nowhere(particles, log_weights, y):
     return look(particles, log_weights, y)._replace(information=jnp.zeros((1, 1)))
 
 
-def make_inner(builder=rao_blackwell_shared, num_particles=200):
+def make_inner(builder=rao_blackwell_shared, num_particles=200, **options):
     prior = Gaussian(jnp.zeros(1), 4.0 * jnp.eye(1))
-    return builder(sample_prior, prior, dynamics, log_likelihood, num_particles=num_particles, noise_dim=1)
+    return builder(sample_prior, prior, dynamics, log_likelihood, num_particles=num_particles, noise_dim=1, **options)
 
 
 def simulate(length=12):
@@ -68,12 +70,14 @@ def exact_log_evidence(ys):
     return float(total)
 
 
-@pytest.mark.parametrize("guide", [look, look_past, look_nowhere])
-def test_evidence_is_unbiased_whatever_the_guide_says(guide):
+@pytest.mark.parametrize(
+    ("guide", "scheme"), [(look, systematic), (look_past, systematic), (look_nowhere, systematic), (look, soft(0.6))]
+)
+def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
     # z-test at 4 sigma over 600 runs of the unbiased evidence: fails by chance once in 16000.
     ys = simulate()
     keys = jax.random.split(jax.random.key(1), 600)
-    pf = guided(make_inner(), guide)
+    pf = guided(make_inner(scheme=scheme), guide)
     log_evidence = jax.vmap(loglikelihood, in_axes=(None, 0, None))(pf, keys, jnp.asarray(ys, dtype=float))
     ratio = np.exp(np.asarray(log_evidence, np.float64) - exact_log_evidence(ys))
     assert abs((ratio.mean() - 1) / (ratio.std(ddof=1) / np.sqrt(ratio.size))) < 4

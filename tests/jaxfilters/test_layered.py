@@ -10,6 +10,7 @@ from jax.scipy.stats import norm
 from scipy import stats
 
 from jaxfilters import weights
+from jaxfilters.differentiable_resampling import transport
 from jaxfilters.layered import Layers, consecutive, counted_once, counted_twice, in_one_group, layered_update
 from jaxfilters.layered import over_ensemble as batched
 
@@ -161,3 +162,13 @@ def test_layers_are_data():
     leaves, tree = jax.tree.flatten(Layers(consecutive(6, 5)))
     assert len(leaves) == 2
     assert jax.tree.structure(Layers(consecutive(6, 5))) == tree
+
+
+def test_transport_is_refused():
+    """What it makes are averages, whose likelihoods nobody has evaluated."""
+    particles, log_weights = jnp.zeros((1, 4)), jnp.full(4, -np.log(4.0))
+    likelihood = lambda x: jnp.zeros(x.shape[1])
+    with pytest.raises(ValueError, match="scheme must choose ancestors between the stages"):
+        layered_update(
+            jax.random.key(0), particles, log_weights, jnp.arange(4), likelihood, jnp.ones(1), scheme=transport(0.5)
+        )

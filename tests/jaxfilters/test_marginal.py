@@ -7,6 +7,7 @@ import pytest
 from jax.scipy.stats import norm
 
 from jaxfilters import weights
+from jaxfilters.differentiable_resampling import transport
 from jaxfilters.filter import loglikelihood, run
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.marginal import LinearObservation, MixedDynamics, propagate, rao_blackwell, rao_blackwell_shared
@@ -316,3 +317,18 @@ def test_gradient_is_finite(proposal):
     gradient = jax.grad(lambda pf: loglikelihood(pf, jax.random.key(0), jnp.asarray(simulate(20), dtype=float)))(pf)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
     assert gradient.params.linear_prior.covariance[0, 0] != 0
+
+
+@pytest.mark.parametrize("build", [rao_blackwell, rao_blackwell_shared])
+def test_transport_is_refused(build):
+    """It would average Gaussians that belong to different particles."""
+    with pytest.raises(ValueError, match="scheme must choose ancestors: transport averages"):
+        build(
+            lambda key: jnp.zeros(1),
+            Gaussian(jnp.zeros(1), jnp.eye(1)),
+            lambda x, control: None,
+            lambda x, y: jnp.zeros(()),
+            num_particles=4,
+            noise_dim=1,
+            scheme=transport(0.5),
+        )

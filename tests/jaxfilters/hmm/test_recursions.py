@@ -182,6 +182,23 @@ def test_hundreds_of_nats_between_states_are_no_trouble_in_float32():
     np.testing.assert_allclose(hmm.log_likelihood(model, e), expected, rtol=1e-5)
 
 
+def test_what_is_seen_may_be_much_likelier_in_a_state_that_cannot_be_in_float32():
+    model = hmm.from_topology(hmm.left_right(2, longest_step=1), first=hmm.first_only(2))
+    e = jnp.zeros((20, 2)).at[0].set(jnp.array([-500.0, 0.0])).at[17].set(jnp.array([-jnp.inf, -300.0]))
+    np.testing.assert_allclose(hmm.log_likelihood(model, e), -800 + np.log1p(-(0.5**17)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("num_frames", [3, 16, 35])
+def test_the_evidence_of_the_filtered_states_has_the_gradient_of_the_log_likelihood(x64, num_frames):
+    model, e = chain(18, allowed=hmm.left_right(3, longest_step=1)), scores(19, num_frames, batch=(2,))
+    by_frames = jax.grad(lambda model, e: hmm.forward(model, e).log_evidence.sum(), argnums=(0, 1))(model, e)
+    at_once = jax.grad(lambda model, e: hmm.log_likelihood(model, e).sum(), argnums=(0, 1))(model, e)
+    found, expected = (tree[0].log_transition for tree in (by_frames, at_once))
+    possible = np.isfinite(model.log_transition)
+    np.testing.assert_allclose(found[possible], expected[possible], atol=1e-10)
+    np.testing.assert_allclose(by_frames[1], at_once[1], atol=1e-12)
+
+
 def best_by_hand(model, e):
     e, first, step = (np.asarray(x, np.float64) for x in (e, model.log_initial, model.log_transition))
     score, back = first + e[0], []

@@ -1,0 +1,346 @@
+"""`vmap` that keeps the batch on the last axis of whatever is computed in between.
+
+The rules of `jax.vmap` move a batch to the front wherever arrays are broadcast, reshaped or joined, and leave a loop
+over the three or six numbers of a small matrix as the innermost one. With the batch on the last axis of every array
+that loop runs over the batch, by vector instructions. Functions are traced; operations for which there is no rule here
+are left to `jax.vmap`, which is right but may be slow.
+"""
+
+from collections.abc import Callable
+from functools import partial, reduce, wraps
+from operator import add
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
+
+_UNROLLED = 8
+"""Sums of up to so many terms are written out."""
+
+_ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
+    complex conj convert_element_type copy cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt igamma
+    igammac imag integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or polygamma
+    pow real reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor"""
+_OF_LEADING_AXES = """argmax argmin cumlogsumexp cummax cummin cumprod cumsum materialized reduce_and reduce_max
+    reduce_min reduce_or reduce_prod reduce_xor rev squeeze"""
+"""Operations on one array whose parameters name axes from the front: one axis more at the end changes nothing."""
+
+
+class _Value(NamedTuple):
+    array: Any
+    batched: bool
+    """Whether the last axis is that of the batch."""
+
+
+def vmap(fun: Callable, in_axes: PyTree = -1, out_axes: PyTree = -1) -> Callable:
+    """As `jax.vmap`, with the batch on the last axis of arguments, results and all that is computed between them.
+
+    Args:
+        fun: Function of one element.
+        in_axes: For each argument, as a prefix of its pytree: -1, or `None` where all elements share it.
+        out_axes: -1, or `None` for results that do not depend on the element.
+
+    Raises:
+        ValueError: If nothing has a batch axis, if lengths differ, or if a result with the axis `None` depends on the
+            element.
+    """
+
+    @wraps(fun)
+    def mapped(*args: PyTree) -> PyTree:
+        axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
+        leaves, tree = jax.tree.flatten(args)
+        flags = _mapped_leaves(axes, args)
+        values = [_Value(jnp.asarray(leaf), flag) for leaf, flag in zip(leaves, flags, strict=True)]
+        sizes = {value.array.shape[-1] for value in values if value.batched}
+        if len(sizes) != 1:
+            raise ValueError(f"in_axes must give arguments one length along their last axis; got {sorted(sizes)}.")
+        size = sizes.pop()
+        result, structure = _mapped(lambda *flat: fun(*jax.tree.unflatten(tree, flat)), size, values)
+        whole = jax.tree.unflatten(structure, [value.array for value in result])
+        wanted = _mapped_leaves(out_axes, whole)
+        for (path, _), value, flag in zip(jax.tree.leaves_with_path(whole), result, wanted, strict=True):
+            if value.batched and not flag:
+                raise ValueError(
+                    f"out_axes must be -1 for results that depend on the element; got None for the result"
+                    f"{jax.tree_util.keystr(path)}, which does."
+                )
+        arrays = [_full(value, size) if flag else value.array for value, flag in zip(result, wanted, strict=True)]
+        return jax.tree.unflatten(structure, arrays)
+
+    return mapped
+
+
+def batch_last(fun: Callable) -> Callable:
+    """The same function, of which `jax.vmap` keeps the batch on the last axis of whatever it computes.
+
+    For functions of small arrays, up to about eight rows: large matrices are better left to `jax.vmap`.
+    """
+
+    @wraps(fun)
+    def same(*args: PyTree) -> PyTree:
+        leaves, tree = jax.tree.flatten(args)
+        leaves = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
+        closed, shapes = jax.make_jaxpr(lambda *flat: fun(*jax.tree.unflatten(tree, flat)), return_shape=True)(*leaves)
+        if closed.effects:
+            return fun(*args)
+        # What the function closes over may be traced, too: it is handed over.
+        jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
+        result = _batch_last_p.bind(*closed.consts, *leaves, jaxpr=ClosedJaxpr(jaxpr, ()))
+        return jax.tree.unflatten(jax.tree.structure(shapes), result)
+
+    return same
+
+
+def _mapped_leaves(axes, tree):
+    """Which leaves have the axis of the batch, where `axes` is a prefix of the tree."""
+    flags = jax.tree.map(
+        lambda axis, branch: jax.tree.map(lambda _: axis is not None, branch),
+        axes,
+        tree,
+        is_leaf=lambda axis: axis is None,
+    )
+    return jax.tree.leaves(flags)
+
+
+def _mapped(fun, size, values):
+    """The results of a function of flat arguments, flat, and their structure."""
+    one = [jax.ShapeDtypeStruct(_shape(value), value.array.dtype) for value in values]
+    closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*one)
+    return _evaluate(closed, size, values), jax.tree.structure(shapes)
+
+
+def _shape(value):
+    """The shape for one element."""
+    return np.shape(value.array)[: np.ndim(value.array) - value.batched]
+
+
+def _full(value, size):
+    """The array with its batch axis, repeated along it where all elements share it."""
+    if value.batched:
+        return value.array
+    return lax.broadcast_in_dim(value.array, (*np.shape(value.array), size), range(np.ndim(value.array)))
+
+
+def _evaluate(closed: ClosedJaxpr, size: int, values: list[_Value]) -> list[_Value]:
+    jaxpr = closed.jaxpr
+    known = {var: _Value(const, False) for var, const in zip(jaxpr.constvars, closed.consts, strict=True)}
+    known |= dict(zip(jaxpr.invars, values, strict=True))
+
+    def read(var):
+        return _Value(var.val, False) if isinstance(var, Literal) else known[var]
+
+    for eqn in jaxpr.eqns:
+        known |= dict(zip(eqn.outvars, _apply(eqn, size, [read(var) for var in eqn.invars]), strict=True))
+    return [read(var) for var in jaxpr.outvars]
+
+
+def _apply(eqn: JaxprEqn, size: int, values: list[_Value]) -> list[_Value]:
+    name = eqn.primitive.name
+    if any(value.batched for value in values):
+        if name in _CALLS:
+            return _CALLS[name](eqn, size, values)
+        result = _RULES.get(name, _left_alone)(eqn, size, values)
+        if result is NotImplemented:
+            axes = [-1 if value.batched else None for value in values]
+            result = jax.vmap(partial(_bind, eqn), axes, -1)(*(value.array for value in values))
+    else:
+        result = _bind(eqn, *(value.array for value in values))
+    batched = any(value.batched for value in values)
+    return [_Value(array, batched) for array in (result if eqn.primitive.multiple_results else [result])]
+
+
+def _bind(eqn, *args):
+    return eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
+
+
+def _left_alone(eqn, size, values):
+    del eqn, size, values
+    return NotImplemented
+
+
+def _elementwise(eqn, size, values):
+    shape = eqn.outvars[0].aval.shape
+
+    def fitted(value):
+        if len(_shape(value)) == len(shape):
+            return _full(value, size)
+        # A number beside arrays.
+        return lax.broadcast_in_dim(value.array, (*shape, size), (len(shape),)) if value.batched else value.array
+
+    return _bind(eqn, *map(fitted, values))
+
+
+def _of_leading_axes(eqn, size, values):
+    del size
+    return _bind(eqn, *(value.array for value in values))
+
+
+def _broadcast_in_dim(eqn, size, values):
+    shape, axes = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    return lax.broadcast_in_dim(values[0].array, (*shape, size), (*axes, len(shape)))
+
+
+def _reshape(eqn, size, values):
+    return lax.reshape(values[0].array, (*eqn.params["new_sizes"], size))
+
+
+def _transpose(eqn, size, values):
+    del size
+    order = eqn.params["permutation"]
+    return lax.transpose(values[0].array, (*order, len(order)))
+
+
+def _slice(eqn, size, values):
+    first, last, steps = (eqn.params[name] for name in ("start_indices", "limit_indices", "strides"))
+    return lax.slice(values[0].array, (*first, 0), (*last, size), None if steps is None else (*steps, 1))
+
+
+def _pad(eqn, size, values):
+    del size
+    x, filling = values
+    if filling.batched:
+        return NotImplemented
+    return lax.pad(x.array, filling.array, (*eqn.params["padding_config"], (0, 0, 0)))
+
+
+def _concatenate(eqn, size, values):
+    return lax.concatenate([_full(value, size) for value in values], eqn.params["dimension"])
+
+
+def _stack(eqn, size, values):
+    return jnp.stack([_full(value, size) for value in values], eqn.params["axis"])
+
+
+def _reduce_sum(eqn, size, values):
+    axes, x = sorted(eqn.params["axes"], reverse=True), values[0].array
+    if not 0 < np.prod([x.shape[axis] for axis in axes], dtype=int) <= _UNROLLED:
+        return _of_leading_axes(eqn, size, values)
+    for axis in axes:
+        x = reduce(add, (lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])))
+    return x
+
+
+def _dot_general(eqn, size, values):
+    del size
+    contracted, batch = eqn.params["dimension_numbers"]
+    shapes = [_shape(value) for value in values]
+    if batch != ((), ()) or len(contracted[0]) != 1 or not 0 < max(*shapes[0], *shapes[1]) <= _UNROLLED:
+        return NotImplemented
+    axes, count = [of[0] for of in contracted], shapes[0][contracted[0][0]]
+    kind = eqn.outvars[0].aval.dtype
+    a, b = ((value.array if value.batched else value.array[..., None]).astype(kind) for value in values)
+
+    def term(i):
+        left, right = (lax.index_in_dim(x, i, axis, keepdims=False) for x, axis in zip((a, b), axes, strict=True))
+        return left.reshape(*left.shape[:-1], *(1,) * (right.ndim - 1), left.shape[-1]) * right
+
+    return reduce(add, map(term, range(count))) if count else NotImplemented
+
+
+def _call(eqn, size, values):
+    return _evaluate(eqn.params["jaxpr"], size, values)
+
+
+def _custom_jvp_call(eqn, size, values):
+    """The function over the batch, and as its derivative that of one element over the batch."""
+    inexact = [jnp.issubdtype(var.aval.dtype, jnp.inexact) for var in eqn.invars]
+    smooth = [jnp.issubdtype(var.aval.dtype, jnp.inexact) for var in eqn.outvars]
+    flags = [value.batched for value in values]
+    batched = _depends(eqn.params["call_jaxpr"], flags)
+
+    @jax.custom_jvp
+    def function(*arrays):
+        return [value.array for value in _evaluate(eqn.params["call_jaxpr"], size, list(map(_Value, arrays, flags)))]
+
+    @function.defjvp
+    def _derivative(primals, tangents):
+        def along(*flat):
+            primals, changing = flat[: len(inexact)], iter(flat[len(inexact) :])
+            none = [np.zeros(np.shape(primal), jax.dtypes.float0) for primal in primals]
+            tangents = tuple(next(changing) if moves else zero for moves, zero in zip(inexact, none, strict=True))
+            values, changes = jax.jvp(partial(_bind, eqn), primals, tangents)
+            return [*values, *(change for change, moves in zip(changes, smooth, strict=True) if moves)]
+
+        moving = [_Value(*pair) for *pair, moves in zip(tangents, flags, inexact, strict=True) if moves]
+        found = _mapped(along, size, [*map(_Value, primals, flags), *moving])[0]
+        values = [_like(value, depends, size) for value, depends in zip(found, batched, strict=False)]
+        changes = iter(found[len(smooth) :])
+        none = [np.zeros(value.shape, jax.dtypes.float0) for value in values]
+        kinds = zip(smooth, batched, none, strict=True)
+        return values, [_like(next(changes), depends, size) if moves else zero for moves, depends, zero in kinds]
+
+    return list(map(_Value, function(*(value.array for value in values)), batched))
+
+
+def _like(value, batched, size):
+    """The array with a batch axis or without; what does not depend on the element is the same for all."""
+    return _full(value, size) if batched else value.array[..., 0] if value.batched else value.array
+
+
+def _depends(closed, flags):
+    """Which results depend on the element, as `_evaluate` finds them."""
+    known = dict(zip(closed.jaxpr.invars, flags, strict=True))
+    read = lambda var: not isinstance(var, Literal) and known.get(var, False)
+    for eqn in closed.jaxpr.eqns:
+        given = [read(var) for var in eqn.invars]
+        inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
+        known |= dict(
+            zip(eqn.outvars, _depends(inner, given) if inner else [any(given)] * len(eqn.outvars), strict=True)
+        )
+    return [read(var) for var in closed.jaxpr.outvars]
+
+
+_RULES = dict.fromkeys(_ELEMENTWISE.split(), _elementwise) | dict.fromkeys(_OF_LEADING_AXES.split(), _of_leading_axes)
+_RULES |= {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "concatenate": _concatenate,
+    "dot_general": _dot_general,
+    "pad": _pad,
+    "reduce_sum": _reduce_sum,
+    "reshape": _reshape,
+    "slice": _slice,
+    "stack": _stack,
+    "transpose": _transpose,
+}
+"""Array of the results of one operation; `NotImplemented` leaves it to `jax.vmap`."""
+_CALLS = {"batch_last": _call, "custom_jvp_call": _custom_jvp_call, "jit": _call, "pjit": _call}
+"""Operations that hold others."""
+
+
+def _as_it_is(*args, jaxpr):
+    return jaxpr_as_fun(jaxpr)(*args)
+
+
+def _jvp(primals, tangents, *, jaxpr):
+    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+
+    def function(*moving):
+        moving = iter(moving)
+        return _as_it_is(*(next(moving) if m else x for x, m in zip(primals, moves, strict=True)), jaxpr=jaxpr)
+
+    chosen = [[x for x, m in zip(of, moves, strict=True) if m] for of in (primals, tangents)]
+    return jax.jvp(function, *chosen)
+
+
+def _batch(args, axes, *, jaxpr):
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    values = [
+        _Value(x, False) if axis is None else _Value(jnp.moveaxis(x, axis, -1), True)
+        for x, axis in zip(args, axes, strict=True)
+    ]
+    found = _evaluate(jaxpr, size, values)
+    return [value.array for value in found], [value.array.ndim - 1 if value.batched else None for value in found]
+
+
+_batch_last_p = Primitive("batch_last")
+_batch_last_p.multiple_results = True
+_batch_last_p.def_impl(_as_it_is)
+_batch_last_p.def_abstract_eval(lambda *_, jaxpr: jaxpr.out_avals)
+mlir.register_lowering(_batch_last_p, mlir.lower_fun(_as_it_is, multiple_results=True))
+ad.primitive_jvps[_batch_last_p] = _jvp
+batching.primitive_batchers[_batch_last_p] = _batch
