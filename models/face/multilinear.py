@@ -6,7 +6,8 @@ one of its ranks for symmetric halves of training faces, people along one mode a
 matrices with orthonormal columns, and `(c identity, expression / c)` is the same face.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import jax
@@ -83,6 +84,12 @@ def expression_basis(model: MultilinearFace, identity: Float[Array, " S"]) -> Fl
 def identity_basis(model: MultilinearFace, expression: Float[Array, " A"]) -> Float[Array, "K 3 S"]:
     """Change of the landmarks with an expression by each identity parameter, millimetres (section 2.3, `M_a`)."""
     return _along_last(model.tensor, expression)
+
+
+def restricted(model: MultilinearFace, landmarks: Sequence[int]) -> MultilinearFace:
+    """The model of some of its landmarks, with the same people and expressions."""
+    chosen = np.array(landmarks)
+    return replace(model, mean=model.mean[chosen], tensor=model.tensor[chosen])
 
 
 def shape_tensor(shapes: Float[Array, "S A K 3"], pairs: Pairs = PAIRS) -> Float[Array, "K 3 2*S A"]:

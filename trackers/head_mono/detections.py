@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.trackers.head.corners import eye_centers
-from jaxfilters.trackers.head.detect import complete, detect
+from jaxfilters.trackers.head_mono.dense import NUM_DENSE, Dense
+from jaxfilters.trackers.head_mono.detectors import MESH_MM, CascadeDetector, Detector, Seen, dense_noise
 from jaxfilters.trackers.head_mono.start import DETECTED_PX, is_symmetric
 from jaxfilters.trackers.head_mono.state import NUM_FRAMES
 
@@ -27,17 +29,27 @@ class Detections(NamedTuple):
     """Of the last, seconds."""
     std_px: float = DETECTED_PX
     """Standard deviation of each coordinate of the points."""
+    dense: Dense | None = None
+    """The 68 landmarks, if they are known."""
+    iris_px: Float[np.ndarray, "n 2"] | None = None
+    """Widths of the irises, if they are seen."""
 
 
 class Collector:
     """Gathers detections until there are enough of them; what is wrong with a frame is in `reason`."""
 
-    def __init__(self) -> None:
+    def __init__(self, detector: Detector | None = None) -> None:
+        """Nothing gathered yet.
+
+        Args:
+            detector: What finds the landmarks; OpenCV's cascades if none.
+        """
         self.reason = ""
         """Why the last frame was no detection, in a few words; empty if it was one."""
         self.several = 0
         """Faces in the last frame, if more than one."""
-        self._points: list[np.ndarray] = []
+        self._detector = detector or CascadeDetector()
+        self._seen: list[Seen] = []
         self._images: list[np.ndarray] = []
         self._times: list[float] = []
 
@@ -51,37 +63,39 @@ class Collector:
         self.reason, self.several = "", 0
         if self._times and 0 <= time - self._times[-1] < APART_S:
             return None
-        points = self._detected(image)
-        if points is None:
+        seen = self._detected(image)
+        if seen is None:
             return None
-        self._drop_others(points, time)
-        return self._kept(points, image, time)
+        self._drop_others(seen.points, time)
+        return self._kept(seen, image, time)
 
     def given(self, points: Float[np.ndarray, "K 2"], image: UInt8[np.ndarray, "rows cols"], time: float) -> Detections:
-        """Detections that are one frame's landmarks, given by a person."""
+        """Detections that are one frame's landmarks, ten or 68, given by a person."""
         # The same frame several times tells no more than once.
         std_px = DETECTED_PX * math.sqrt(NUM_FRAMES)
-        return Detections(np.tile(points, (NUM_FRAMES, 1, 1)), np.stack([image] * NUM_FRAMES), time, std_px)
+        several = np.tile(points, (NUM_FRAMES, 1, 1))
+        images = np.stack([image] * NUM_FRAMES)
+        if len(points) != NUM_DENSE:
+            return Detections(several, images, time, std_px)
+        covariance = np.broadcast_to(std_px**2 * np.eye(2), (*several.shape, 2))
+        dense = Dense(several, covariance, np.ones(several.shape[:2], bool), 0.0)
+        return Detections(several[:, list(FROM_68)], images, time, std_px, dense)
 
     def clear(self) -> None:
         """Begins anew."""
-        self._points, self._images, self._times = [], [], []
+        self._seen, self._images, self._times = [], [], []
 
-    def _detected(self, image: np.ndarray) -> np.ndarray | None:
-        near = self._points[-1].mean(axis=0) if self._points else None
-        found = detect(image, near=near)
-        if found is None:
-            self.reason = "no face whose eyes and lips are seen"
+    def _detected(self, image: np.ndarray) -> Seen | None:
+        near = self._seen[-1].points.mean(axis=0) if self._seen else None
+        found = self._detector.detect(image, near)
+        if isinstance(found, str):
+            self.reason = found
             return None
         self.several = found.num_faces if found.num_faces > 1 else 0
-        points = complete(image, found.points)
-        if points is None:
-            self.reason = "nostrils or brows are not seen"
-            return None
-        if not is_symmetric(points):
+        if not is_symmetric(found.points):
             self.reason = "left and right landmarks do not lie alike"
             return None
-        return points
+        return found
 
     def _drop_others(self, points: np.ndarray, time: float) -> None:
         """Only what is recent and of the same face stays."""
@@ -89,18 +103,28 @@ class Collector:
             return
         right, left = eye_centers(points[:6])
         most = SAME_PLACE * np.linalg.norm(left - right)
-        is_other = np.linalg.norm(points.mean(axis=0) - self._points[-1].mean(axis=0)) > most
+        is_other = np.linalg.norm(points.mean(axis=0) - self._seen[-1].points.mean(axis=0)) > most
         if is_other or time < self._times[-1]:
             self.clear()
         while self._times and time - self._times[0] > STALE_S:
-            del self._points[0], self._images[0], self._times[0]
+            del self._seen[0], self._images[0], self._times[0]
 
-    def _kept(self, points: np.ndarray, image: np.ndarray, time: float) -> Detections | None:
-        self._points.append(points)
+    def _kept(self, seen: Seen, image: np.ndarray, time: float) -> Detections | None:
+        self._seen.append(seen)
         self._images.append(image.copy())
         self._times.append(time)
-        if len(self._points) < NUM_FRAMES:
+        if len(self._seen) < NUM_FRAMES:
             return None
-        found = Detections(np.stack(self._points), np.stack(self._images), time)
+        points = np.stack([one.points for one in self._seen])
+        many = [one.dense for one in self._seen if one.dense is not None]
+        widths = [one.iris_px for one in self._seen if one.iris_px is not None]
+        dense = None if len(many) < NUM_FRAMES else _of_mesh(np.stack(many))
+        iris_px = None if len(widths) < NUM_FRAMES else np.stack(widths)
+        found = Detections(points, np.stack(self._images), time, dense=dense, iris_px=iris_px)
         self.clear()
         return found
+
+
+def _of_mesh(points: Float[np.ndarray, "n 68 2"]) -> Dense:
+    covariance, seen = dense_noise(points)
+    return Dense(np.nan_to_num(points), covariance, seen, MESH_MM)

@@ -81,17 +81,38 @@ def tried(people: People, rig: CameraRig, state: MonoState, options: MonoOptions
 
     Arguments are those of `recognised`.
     """
-    stranger, now = one_of(people, 0), one_of(people, state.who)
-
-    def one(face: MultilinearFace) -> tuple[Bundle, Array]:
-        bundle, info = fitted(stranger, face, rig, state, _start(face, now, state), options, STEPS)
-        window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-        told = jnp.sum(informed(face, rig, window, bundle.person, options.prior).information, axis=0)
-        before, after = prior_information(face, options), known(face, state.past, options) + told
-        return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
-
+    now = one_of(people, state.who)
+    one = lambda face: weighed(one_of(people, 0), face, rig, state, _start(face, now, state), options)
     # One by one: batches of factorisations can stand still on two cores.
     return jax.lax.map(one, people.faces)
+
+
+def weighed(
+    stranger: MultilinearFace,
+    face: MultilinearFace,
+    rig: CameraRig,
+    state: MonoState,
+    start: Bundle,
+    options: MonoOptions,
+) -> tuple[Bundle, Float[Array, ""]]:
+    """The window adjusted to one face from a start, and the logarithm of its evidence but for a common constant.
+
+    What is integrated out is identity and offset, by Laplace's approximation; poses count by direction and in
+    proportion to the distance, of which no value is likelier than another.
+
+    Args:
+        stranger: The model.
+        face: The same, or somebody who is remembered.
+        rig: One camera.
+        state: With the window.
+        start: Of all frames.
+        options: Constants.
+    """
+    bundle, info = fitted(stranger, face, rig, state, start, options, STEPS)
+    window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
+    told = jnp.sum(informed(face, rig, window, bundle.person, options.prior).information, axis=0)
+    before, after = prior_information(face, options), known(face, state.past, options) + told
+    return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
 
 
 def as_remembered(

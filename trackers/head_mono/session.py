@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfilters.models.face.bundle import Person
-from jaxfilters.models.face.landmarks import NUM_LANDMARKS
+from jaxfilters.models.face.bundle import Past, Person, Views
+from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig
@@ -17,9 +17,13 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.following import Beginning, Following
 from jaxfilters.trackers.head.session import check_points
 from jaxfilters.trackers.head.state import INITIALISING, POSE
+from jaxfilters.trackers.head_mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head_mono.detections import Collector, Detections
+from jaxfilters.trackers.head_mono.detectors import Detector
+from jaxfilters.trackers.head_mono.focal import FocalLength, focal_length
+from jaxfilters.trackers.head_mono.irises import with_irises
 from jaxfilters.trackers.head_mono.recognition import as_remembered, one_of, people, recognised
-from jaxfilters.trackers.head_mono.start import Start, begin, initialise, search_of
+from jaxfilters.trackers.head_mono.start import Start, begin, detected, initialise, search_of
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head_mono.track import System, advance
 
@@ -33,8 +37,8 @@ _begun = jax.jit(begin, static_argnames="options")
 class _Found:
     """What a track begins with."""
 
-    def __init__(self, detections: Detections, start: Start) -> None:
-        self.detections, self.start = detections, start
+    def __init__(self, detections: Detections, start: Start, views: Views, past: Past | None) -> None:
+        self.detections, self.start, self.views, self.past = detections, start, views, past
         turned = np.abs(np.asarray(start.bundle.poses[:, 4:])).sum(axis=1)
         self.frame = int(turned.argmin())
         """The one most turned to the camera."""
@@ -51,33 +55,38 @@ class MonoSession:
         points: Float[np.ndarray, "K 2"] | None = None,
         *,
         detections: Detections | None = None,
+        detector: Detector | None = None,
         remembered: Remembered | None = None,
     ) -> None:
         """A session before its first frame.
 
         Args:
             rig: One camera.
-            face: Model of ten landmarks.
+            face: Model of ten landmarks, or of the 68 of iBUG: the start is then from all that are known, and ten of
+                them are followed.
             options: Constants.
-            points: The ten landmarks in the first image, pixels, (u, v); detected in several images where not given.
+            points: The ten landmarks, or 68, in the first image, pixels, (u, v); detected in several images where not
+                given.
             detections: Landmarks that were found otherwise in several images, the last of which is still to come.
+            detector: What finds landmarks; OpenCV's cascades if none.
             remembered: People of the same model who may be before the camera, beside strangers.
 
         Raises:
             ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
-                `points` are not ten finite pixels, or `remembered` is not of the model or for the tracker of the
+                `points` are not ten or 68 finite pixels, or `remembered` is not of the model or for the tracker of the
                 thesis, which knows nobody.
         """
         if rig.num_cameras != 1:
             raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
         if np.any(np.asarray(rig.rotation[0]) != np.eye(3)) or np.any(np.asarray(rig.translation[0]) != 0):
             raise ValueError("rig must have its camera at the origin, without a rotation: its frame is the world.")
-        if face.num_landmarks != NUM_LANDMARKS:
-            raise ValueError(f"face must have {NUM_LANDMARKS} landmarks; got {face.num_landmarks}.")
-        check_points(points)
+        if points is None or len(points) != NUM_DENSE:
+            check_points(points)
+        else:
+            check_points(np.asarray(points)[list(FROM_68)])
         options = options or MonoOptions()
-        _check_remembered(remembered, face, options)
-        self._tracker = _MonoTracker(rig, face, options, points, detections, remembered)
+        _check_remembered(remembered, tracked(face), options)
+        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, remembered)
         self._following = Following(self._tracker)
 
     @property
@@ -99,6 +108,10 @@ class MonoSession:
     def remembered(self) -> Remembered | None:
         """The person who is followed, for later sessions with the same model; `None` before there was a face."""
         return None if self._following.state is None else self._tracker.remembered(self._following.state)
+
+    def focal_length(self) -> FocalLength | None:
+        """What the frames that the face is adjusted to say of the focal length; `None` before there was a face."""
+        return None if self._following.state is None else self._tracker.focal_length(self._following.state)
 
     def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
         """Track of the next frames, a row each.
@@ -123,9 +136,12 @@ class _MonoTracker:
         options: MonoOptions,
         points: np.ndarray | None,
         detections: Detections | None,
+        detector: Detector | None,
         remembered: Remembered | None,
     ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self._whole, face = face, tracked(face)
+        """With all its landmarks."""
         self._face, self._options, self._points, self._detections = face, options, points, detections
         # What is compiled knows its options, but need not be compiled anew for another seed.
         self._compiled = replace(options, seed=0)
@@ -134,7 +150,8 @@ class _MonoTracker:
         self._system = System(face, face, rig, search_of(rig, options))
         self._num_told = 0
         """Adjustments when it was last asked who it is."""
-        self._collector = Collector()
+        self._detector = detector
+        self._collector = Collector(detector)
 
     @property
     def can_wait(self) -> bool:
@@ -161,27 +178,25 @@ class _MonoTracker:
 
     def forget(self) -> None:
         # Not cleared: a search beside the tracking may be at work with the old one.
-        self._collector = Collector()
+        self._collector = Collector(self._detector)
 
     def begin(self, found: _Found, old: MonoState | None, frame: int) -> Beginning:
         key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
         start, detections = found.start, found.detections
         if old is not None:
             self._remember(old)
-        images, points = detections.images[[found.frame, -1]], jnp.asarray(detections.points, float)
-        std_px = jnp.asarray(detections.std_px, points.dtype)
-        zero = jnp.zeros((), points.dtype)
+        zero = jnp.zeros((), start.uv.dtype)
         state = _begun(
             key,
             self._face,
             self.rig,
             start,
-            points,
+            found.views,
             jnp.asarray(found.frame),
-            images,
+            detections.images[[found.frame, -1]],
             zero,
             options=self._compiled,
-            detected_px=std_px,
+            past=found.past,
         )
         self._num_told, self._system = 0, self._system._replace(face=self._face)
         state = self._recognised(state)
@@ -194,6 +209,9 @@ class _MonoTracker:
 
     def remembered(self, state: MonoState) -> Remembered:
         return as_remembered(self._system.stranger, self._system.face, state, self._compiled)
+
+    def focal_length(self, state: MonoState) -> FocalLength:
+        return focal_length(self._system.stranger, self._system.face, self.rig, state, self._compiled)
 
     def _recognised(self, state: MonoState) -> MonoState:
         """Asked again whenever the face has been adjusted twice as often: what is learnt of it grows ever slower."""
@@ -241,7 +259,22 @@ class _MonoTracker:
             return None, [f"the points are no face's: the best one is {error:.1f} px from them"]
         if depth.min() < DEPTH_MM[0] or depth.max() > DEPTH_MM[1]:
             return None, [f"the face would be {depth.mean():.0f} mm away"]
-        return _Found(detections, start), []
+        return self._told(detections, start), []
+
+    def _told(self, detections: Detections, start: Start) -> _Found:
+        """The start with all that the detections tell beside the ten landmarks."""
+        points = jnp.asarray(detections.points, float)
+        views, past = detected(points, jnp.asarray(detections.std_px, points.dtype)), None
+        options = self._options
+        if options.is_published or not options.prior_weight:
+            return _Found(detections, start, views, past)
+        if detections.dense is not None and self._whole.num_landmarks == NUM_DENSE:
+            start, past = start_densely(self._whole, self.rig, start, detections.dense, options.prior)
+            # What they tell of the person is in the past already.
+            views = views._replace(seen=jnp.zeros_like(views.seen))
+        if detections.iris_px is not None and options.eyes_apart_mm is None:
+            start, past = with_irises(self._face, self.rig, start, views, past, detections.iris_px, options.prior)
+        return _Found(detections, start, views, past)
 
 
 def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoOptions) -> None:
@@ -249,10 +282,8 @@ def _check_remembered(remembered: Remembered | None, face: MultilinearFace, opti
         return
     if options.is_published:
         raise ValueError('remembered must be None where options.landmarks is not "aligned": that tracker knows nobody.')
-    count = len(remembered.identity)
-    expected = Remembered(
-        (count, face.num_identities), (count, face.num_identities, face.num_identities), (count, *face.mean.shape)
-    )
-    shapes = jax.tree.map(jnp.shape, remembered)
+    count, num_identities = len(remembered.identity), face.num_identities
+    expected = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
+    shapes = tuple(jnp.shape(leaf) for leaf in remembered)
     if shapes != expected:
-        raise ValueError(f"remembered must be of the model, with shapes {tuple(expected)}; got {tuple(shapes)}.")
+        raise ValueError(f"remembered must be of the model, with shapes {expected}; got {shapes}.")

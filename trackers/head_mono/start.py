@@ -105,10 +105,14 @@ def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
 
 @jax.jit
 def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
-    covariance = detected_px**2 * jnp.tile(jnp.eye(2), (*points.shape[:2], 1, 1))
-    views = Views(points, covariance, jnp.ones(points.shape[:2], bool))
-    found, info = adjust(face, rig, views, bundle, prior, reach, steps=STEPS)
+    found, info = adjust(face, rig, detected(points, detected_px), bundle, prior, reach, steps=STEPS)
     return Start(found, info, projected(face, rig, found))
+
+
+def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, ""]) -> Views:
+    """Landmarks that were all detected equally well, with the standard deviation of each coordinate."""
+    covariance = jnp.square(std_px) * jnp.tile(jnp.eye(2), (*points.shape[:2], 1, 1))
+    return Views(points, covariance, jnp.ones(points.shape[:2], bool))
 
 
 def begin(
@@ -116,12 +120,11 @@ def begin(
     face: MultilinearFace,
     rig: CameraRig,
     start: Start,
-    points: Float[Array, "n K 2"],
+    views: Views,
     frame: Int[ArrayLike, ""],
     images: Num[Array, "2 rows cols"],
     time: Float[Array, ""],
     options: MonoOptions,
-    detected_px: Float[ArrayLike, ""] = DETECTED_PX,
     past: Past | None = None,
 ) -> MonoState:
     """State in the last frame of the start, with templates from one of its frames.
@@ -131,12 +134,11 @@ def begin(
         face: Model.
         rig: One camera.
         start: From `initialise`.
-        points: That it was made from, pixels.
+        views: Landmarks in its frames; not seen where what they tell is known otherwise (`past`).
         frame: Which of its frames the templates are taken from: the one most turned to the camera.
         images: That frame, and the last one.
         time: Of the last frame, seconds.
         options: Constants.
-        detected_px: Standard deviation of each coordinate of the points.
         past: What is known of the person beside these landmarks.
     """
     bundle, uv, person = start.bundle, start.uv[frame], start.bundle.person
@@ -146,8 +148,7 @@ def begin(
     here, expressed = bundle.poses[-1], bundle.expressions[-1]
     x = jnp.concatenate([here, modes.coefficients(face, expressed)])
     variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
-    window = _first_window(bundle, points, uv, frame, options, detected_px)
-    window = informed(face, rig, window, person, options.prior)
+    window = informed(face, rig, _first_window(bundle, views, uv, frame, options), person, options.prior)
     size = window.information.shape[-1]
     return MonoState(
         search=start_search(x, search_options(options)),
@@ -203,18 +204,16 @@ def _registered(face, rig, bundle, uv, frame, image) -> Registered:
     return Registered(wide, wide[..., border:-border, border:-border], seen)
 
 
-def _first_window(
-    bundle: Bundle, points: Array, uv: Array, frame: Int[ArrayLike, ""], options: MonoOptions, detected_px: ArrayLike
-) -> Window:
+def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike, ""], options: MonoOptions) -> Window:
     """The frames of the start; that of the templates comes first, where they are exact by definition."""
-    n, K, _ = points.shape
+    n = len(views.uv)
     order = jnp.arange(n).at[0].set(frame).at[frame].set(0)
-    covariance = jnp.square(detected_px) * jnp.tile(jnp.eye(2), (n, K, 1, 1))
-    points = points[order]
+    points, covariance, seen = (leaf[order] for leaf in views)
     if not options.is_published:
         points = points.at[0].set(uv)
         covariance = covariance.at[0].set(ANCHORED_PX**2 * jnp.eye(2))
-    views = Views(points, covariance, jnp.ones((n, K), bool))
+        seen = seen.at[0].set(True)
+    views = Views(points, covariance, seen)
     size = bundle.person.identity.size + bundle.person.offset.size
     return Window(
         views,

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.head.session import HeadSession
 from jaxfilters.trackers.head.state import HeadOptions
 from jaxfilters.trackers.recording import InputError
@@ -51,8 +52,11 @@ def track_head(options: argparse.Namespace) -> str:
 
 
 def _session(place: Place, settings: HeadOptions) -> HeadSession:
+    points = place.points
+    if points is not None and len(points) > NUM_LANDMARKS:
+        points = points[list(FROM_68)]
     try:
-        return HeadSession(place.rig, settings, place.points)
+        return HeadSession(place.rig, settings, points)
     except ImportError as error:
         raise InputError(f"--detector {settings.detector}: {error}") from error
 

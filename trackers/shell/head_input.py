@@ -36,7 +36,8 @@ class Place(NamedTuple):
     undistortions: list[Undistortion]
     sources: list[VideoSource]
     points: np.ndarray | None
-    """(10, 2) landmarks in the first image of the first camera, without lens distortion; None where to be detected."""
+    """(10, 2) landmarks, or (68, 2), in the first image of the first camera, without lens distortion; None where to be
+    detected."""
     truth: HeadTruth | None
     """Of the synthetic face."""
     note: str | None

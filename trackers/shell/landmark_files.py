@@ -1,4 +1,4 @@
-"""Landmarks of a face that a person has marked: CSV with the columns name, u, v."""
+"""Landmarks of a face that a person has marked, the ten or the 68 of iBUG: CSV with the columns name, u, v."""
 
 import csv
 from pathlib import Path
@@ -7,13 +7,14 @@ import numpy as np
 
 from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.landmark_sets import NAMES_68
 
 _COLUMNS = ["name", "u", "v"]
-_WANTED = f"expected a header {','.join(_COLUMNS)} and one row each for {', '.join(NAMES)}"
+_WANTED = f"expected a header {','.join(_COLUMNS)} and one row each for {', '.join(NAMES)}; or for 0 to 67"
 
 
 def read_landmarks(path: Path, image_size: tuple[int, int]) -> np.ndarray:
-    """(10, 2) pixels in the order of `NAMES`, in an image of `image_size` (columns, rows).
+    """(10, 2) pixels in the order of `NAMES`, or (68, 2) in iBUG's, in an image of `image_size` (columns, rows).
 
     Raises:
         InputError: an unreadable file, unknown, missing or repeated names, or pixels that are none of the image.
@@ -36,13 +37,16 @@ def read_landmarks(path: Path, image_size: tuple[int, int]) -> np.ndarray:
             size = f"{image_size[0]}x{image_size[1]}"
             raise InputError(f"{path}: row {number}: ({pixel[0]:g}, {pixel[1]:g}) lies outside an image of {size}.")
         points[name] = pixel
-    if missing := [name for name in NAMES if name not in points]:
+    names = NAMES_68 if points and next(iter(points)) in NAMES_68 else NAMES
+    if missing := [name for name in names if name not in points]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
-    return np.stack([points[name] for name in NAMES])
+    if other := [name for name in points if name not in names]:
+        raise InputError(f"{path}: {other[0]} beside landmarks of another kind; {_WANTED}.")
+    return np.stack([points[name] for name in names])
 
 
 def _point(row: list[str], place: str) -> tuple[str, np.ndarray]:
-    if len(row) != len(_COLUMNS) or row[0] not in NAMES:
+    if len(row) != len(_COLUMNS) or row[0] not in (*NAMES, *NAMES_68):
         raise InputError(f"{place}: {_WANTED}; got {row}.")
     try:
         pixel = np.asarray([float(entry) for entry in row[1:]])

@@ -1,10 +1,14 @@
 """A person of the generator who talks, before one camera; rendered once for all tests of a module."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, speech_schedule
 from jaxfilters.models.synthetic.face_sequence import face_sequence
@@ -19,6 +23,22 @@ def rig():
 @pytest.fixture(scope="session")
 def face():
     return default_face_model().model
+
+
+@pytest.fixture(scope="session")
+def spread():
+    """(68, 10) weights: each of 68 landmarks is a mean of the ten, the ten themselves where iBUG has them."""
+    weights = np.random.default_rng(5).dirichlet(np.full(10, 0.3), 68)
+    weights[list(FROM_68)] = np.eye(10)
+    return weights
+
+
+@pytest.fixture(scope="session")
+def face68(face, spread):
+    """A model of 68 landmarks of the same people."""
+    W = jnp.asarray(spread, face.mean.dtype)
+    product = lambda a: jnp.tensordot(W, a, 1, precision="highest")
+    return dataclasses.replace(face, mean=product(face.mean), tensor=product(face.tensor))
 
 
 @pytest.fixture(scope="session")

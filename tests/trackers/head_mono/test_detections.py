@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.models.face.landmarks import FROM_68, MEAN_SHAPE
 from jaxfilters.trackers.head.session import check_points
-from jaxfilters.trackers.head_mono import detections as module
+from jaxfilters.trackers.head_mono import detectors as module
 from jaxfilters.trackers.head_mono.detections import APART_S, STALE_S, Collector
+from jaxfilters.trackers.head_mono.detectors import CHIN, MESH_SHARE, Seen
 from jaxfilters.trackers.head_mono.start import is_symmetric
 from jaxfilters.trackers.head_mono.state import NUM_FRAMES
 
@@ -85,6 +86,41 @@ def test_old_detections_do_not_count(seen):
     collector = Collector()
     gather(collector, np.arange(NUM_FRAMES - 1) * APART_S * 1.01)
     assert collector.update(IMAGE, STALE_S + 10) is None
+
+
+class Mesh:
+    """A detector that sees the face where it is told, 68 landmarks and irises with it."""
+
+    def __init__(self, dense):
+        self.dense = dense
+
+    def detect(self, image, near):
+        return Seen(FACE, 1, self.dense, np.array([11.0, 12.0]))
+
+
+def test_more_landmarks_are_kept_with_what_is_not_seen_of_them():
+    dense = np.tile(FACE.mean(axis=0), (68, 1))
+    dense[list(FROM_68)] = FACE
+    dense[:8] = np.nan
+    found = gather(Collector(Mesh(dense)), np.arange(NUM_FRAMES) * 1.01 * APART_S)[-1]
+    np.testing.assert_array_equal(found.dense.seen, np.tile(np.arange(68) >= 8, (NUM_FRAMES, 1)))
+    np.testing.assert_array_equal(found.dense.uv[:, 8:], np.tile(dense[8:], (NUM_FRAMES, 1, 1)))
+    apart = np.linalg.norm(FACE[2:4].mean(axis=0) - FACE[:2].mean(axis=0))
+    std_px = np.sqrt(found.dense.covariance[:, :, [0, 1], [0, 1]])
+    np.testing.assert_allclose(
+        std_px[:, [20, CHIN]], np.array([1, 2])[:, None] * MESH_SHARE * apart * np.ones((5, 2, 2))
+    )
+    np.testing.assert_array_equal(found.iris_px, np.tile([11.0, 12.0], (NUM_FRAMES, 1)))
+
+
+def test_68_given_points_are_the_ten_and_all():
+    points = np.random.default_rng(0).uniform(100, 300, (68, 2))
+    found = Collector().given(points, IMAGE, 3.0)
+    np.testing.assert_array_equal(found.points[2], points[list(FROM_68)])
+    np.testing.assert_array_equal(found.dense.uv[4], points)
+    # The same frame five times tells as much as once.
+    np.testing.assert_allclose(found.dense.covariance, NUM_FRAMES * np.tile(np.eye(2), (NUM_FRAMES, 68, 1, 1)))
+    assert found.dense.misplaced_mm == 0
 
 
 def test_given_points_are_a_start_of_their_own():

@@ -12,6 +12,7 @@ import pytest
 from jaxfilters.models.face.bundle import Person
 from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.models.face.remembered import Remembered
+from jaxfilters.trackers.head_mono.focal import FocalLength
 from jaxfilters.trackers.head_mono.state import MonoTrack
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell import head_input, mono_command
@@ -60,11 +61,14 @@ def fake(monkeypatch):
     class FakeSession(mono_command.MonoSession):
         events, model, person, remembered = (), None, None, None
 
-        def __init__(self, rig, face, options, points, *, remembered=None):
+        def __init__(self, rig, face, options, points, *, detector, remembered=None):
             self.known = remembered
             self.rig, self.face, self.options, self.points, self.frames = rig, face, options, points, 0
             self.events = []
             made.append(self)
+
+        def focal_length(self):
+            return FocalLength(np.float32(1.1), np.float32(0.1))
 
         def process(self, images, times):
             assert images.shape[1:] == (1, *self.rig.shape)
@@ -139,6 +143,16 @@ def test_whom_one_run_followed_the_next_may_know(pictures, fake, tmp_path, capsy
     assert "people of another model of the face" in capsys.readouterr().err
 
 
+def test_the_focal_length_is_said_if_asked_for(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "out", "--estimate-focal", "--no-video") == 0
+    estimate = json.loads((tmp_path / "out" / "report.json").read_text())["focal_length_estimate"]
+    assert estimate["px"] == pytest.approx(1.1 * 1.2 * COLS, rel=1e-5)
+    assert estimate["std_px"] == pytest.approx(0.1 * 1.1 * 1.2 * COLS, rel=1e-5)
+    assert "the focal length looks like 84 px, give or take 8" in capsys.readouterr().out
+    assert run(pictures, "--out", tmp_path / "again", "--no-video") == 0
+    assert json.loads((tmp_path / "again" / "report.json").read_text())["focal_length_estimate"] is None
+
+
 def test_marked_landmarks_reach_the_session(pictures, fake, tmp_path):
     marks = tmp_path / "marks.csv"
     lines = [f"{name},{10 + i},{20 + i}" for i, name in enumerate(NAMES)]
@@ -202,7 +216,7 @@ def mono_options(**given):
     from argparse import Namespace
 
     usual = dict(video_source=None, camera=None, points=None, fps=None, seed=None, num_particles=None, video=False)
-    return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, known=None) | given)
+    return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, estimate_focal=False, known=None) | given)
 
 
 def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
