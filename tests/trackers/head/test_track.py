@@ -44,19 +44,19 @@ class Video:
         state, track = module.advance(self.video.rig, filters, state, images, times, is_frame, compiled(options))
         return state, jax.tree.map(lambda a: np.asarray(a)[: stop - start], track)
 
-    def track(self, options):
+    def track(self, options, seed=0):
         """The last state, and rows from the second frame on."""
-        if options not in self._tracks:
-            state, rows, filters = self.begin(options), [], searches(self.video.rig, options)
+        if (options, seed) not in self._tracks:
+            state, rows, filters = self.begin(options, seed), [], searches(self.video.rig, options)
             for start in range(1, len(self.video), CHUNK):
                 state, row = self.advance(state, start, min(start + CHUNK, len(self.video)), options, filters)
                 rows.append(row)
-            self._tracks[options] = state, jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
-        return self._tracks[options]
+            self._tracks[options, seed] = state, jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
+        return self._tracks[options, seed]
 
-    def errors(self, options):
+    def errors(self, options, seed=0):
         """Millimetres and degrees."""
-        return (self.track(options)[1].pose - self.video.poses[1:]) / UNITS
+        return (self.track(options, seed)[1].pose - self.video.poses[1:]) / UNITS
 
 
 @pytest.fixture(scope="module")
@@ -82,20 +82,15 @@ def test_the_fit_is_far_within_half_of_the_published_errors(videos, kind):
 
 @pytest.mark.parametrize("kind", ["slow", "fast"])
 def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
-    """80 frames of one face, whose registration errs in its own way: half as much again is allowed."""
-    _, track = videos[kind].track(PAPER)
-    assert np.all(rms(videos[kind].errors(PAPER)) < 1.5 * np.array(PAPER_ADAPTIVE[kind]))
-    np.testing.assert_array_equal(track.status, RIGID)
+    """80 frames of one face, whose registration errs in its own way: half as much again is allowed.
 
-
-def test_small_fixed_diffusion_loses_a_fast_head(videos):
-    _, track = videos["fast"].track(FIXED)
-    assert track.status[-1] == LOST
-    lost = track.status == LOST
-    for rows in (track.pose, track.pose_std, track.deformation, track.shape, track.image_points):
-        assert np.all(np.isnan(rows[lost]))
-        assert np.all(np.isfinite(rows[~lost]))
-    assert np.all(np.isfinite(track.score))
+    Over three draws of the particles: the errors of one are off by a third either way.
+    """
+    tracks = [videos[kind].track(PAPER, seed)[1] for seed in range(3)]
+    errors = np.concatenate([videos[kind].errors(PAPER, seed) for seed in range(3)])
+    assert np.all(rms(errors) < 1.5 * np.array(PAPER_ADAPTIVE[kind]))
+    for track in tracks:
+        np.testing.assert_array_equal(track.status, RIGID)
 
 
 @pytest.mark.parametrize("kind", ["slow", "fast"])
