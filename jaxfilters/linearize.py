@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 from jaxfilters import linalg
 from jaxfilters.gaussian import Gaussian, GaussianRoot
 from jaxfilters.kalman import factor
-from jaxfilters.materialize import materialized
 
 Function = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
@@ -105,7 +104,7 @@ def _value_and_jacobian(f, x):
     value, F = jax.vmap(along, in_axes=-1, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
     # vmap leaves F transposed in memory. XLA would fold that into the products of F, for which it then has no fast
     # kernel on a CPU; behind the barrier it makes a copy.
-    return value, materialized(F) if max(F.shape) <= factor.UNROLLED else jax.lax.optimization_barrier(F)
+    return value, F if max(F.shape) <= factor.UNROLLED else jax.lax.optimization_barrier(F)
 
 
 def _second_order(f, belief):

@@ -20,7 +20,7 @@ from jaxfilters.models.face.mirroring import Pairs, mirror_map
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays
+from jaxfilters.trackers.shell.npz_files import read_arrays, read_header
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters face model", 1
@@ -103,15 +103,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = read_arrays(path, _WANTED)
     if missing := [name for name in (*_ARRAYS, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
-    try:
-        header = json.loads(str(arrays["header"]))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: header is not JSON ({error}).") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("units") != "mm":
-        raise InputError(f'{path}: header must say format "{FORMAT}" and units "mm".')
-    if header.get("version") != VERSION:
-        raise InputError(f"{path}: version {header.get('version')}; this program reads version {VERSION}.")
-    return arrays, header
+    return arrays, read_header(arrays, path, FORMAT, VERSION)
 
 
 def _check_array(array: np.ndarray, name: str, shape: tuple, sizes: dict[str, int], path: Path) -> None:

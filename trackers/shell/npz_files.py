@@ -1,9 +1,11 @@
 """Arrays from `.npz` files that people hand over: whatever is wrong with one is said with its name."""
 
+import json
 import zipfile
 import zlib
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,3 +35,26 @@ def read_arrays(path: Path, wanted: str, known: Collection[str] | None = None) -
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); {wanted}.") from None
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: not a complete .npz file ({error}); {wanted}.") from None
+
+
+def read_header(arrays: dict[str, np.ndarray], path: Path, format: str, version: int) -> dict[str, Any]:
+    """The text `header` of arrays in millimetres, in JSON.
+
+    Args:
+        arrays: With `header`.
+        path: Of the file, for messages.
+        format: What the header must say that the file is.
+        version: Of that format.
+
+    Raises:
+        InputError: no JSON, another format or version, or other units.
+    """
+    try:
+        header = json.loads(str(arrays["header"]))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: header is not JSON ({error}).") from None
+    if not isinstance(header, dict) or header.get("format") != format or header.get("units") != "mm":
+        raise InputError(f'{path}: header must say format "{format}" and units "mm".')
+    if header.get("version") != version:
+        raise InputError(f"{path}: version {header.get('version')}; this program reads version {version}.")
+    return header

@@ -22,7 +22,7 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays
+from jaxfilters.trackers.shell.npz_files import read_arrays, read_header
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters people", 1
@@ -84,14 +84,7 @@ def _read(path: Path, face: MultilinearFace) -> People:
     arrays = read_arrays(path, _WANTED)
     if missing := [name for name in (*Remembered._fields, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
-    try:
-        header = json.loads(str(arrays["header"]))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: header is not JSON ({error}).") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("units") != "mm":
-        raise InputError(f'{path}: header must say format "{FORMAT}" and units "mm".')
-    if header.get("version") != VERSION:
-        raise InputError(f"{path}: version {header.get('version')}; this program reads version {VERSION}.")
+    header = read_header(arrays, path, FORMAT, VERSION)
     if header.get("model") != fingerprint(face):
         raise InputError(f"{path}: people of another model of the face than the one that is used (--model).")
     names = header.get("names")
