@@ -316,6 +316,7 @@ def _scan(
     return jax.lax.scan(body, state, (frames, times, jnp.arange(frames.shape[0])))
 
 
+@jax.jit  # traced once for its shapes and its program
 def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)

@@ -1,6 +1,7 @@
 """Modelled people that turn and speak as recorded, and real video, before one camera."""
 
 import sys
+from functools import cache
 
 import jax
 import numpy as np
@@ -57,6 +58,7 @@ def modelled_face(seed: int) -> MultilinearFace:
     return learn(shapes, identities=IDENTITIES, expressions=EXPRESSIONS)
 
 
+@cache
 def cross_model(seed: int) -> dict[str, Contender]:
     """The tracker with what modelled people differ in, for faces of the generator; nothing without that model."""
     try:

@@ -6,8 +6,9 @@ import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._mono_runs import DETECTED_PX, DISPLAY, camera
-from jaxfilters.models.face.bundle import Bundle, Person, Prior, projected
+from jaxfilters.models.face.bundle import Bundle, projected
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
 from jaxfilters.trackers.head_mono.start import initialise
 from jaxfilters.trackers.head_mono.state import NUM_FRAMES, MonoOptions

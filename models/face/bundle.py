@@ -17,9 +17,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
 from jaxfilters.least_squares import BoxLevenbergMarquardt, cauchy, huber
-from jaxfilters.linalg import safe_sqrt
-from jaxfilters.models.face.landmarks import EYES
-from jaxfilters.models.face.multilinear import MultilinearFace, shape
+from jaxfilters.models.face import person_prior
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig, project_shape
 
 POSE_UNITS = np.array([10.0, 10.0, 20.0, *np.radians([3.0, 3.0, 3.0])])
@@ -28,19 +28,9 @@ OUTLIER = 3.0
 """Standard deviations from which on a landmark's distance counts less (Huber's loss, then Cauchy's)."""
 _SMALLEST = 1e-12
 """Of steps and gradients: the number of steps is the limit."""
-UNTOLD = 1e-6
-"""Information, as a share of that about each parameter itself, about what the past frames do not tell."""
 HIDDEN_PX = 1e4
 """Residual of a point behind the camera, pixels."""
 Loss = Callable[[Array, float], Array]
-
-
-class Person(NamedTuple):
-    """Whose face it is."""
-
-    identity: Float[Array, " S"]
-    offset: Float[Array, "K 3"]
-    """What the model lacks of this face in every expression, model frame, millimetres."""
 
 
 class Views(NamedTuple):
@@ -60,31 +50,6 @@ class Bundle(NamedTuple):
     """Millimetres and radians."""
     expressions: Float[Array, "n A"]
     person: Person
-
-
-class Past(NamedTuple):
-    """What frames that are no longer adjusted told of the person: a Gaussian, in information form.
-
-    Minus its logarithm is `p . information p / 2 - pull . p` for the parameters p: identity, then offset.
-    """
-
-    information: Float[Array, "d d"]
-    pull: Float[Array, " d"]
-
-
-class Prior(NamedTuple):
-    """What holds a bundle beside the images; a weight of 0 lets go, 1 is Bayes' rule."""
-
-    weight: Float[ArrayLike, ""]
-    """Of identity and expressions about those of the training set, with their covariances."""
-    offset_std: Float[ArrayLike, ""]
-    """Millimetres: of each coordinate of the offset; 0 for none."""
-    eyes_apart: Float[ArrayLike, ""] = 0.0
-    """Millimetres between the centres of the eyes, if that is known: the size of everything follows from it."""
-    eyes_apart_std: Float[ArrayLike, ""] = 0.0
-    """Millimetres; 0 where it is not known."""
-    past: Past | None = None
-    """Of frames that were adjusted before."""
 
 
 class Reach(NamedTuple):
@@ -114,29 +79,6 @@ def square(distance: Float[Array, "*shape"], scale: float) -> Float[Array, "*sha
     """Distances as they are, for plain least squares."""
     del scale
     return distance
-
-
-def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
-    """Landmarks of a person with an expression in the model frame, millimetres ([4.15] and the offset)."""
-    return shape(face, person.identity, expression) + person.offset
-
-
-def parameters(person: Person) -> Float[Array, " d"]:
-    """Identity, then offset, as `Past` has them."""
-    return jnp.concatenate([person.identity, person.offset.ravel()])
-
-
-def nothing_past(face: MultilinearFace) -> Past:
-    """Of a person who is new."""
-    size = face.num_identities + face.mean.size
-    return Past(jnp.zeros((size, size), face.mean.dtype), jnp.zeros(size, face.mean.dtype))
-
-
-def eyes_apart(face: MultilinearFace, person: Person) -> Float[Array, ""]:
-    """Millimetres between the middles of the corners of either eye."""
-    corners = posed_shape(face, person, face.expression_mean)[jnp.asarray(EYES)]
-    right, left = jnp.mean(corners[:2], axis=0), jnp.mean(corners[2:], axis=0)
-    return jnp.sqrt(jnp.sum(jnp.square(left - right)))
 
 
 def adjust(
@@ -215,40 +157,34 @@ def projected(face: MultilinearFace, rig: CameraRig, bundle: Bundle) -> Float[Ar
 def all_residuals(
     face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior, *, loss: Loss = cauchy
 ) -> Float[Array, " rows"]:
-    """Residuals in standard deviations: of the landmarks ([4.18]), of identity, expressions, offset, and size.
+    """Residuals in standard deviations: of the frames (`frame_residuals`), and of the person (`person_prior`)."""
+    of_frames = frame_residuals(face, rig, views, bundle, prior.weight, loss=loss)
+    return jnp.concatenate([of_frames, person_prior.residuals(face, bundle.person, bundle.expressions, prior)])
+
+
+def frame_residuals(
+    face: MultilinearFace,
+    rig: CameraRig,
+    views: Views,
+    bundle: Bundle,
+    weight: Float[ArrayLike, ""],
+    *,
+    loss: Loss = cauchy,
+) -> Float[Array, " rows"]:
+    """Residuals in standard deviations: of the landmarks ([4.18]) and of the expressions.
 
     Distances of landmarks enter by `loss`, `huber` or `cauchy` of `jaxfilters.least_squares`.
+
+    Args:
+        face: Model.
+        rig: One camera.
+        views: Landmarks in n frames.
+        bundle: Where they are.
+        weight: Of the expressions; 1 is Bayes' rule.
+        loss: Of distances.
     """
-    whiten = lambda covariance, x: jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(covariance), x.T, lower=True)
-    identity = whiten(face.identity_covariance, (bundle.person.identity - face.identity_mean)[None])
-    expressions = whiten(face.expression_covariance, bundle.expressions - face.expression_mean)
-    known = jnp.asarray(prior.offset_std) > 0
-    offset = jnp.where(known, bundle.person.offset / jnp.where(known, prior.offset_std, 1.0), 0.0)
-    held = prior.weight * jnp.concatenate([identity.ravel(), expressions.ravel()])
-    measured = jnp.asarray(prior.eyes_apart_std) > 0
-    wrong = eyes_apart(face, bundle.person) - prior.eyes_apart
-    size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
-    before = jnp.zeros(0, offset.dtype) if prior.past is None else _of_past(face, prior.past, bundle.person)
-    return jnp.concatenate(
-        [_of_views(face, rig, views, bundle, loss).ravel(), held, offset.ravel(), size[None], before]
-    )
-
-
-def _of_past(face: MultilinearFace, past: Past, person: Person) -> Array:
-    """Residuals of which half the sum of squares is the past's part of the energy, but for a constant.
-
-    In units of each parameter's own information and about the mean person, so that one small constant can stand for
-    what the past does not tell, and rounding does not grow with what it does.
-    """
-    product = lambda a, b: jnp.matmul(a, b, precision="highest")
-    scale = safe_sqrt(jnp.diagonal(past.information))
-    unit = jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 1.0)
-    mean = parameters(Person(face.identity_mean, jnp.zeros_like(face.mean)))
-    pull = unit * (past.pull - product(past.information, mean))
-    untold = UNTOLD * jnp.eye(unit.size, dtype=unit.dtype)
-    root = jnp.linalg.cholesky(past.information * unit[:, None] * unit + untold)
-    towards = jax.scipy.linalg.solve_triangular(root, pull, lower=True)
-    return product(root.T, (parameters(person) - mean) / unit) - towards
+    held = weight * person_prior.expression_residuals(face, bundle.person.identity, bundle.expressions)
+    return jnp.concatenate([_of_views(face, rig, views, bundle, loss).ravel(), held.ravel()])
 
 
 def _of_views(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, loss: Loss) -> Array:

@@ -1,13 +1,15 @@
 """Which frames of a video a face is adjusted to: those that turn most (Sugano 2007), or those that tell most."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Person, Prior, Views, all_residuals
+from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Views, frame_residuals
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig
 
 TIE = 1e-9
@@ -90,21 +92,31 @@ def told(face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prio
         offset = person[count:].reshape(frame.person.offset.shape)
         who = Person(frame.person.identity + s_std * person[:count], frame.person.offset + prior.offset_std * offset)
         pose, expression = frame.poses + units[:6] * own[:6], frame.expressions + units[6:] * own[6:]
-        # Without weights: what is known beforehand must not count once for every frame.
-        return all_residuals(face, rig, view, Bundle(pose, expression, who), Prior(0.0, 0.0))
+        # What is known of the person beforehand must not count once for every frame.
+        return frame_residuals(face, rig, view, Bundle(pose, expression, who), prior.weight)
 
     of_person, own = jnp.zeros(count + frame.person.offset.size), jnp.zeros_like(units)
-    J, L = jax.jacfwd(residuals, (0, 1))(of_person, own)
-    r = residuals(of_person, own)
+    information, by_person, gradient = reduced(residuals, of_person, own)
+    return Told(information, units[:, None] * by_person, gradient)
+
+
+def reduced(
+    residuals: Callable[[Array, Array], Array], kept: Float[Array, " d"], gone: Float[Array, " m"]
+) -> tuple[Float[Array, "d d"], Float[Array, "m d"], Float[Array, " d"]]:
+    """What residuals tell of some parameters once the others are the likeliest for them: a Schur complement.
+
+    Args:
+        residuals: Of both.
+        kept: Where they are.
+        gone: The same, in units of which some determine a residual of one.
+
+    Returns:
+        Information about the first, how the others respond to them, and the gradient of the energy by the first.
+    """
+    J, L = jax.jacfwd(residuals, (0, 1))(kept, gone)
+    r = residuals(kept, gone)
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
-    usual = a_std[:, None] * jnp.linalg.inv(face.expression_covariance) * a_std
-    held = jax.scipy.linalg.block_diag(jnp.zeros((6, 6)), jnp.square(prior.weight) * usual)
-    root = (jnp.linalg.cholesky(product(L.T, L) + held + 1e-6 * jnp.eye(len(held))), True)
-    by_person = -jax.scipy.linalg.cho_solve(root, product(L.T, J))
-    apart = jnp.concatenate([jnp.zeros(6), (frame.expressions[0] - face.expression_mean) / a_std])
-    of_own = product(L.T, r) + product(held, apart)
-    return Told(
-        product(J.T, J) + product(product(L.T, J).T, by_person),
-        units[:, None] * by_person,
-        product(J.T, r) + product(by_person.T, of_own),
-    )
+    root = (jnp.linalg.cholesky(product(L.T, L) + 1e-6 * jnp.eye(gone.size)), True)
+    response = -jax.scipy.linalg.cho_solve(root, product(L.T, J))
+    information = product(J.T, J) + product(product(L.T, J).T, response)
+    return information, response, product(J.T, r) + product(response.T, product(L.T, r))

@@ -119,13 +119,15 @@ def advance(
 
     def one(state: HeadState, inputs: tuple) -> tuple[HeadState, HeadTrack]:
         images, time, is_frame = inputs
-        _, empty = jax.eval_shape(lambda: _step(rig, searches, state, images, time, options))
+        step = lambda: _step(rig, searches, state, images, time, options)
+        _, empty = jax.eval_shape(step)
         nothing = lambda: (state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), empty))
-        return jax.lax.cond(is_frame, lambda: _step(rig, searches, state, images, time, options), nothing)
+        return jax.lax.cond(is_frame, step, nothing)
 
     return jax.lax.scan(one, state, (images, times, is_frame))
 
 
+@partial(jax.jit, static_argnames="options")  # traced once for its shapes and its program
 def _step(
     rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadOptions
 ) -> tuple[HeadState, HeadTrack]:

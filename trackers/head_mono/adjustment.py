@@ -9,21 +9,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.gaussian import Gaussian
 from jaxfilters.least_squares import cauchy, huber
-from jaxfilters.models.face.bundle import (
-    Adjustment,
-    Bundle,
-    Past,
-    Person,
-    Prior,
-    Views,
-    adjust,
-    eyes_apart,
-    posed_shape,
-    square,
-)
+from jaxfilters.models.face import person_prior
+from jaxfilters.models.face.bundle import Adjustment, Bundle, Views, adjust, square
 from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import patches_of
+from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.state import POSE
 from jaxfilters.trackers.head_mono.past import joined, left_behind, seen_by, units
@@ -83,24 +74,25 @@ def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Pers
 def uncertainty(
     face: MultilinearFace,
     window: Window,
-    past: Past | None,
+    prior: Prior,
+    person: Person,
     response: Float[Array, "m d"],
-    options: MonoOptions,
 ) -> Float[Array, "m m"]:
     """Covariance of what responds to identity and offset, by what is not known of them."""
-    total = known(face, past, options) + jnp.sum(window.information, axis=0)
+    total = known(face, prior, person) + jnp.sum(window.information, axis=0)
     root = jnp.linalg.cholesky(total)
     part = jax.scipy.linalg.solve_triangular(root, response.T, lower=True)
     return jnp.matmul(part.T, part, precision="highest")
 
 
 def choose(
-    face: MultilinearFace, window: Window, past: Past | None, frame: Frame, options: MonoOptions
+    face: MultilinearFace, window: Window, prior: Prior, person: Person, frame: Frame, options: MonoOptions
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Which frame of the window the new one replaces, and whether it does."""
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
-        place, gain = by_information(window.information, frame.told.information, known(face, past, options), may_go)
+        beside = known(face, prior, person)
+        place, gain = by_information(window.information, frame.told.information, beside, may_go)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
@@ -128,13 +120,14 @@ def adjusted(
         place: Which frame of the window it replaces.
         options: Constants.
     """
-    past = state.past
-    if past is not None and options.past == "marginalised":
-        past = joined(past, left_behind(stranger, face, state.window, state.person, place, options))
+    prior = state.prior
+    if prior.past is not None and options.past == "marginalised":
+        gone = left_behind(stranger, face, state.window, state.person, place, prior)
+        prior = prior._replace(past=joined(prior.past, gone))
     start = state.person
     if options.is_published:
         start = start._replace(identity=_average(state))
-    state = state._replace(window=_with(state.window, frame, place), past=past, num_adjusted=state.num_adjusted + 1)
+    state = state._replace(window=_with(state.window, frame, place), prior=prior, num_adjusted=state.num_adjusted + 1)
     bundle, info = fitted(stranger, face, rig, state, state.window.bundle(start), options)
     identity = jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan)
     bundle = bundle._replace(person=bundle.person._replace(identity=identity))
@@ -152,9 +145,9 @@ def fitted(
     steps: tuple[int, int] = STEPS,
 ) -> tuple[Bundle, Adjustment]:
     """The window adjusted to one of the faces that it may be of; arguments are those of `adjusted` and `adjust`."""
-    prior = options.prior
-    if state.past is not None:
-        prior = prior._replace(past=seen_by(state.past, stranger, face))
+    prior = state.prior
+    if prior.past is not None:
+        prior = prior._replace(past=seen_by(prior.past, stranger, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
     return adjust(face, rig, state.window.views, start, prior, options.reach, steps=steps, losses=losses)
 
@@ -181,7 +174,7 @@ def settled(
     """
     person = bundle.person
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    state = state._replace(window=informed(face, rig, window, person, options.prior))
+    state = state._replace(window=informed(face, rig, window, person, state.prior))
     if options.is_published:
         person = person._replace(identity=_average(state))
     model, modes = model_of(face, person, state.registered.templates)
@@ -232,36 +225,32 @@ def _average(state: MonoState) -> Array:
     return jnp.sum(jnp.where(used[:, None], state.identities, 0.0), axis=0) / jnp.sum(used)
 
 
-def known(face: MultilinearFace, past: Past | None, options: MonoOptions) -> Float[Array, "d d"]:
-    """Information about identity and offset beside the window's, in standard deviations."""
-    both = prior_information(face, options) + _of_eyes(face, options)
-    if past is not None:
-        unit = units(face, options)
-        both = both + unit[:, None] * past.information * unit
-    return both
+def known(face: MultilinearFace, prior: Prior, person: Person) -> Float[Array, "d d"]:
+    """Information about identity and offset beside the window's, in standard deviations, at a person."""
+    both = prior_information(face, person, prior)
+    if prior.past is None:
+        return both
+    unit = units(face, prior)
+    return both + unit[:, None] * prior.past.information * unit
 
 
-def prior_information(face: MultilinearFace, options: MonoOptions) -> Float[Array, "d d"]:
-    """Information about identity and offset before anything is measured, in standard deviations."""
-    std = face.identity_std
-    identity = options.prior_weight**2 * std[:, None] * jnp.linalg.inv(face.identity_covariance) * std
-    if not options.prior_weight:
-        # The box of two deviations to either side is all that is known: as much as its variance of 4 / 3.
-        identity = 0.75 * jnp.eye(std.size, dtype=std.dtype)
-    offset = jnp.eye(3 * face.num_landmarks, dtype=std.dtype) * (options.offset_std > 0)
-    both = jax.scipy.linalg.block_diag(identity, offset)
-    return both + UNKNOWN * jnp.eye(len(both), dtype=std.dtype)
+def prior_information(face: MultilinearFace, person: Person, prior: Prior) -> Float[Array, "d d"]:
+    """Information about identity and offset before anything is seen, in standard deviations.
 
+    Args:
+        face: Model.
+        person: Whose size decides how far a face may differ from others.
+        prior: What holds the face; the past is not counted.
+    """
+    count, std = face.num_identities, face.identity_std
+    prior = prior._replace(past=None)
 
-def _of_eyes(face: MultilinearFace, options: MonoOptions) -> Array | float:
-    """What the distance between the eyes tells of the person, where it is known."""
-    if not options.prior.eyes_apart_std:
-        return 0.0
+    def residuals(y: Array) -> Array:
+        offset = person.offset + prior.offset_std * y[count:].reshape(person.offset.shape)
+        who = Person(person.identity + std * y[:count], offset)
+        return person_prior.residuals(face, who, face.expression_mean[None], prior)
 
-    def apart(y: Array) -> Array:
-        identity = face.identity_mean + face.identity_std * y[: face.num_identities]
-        offset = options.offset_std * y[face.num_identities :].reshape(face.mean.shape)
-        return eyes_apart(face, Person(identity, offset))
-
-    slope = jax.grad(apart)(jnp.zeros(face.num_identities + face.mean.size)) / options.prior.eyes_apart_std
-    return slope[:, None] * slope
+    J = jax.jacfwd(residuals)(jnp.zeros(count + face.mean.size, std.dtype))
+    # Without a weight the box of two deviations to either side is all that is known: as much as its variance of 4 / 3.
+    boxed = jnp.where(jnp.asarray(prior.weight) > 0, 0.0, 0.75) * (jnp.arange(J.shape[1]) < count)
+    return jnp.matmul(J.T, J, precision="highest") + jnp.diag(boxed + UNKNOWN)

@@ -1,42 +1,33 @@
 """A start from the 68 landmarks of iBUG, of which the tracker goes on with ten.
 
 Many landmarks tell more of a face than the ten that can be followed: who it is, and so how large. What they tell of the
-identity is kept as a Gaussian (`Past`), in which nothing else is left of them: the frames that the face is adjusted to
-later must not count the same detections again.
+face of the ten is kept as a Gaussian (`Past`), in which nothing else is left of them: the frames that the face is
+adjusted to later must not count the same detections again.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters.models.face.bundle import (
-    Adjustment,
-    Bundle,
-    Past,
-    Person,
-    Prior,
-    Reach,
-    Views,
-    adjust,
-    nothing_past,
-    posed_shape,
-    projected,
-)
-from jaxfilters.models.face.frame_selection import told
+from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adjust, frame_residuals, projected
+from jaxfilters.models.face.frame_selection import reduced, told
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, restricted
+from jaxfilters.models.face.person_prior import Past, Person, Prior, parameters, seen_size
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head_mono.start import WIDE, Start
 
 NUM_DENSE = 68
-STEPS, ROUNDS = (5, 15), 3
-"""Of both stages of each adjustment; adjustments."""
-REACH = WIDE._replace(identity=12.0, deviations=12.0)
-"""Of the adjustment, which sets out from that to the ten; wide, as the push moves the mean by several deviations."""
+STEPS = (5, 30)
+"""Of both stages of the adjustment, which sets out from that to the ten."""
+UNKNOWN = 1e-6
+"""Information about what nothing tells of, such as what a detector misplaces that is exact."""
+REACH = WIDE._replace(deviations=4.0)
+"""Of the adjustment."""
 
 
 class Dense(NamedTuple):
@@ -52,34 +43,13 @@ class Dense(NamedTuple):
     """By how much they lie beside the model's landmarks, the same in all frames: standard deviation of a coordinate."""
 
 
-class Size(NamedTuple):
-    """A push of the logarithm of a face's size, which is linear in the identity here."""
-
-    strength: Float[Array, ""]
-    """What the logarithm gets: the push of as many parameters that the images determine."""
-    slope: Float[Array, " S"]
-    """Of the logarithm, by the identity."""
-    center: Float[Array, ""]
-    """Of slope times identity: where the push was made."""
-
-    @property
-    def information(self) -> Float[Array, "S S"]:
-        """About the identity."""
-        return self.strength * self.slope[:, None] * self.slope
-
-    @property
-    def pull(self) -> Float[Array, " S"]:
-        """As `Past.pull`: at the center it leads towards larger faces."""
-        return self.strength * (1 + self.center) * self.slope
-
-
 class DenseStart(NamedTuple):
     """What many landmarks say."""
 
     start: Start
     """Of the ten."""
     past: Past
-    """What they tell of the identity of the ten's face."""
+    """What they tell of the face of the ten."""
 
 
 def tracked(face: MultilinearFace) -> MultilinearFace:
@@ -121,96 +91,138 @@ def _adjusted(
     # The distance of the eyes is that of landmarks among the ten: the tracker's own prior has it.
     prior = prior._replace(offset_std=both_std, eyes_apart_std=jnp.zeros_like(offset_std))
     begun = start.bundle._replace(person=Person(start.bundle.person.identity, jnp.zeros_like(face.mean)))
-
-    def closer(_: Array | int, carry: tuple[Bundle, Adjustment, Size]) -> tuple[Bundle, Adjustment, Size]:
-        bundle, info = adjust(_pushed(face, carry[2], prior), rig, views, carry[0], prior, reach, steps=STEPS)
-        return bundle, info, _unshrunk(face, rig, views, bundle, prior)
-
-    zero = jnp.zeros((), start.uv.dtype)
-    unadjusted = Adjustment(zero, zero, jnp.zeros((), jnp.int32))
-    # Nearly as many as the images have coordinates of landmarks: a search that sets out too small comes back slowly.
-    many = 2.0 * jnp.sum(jnp.any(views.seen, axis=0)).astype(zero.dtype)
-    first = begun, unadjusted, _push_at(face, begun.person, many)
-    found, info, size = jax.lax.fori_loop(0, ROUNDS, closer, first)
+    found, info = adjust(face, rig, views, begun, prior, reach, steps=STEPS)
     ten = restricted(face, FROM_68)
     # The rest of the offset is the detector's, and no part of the face.
     of_face = jnp.square(offset_std / jnp.where(both_std > 0, both_std, 1.0))
     person = Person(found.person.identity, of_face * found.person.offset[jnp.asarray(FROM_68)])
     bundle = Bundle(found.poses, found.expressions, person)
-    information, pull = told_of_identity(face, rig, views, found, prior)
-    none, count = nothing_past(ten), face.num_identities
-    past = Past(
-        none.information.at[:count, :count].set(information + size.information),
-        none.pull.at[:count].set(pull + size.pull),
-    )
+    past = told_of_ten(face, rig, views, found, person, prior, misplaced)
     return DenseStart(Start(bundle, info, projected(ten, rig, bundle)), past)
 
 
-def _unshrunk(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Size:
-    """What keeps a face from shrinking for no reason.
+def told_of_ten(
+    face: MultilinearFace,
+    rig: CameraRig,
+    views: Views,
+    bundle: Bundle,
+    person: Person,
+    prior: Prior,
+    misplaced: Float[ArrayLike, ""],
+) -> Past:
+    """What views of the 68 tell of identity and offset of the ten, the rest integrated out.
 
-    A small face near by looks like a large one far away. What it differs by from the average then differs by fewer
-    millimetres, too, which the priors like better: every squared term of theirs falls with the square of the size.
-    That is no evidence. Integrals over those parameters instead of their likeliest values would have factors of the
-    size that make up for it, one for each parameter that the images determine; so here the logarithm of the size gets
-    as much of a push as it is pulled: by offset and expressions as they are, by the identity as its parameters are
-    determined.
+    Args:
+        face: Model of the 68.
+        rig: One camera.
+        views: Landmarks in n frames.
+        bundle: Adjusted to them; of its offset a part is the detector's.
+        person: Of the ten, with the other part.
+        prior: What held the bundle.
+        misplaced: Standard deviation of the detector's part, millimetres.
     """
-    person, weight2 = bundle.person, jnp.square(prior.weight)
-    apart = bundle.expressions - face.expression_mean
-    by_expressions = jnp.sum(apart.T * jnp.linalg.solve(face.expression_covariance, apart.T))
-    known = jnp.asarray(prior.offset_std) > 0
-    by_offset = jnp.sum(jnp.square(jnp.where(known, person.offset / jnp.where(known, prior.offset_std, 1.0), 0.0)))
-    information, _ = told_of_identity(face, rig, views, bundle, prior)
-    beforehand = weight2 * jnp.linalg.inv(face.identity_covariance)
-    determined = jnp.trace(jnp.linalg.solve(information + beforehand, information))
-    pulled = weight2 * (by_expressions + determined) + by_offset
-    return _push_at(face, person, pulled)
+    split, y = _Parts(face), _Parts(face).joined(person, bundle.person.offset, misplaced)
+    units = jnp.concatenate([jnp.asarray(POSE_UNITS, y.dtype), face.expression_std])
+    std = jnp.asarray(prior.offset_std), jnp.asarray(misplaced)
+    of_face = jnp.sqrt(jnp.maximum(jnp.square(std[0]) - jnp.square(std[1]), 0.0))
+
+    def held(y: Array, expression: Array) -> tuple[Array, Array]:
+        """The offsets of the ten, and all others, in standard deviations."""
+        own, rest, beside = split.offsets(y)
+        size = seen_size(face, split.identity(y), expression[None])
+        in_std = lambda value, std: jnp.where(std > 0, value / jnp.where(std > 0, std, 1.0), 0.0) / size
+        return in_std(own, of_face), jnp.concatenate([in_std(rest, std[0]), beside / size])
+
+    def of_frame(inputs: tuple) -> tuple[Array, Array]:
+        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
+
+        def residuals(y: Array, own: Array) -> Array:
+            who, a = split.person(y, misplaced), expression + units[6:] * own[6:]
+            seen = frame_residuals(face, rig, view, Bundle(pose + units[:6] * own[:6], a, who), prior.weight)
+            # Offsets are held once, in proportion to the size that the face has in all frames.
+            return jnp.concatenate([seen, *(part / np.sqrt(len(views.uv)) for part in held(y, a[0]))])
+
+        information, _, gradient = reduced(residuals, y, jnp.zeros_like(units))
+        return information, gradient
+
+    # One by one: batches of factorisations can stand still on two cores.
+    each = jax.lax.map(of_frame, (views, bundle.poses, bundle.expressions))
+    information, gradient = (jnp.sum(part, axis=0) for part in each)
+    # How the offsets of the ten are held is known to the tracker.
+    ours = lambda y: jax.vmap(lambda a: held(y, a)[0])(bundle.expressions).ravel() / np.sqrt(len(views.uv))
+    J, product = jax.jacfwd(ours)(y), lambda a, b: jnp.matmul(a, b, precision="highest")
+    kept, gone = np.split(np.arange(y.size), [split.ends[1]])
+    whole = Quadratic(information + jnp.diag(UNKNOWN * jnp.ones(y.size)), gradient)
+    told, before = without(whole, kept, gone), product(J.T, J)[np.ix_(kept, kept)]
+    information, gradient = told.information - before, told.gradient - product(J.T, ours(y))[kept]
+    return Past(information, product(information, parameters(person)) - gradient)
 
 
-def _push_at(face: MultilinearFace, person: Person, strength: Array) -> Size:
-    slope = jax.grad(lambda identity: log_size(face, Person(identity, person.offset)))(person.identity)
-    return Size(strength, slope, jnp.sum(slope * person.identity))
+class _Parts:
+    """All that the 68 landmarks of somebody have in common in all frames, in one vector.
+
+    Identity, the offsets of the ten, those of the others, and what the detector misplaces the ten by, in its standard
+    deviations.
+    """
+
+    def __init__(self, face: MultilinearFace) -> None:
+        self._ten = np.array(FROM_68)
+        self._others = np.setdiff1d(np.arange(face.num_landmarks), self._ten)
+        sizes = face.num_identities, 3 * self._ten.size, 3 * self._others.size
+        self.ends = np.cumsum(sizes)
+
+    def joined(self, ten: Person, offset: Float[Array, "68 3"], misplaced: Float[ArrayLike, ""]) -> Float[Array, " d"]:
+        """Of the ten's person, and the offset of all with what is misplaced."""
+        beside = (offset[self._ten] - ten.offset) / jnp.where(misplaced > 0, misplaced, 1.0)
+        return jnp.concatenate([parameters(ten), offset[self._others].ravel(), beside.ravel()])
+
+    def identity(self, y: Float[Array, " d"]) -> Float[Array, " S"]:
+        """Of the person."""
+        return y[: self.ends[0]]
+
+    def offsets(self, y: Float[Array, " d"]) -> list[Array]:
+        """Of the ten, of the others, and what is misplaced."""
+        return jnp.split(y[self.ends[0] :], self.ends[1:] - self.ends[0])
+
+    def person(self, y: Float[Array, " d"], misplaced: Float[ArrayLike, ""]) -> Person:
+        """Of all landmarks, with what is misplaced."""
+        own, rest, beside = (part.reshape(-1, 3) for part in self.offsets(y))
+        offset = jnp.zeros((self._ten.size + self._others.size, 3), y.dtype)
+        return Person(self.identity(y), offset.at[self._ten].set(own + misplaced * beside).at[self._others].set(rest))
 
 
-def _pushed(face: MultilinearFace, size: Size, prior: Prior) -> MultilinearFace:
-    """The model with people as they are likely before the images and after the push."""
-    weight2 = jnp.square(prior.weight)
-    beforehand = weight2 * jnp.linalg.inv(face.identity_covariance)
-    covariance = jnp.linalg.inv(beforehand + size.information)
-    mean = jnp.matmul(
-        covariance, jnp.matmul(beforehand, face.identity_mean, precision="highest") + size.pull, precision="highest"
-    )
-    return replace(face, identity_mean=mean, identity_covariance=weight2 * (covariance + covariance.T) / 2)
+class Quadratic(NamedTuple):
+    """An energy about a point: `gradient . x + x . information x / 2`."""
+
+    information: Float[Array, "d d"]
+    gradient: Float[Array, " d"]
 
 
-def log_size(face: MultilinearFace, person: Person) -> Float[Array, ""]:
-    """Logarithm of how widely the landmarks spread across the line of sight of a face that looks into the camera."""
-    across = posed_shape(face, person, face.expression_mean)[:, :2]
-    return 0.5 * jnp.log(jnp.sum(jnp.square(across - jnp.mean(across, axis=0))))
+def without(energy: Quadratic, kept: Int[np.ndarray, " kept"], gone: Int[np.ndarray, " gone"]) -> Quadratic:
+    """The energy of some parameters where the others are the likeliest."""
+    H, g = energy
+    product = lambda a, b: jnp.matmul(a, b, precision="highest")
+    root = (jnp.linalg.cholesky(H[np.ix_(gone, gone)]), True)
+    share = jax.scipy.linalg.cho_solve(root, H[np.ix_(gone, kept)])
+    about = H[np.ix_(kept, kept)] - product(share.T, H[np.ix_(gone, kept)])
+    return Quadratic((about + about.T) / 2, g[kept] - product(share.T, g[gone]))
 
 
-def told_of_identity(
-    face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior
-) -> tuple[Float[Array, "S S"], Float[Array, " S"]]:
-    """Information and pull of all views together once poses, expressions and offset have had their part."""
-    person, std, size = bundle.person, face.identity_std, face.num_identities
+def told_of_person(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Quadratic:
+    """What all views together tell of identity and offset, about those of a bundle, poses and expressions aside.
+
+    The offset's standard deviation must not be 0 if it is to be told of.
+    """
 
     def one(inputs: tuple) -> tuple[Array, Array]:
         view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
-        of_frame = told(face, rig, view, Bundle(pose, expression, person), prior)
+        of_frame = told(face, rig, view, Bundle(pose, expression, bundle.person), prior)
         return of_frame.information, of_frame.gradient
 
     # One by one: batches of factorisations can stand still on two cores.
     each = jax.lax.map(one, (views, bundle.poses, bundle.expressions))
     information, gradient = (jnp.sum(part, axis=0) for part in each)
     known = jnp.asarray(prior.offset_std) > 0
-    held = jnp.where(known, person.offset.ravel() / jnp.where(known, prior.offset_std, 1.0), 0.0)
-    product = lambda a, b: jnp.matmul(a, b, precision="highest")
-    of_offset = information[size:, size:] + jnp.eye(held.size, dtype=held.dtype)
-    root = (jnp.linalg.cholesky(of_offset), True)
-    share = jax.scipy.linalg.cho_solve(root, information[size:, :size])
-    about = information[:size, :size] - product(share.T, information[size:, :size])
-    slope = gradient[:size] - product(share.T, gradient[size:] + held)
-    about = (about + about.T) / 2 / std[:, None] / std
-    return about, product(about, person.identity) - slope / std
+    offset = jnp.full(face.mean.size, 1.0, gradient.dtype) / jnp.where(known, prior.offset_std, 1.0)
+    inverse = jnp.concatenate([1 / face.identity_std, offset])
+    return Quadratic(inverse[:, None] * information * inverse, inverse * gradient)

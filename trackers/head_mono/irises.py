@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.models.face.bundle import Past, Person, Prior, Views, nothing_past, posed_shape, projected
+from jaxfilters.models.face.bundle import Views, projected
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Past, Person, Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.trackers.head_mono.dense import log_size, told_of_identity
+from jaxfilters.trackers.head_mono.adjustment import prior_information
+from jaxfilters.trackers.head_mono.dense import told_of_person
 from jaxfilters.trackers.head_mono.past import joined
 from jaxfilters.trackers.head_mono.start import Start
 
@@ -58,24 +60,25 @@ def _resized(
     face: MultilinearFace, rig: CameraRig, start: Start, views: Views, past: Past, iris_px: Array, prior: Prior
 ) -> tuple[Start, Past]:
     bundle, count = start.bundle, face.num_identities
-    person = bundle.person
+    person, none = bundle.person, jnp.zeros(face.mean.size, start.uv.dtype)
+    product = lambda a, b: jnp.matmul(a, b, precision="highest")
     larger, std = measured(face, rig, start, iris_px)
-    slope = jax.grad(lambda identity: log_size(face, Person(identity, person.offset)))(person.identity)
+    slope = jax.grad(lambda identity: log_size(face, identity))(person.identity)
     people = jnp.square(prior.weight) * jnp.linalg.inv(face.identity_covariance)
     information = slope[:, None] * slope / jnp.square(std) + REGULAR * people
-    product = lambda a, b: jnp.matmul(a, b, precision="highest")
     pull = slope / jnp.square(std) * (larger + jnp.sum(slope * person.identity))
     pull = pull + REGULAR * product(people, face.identity_mean)
     nothing = nothing_past(face)
     more = Past(nothing.information.at[:count, :count].set(information), nothing.pull.at[:count].set(pull))
-    of_views, _ = told_of_identity(face, rig, views, bundle, prior)
-    total = people + past.information[:count, :count] + of_views + information
     # The start is the likeliest without the irises; to first order this is the likeliest with them.
-    moved = jnp.linalg.solve(total, slope / jnp.square(std) * larger)
-    factor = jnp.exp(jnp.sum(slope * moved))
-    bundle = bundle._replace(
-        poses=bundle.poses.at[:, :3].multiply(factor), person=person._replace(identity=person.identity + moved)
-    )
+    loose = jnp.where(jnp.asarray(prior.offset_std) > 0, prior.offset_std, 1.0)
+    unit = jnp.concatenate([face.identity_std, loose + none])
+    beside = past.information + more.information + told_of_person(face, rig, views, bundle, prior).information
+    total = prior_information(face, person, prior) + unit[:, None] * beside * unit
+    moved = unit * jnp.linalg.solve(total, unit * jnp.concatenate([slope / jnp.square(std) * larger, none]))
+    factor = jnp.exp(jnp.sum(slope * moved[:count]))
+    person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
+    bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
     return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), joined(past, more)
 
 

@@ -3,15 +3,14 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.models.face.bundle import Past, Person, parameters
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.trackers.head_mono.state import MonoOptions, Window
+from jaxfilters.models.face.person_prior import Past, Person, Prior, parameters
+from jaxfilters.trackers.head_mono.state import Window
 
 
-def units(face: MultilinearFace, options: MonoOptions) -> Float[Array, " d"]:
+def units(face: MultilinearFace, prior: Prior) -> Float[Array, " d"]:
     """Standard deviations of identity and offset, in which a window counts its information."""
-    offset = jnp.full(face.mean.size, options.offset_std, face.mean.dtype)
-    return jnp.concatenate([face.identity_std, offset])
+    return jnp.concatenate([face.identity_std, jnp.full(face.mean.size, prior.offset_std, face.mean.dtype)])
 
 
 def left_behind(
@@ -20,7 +19,7 @@ def left_behind(
     window: Window,
     person: Person,
     place: Int[Array, ""],
-    options: MonoOptions,
+    prior: Prior,
 ) -> Past:
     """What one frame of the window told, about the offset from the stranger's face.
 
@@ -30,9 +29,9 @@ def left_behind(
         window: Informed of the person.
         person: About that face.
         place: Of the frame.
-        options: Constants.
+        prior: What holds the person.
     """
-    unit = units(face, options)
+    unit = units(face, prior)
     inverse = jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
     information = inverse[:, None] * window.information[place] * inverse
     person = person._replace(offset=person.offset + face.mean - stranger.mean)

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfilters.models.face.bundle import Person, posed_shape
 from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis
+from jaxfilters.models.face.person_prior import Person, posed_shape
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.state import NUM_MODES
 

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.models.face.bundle import Bundle, Person, posed_shape
+from jaxfilters.models.face.bundle import Bundle
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.remembered import Remembered, hypotheses
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.state import POSE
@@ -110,24 +111,23 @@ def weighed(
     """
     bundle, info = fitted(stranger, face, rig, state, start, options, STEPS)
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    told = jnp.sum(informed(face, rig, window, bundle.person, options.prior).information, axis=0)
-    before, after = prior_information(face, options), known(face, state.past, options) + told
+    told = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
+    people = Prior(state.prior.weight, state.prior.offset_std)
+    before = prior_information(face, bundle.person, people)
+    after = known(face, state.prior, bundle.person) + told
     return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
 
 
-def as_remembered(
-    stranger: MultilinearFace, face: MultilinearFace, state: MonoState, options: MonoOptions
-) -> Remembered:
+def as_remembered(stranger: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
     """The person who is followed, as one to remember: identity with what is not known of it, and offset.
 
     Args:
         stranger: The model.
         face: Whom the state is about: the same, or somebody who is remembered.
         state: With a window that has been informed of that person.
-        options: Constants.
     """
-    total = known(face, state.past, options) + jnp.sum(state.window.information, axis=0)
-    unit, count = units(face, options), face.num_identities
+    total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
+    unit, count = units(face, state.prior), face.num_identities
     covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
     offset = state.person.offset + face.mean - stranger.mean
     return Remembered(state.person.identity[None], covariance[None], offset[None])

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfilters.models.face.bundle import Past, Person, Views
+from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Past, Person
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel
@@ -31,6 +32,8 @@ MOST_REPROJECTION = 0.05
 """Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
 DEPTH_MM = (100.0, 5000.0)
 """In which a face may be."""
+_STATIC = ("num_particles", "landmarks", "selection", "past", "adjust")
+"""Options that a compiled program is for; the others reach it as numbers, or do not concern it."""
 _begun = jax.jit(begin, static_argnames="options")
 
 
@@ -143,8 +146,8 @@ class _MonoTracker:
         self._whole, face = face, tracked(face)
         """With all its landmarks."""
         self._face, self._options, self._points, self._detections = face, options, points, detections
-        # What is compiled knows its options, but need not be compiled anew for another seed.
-        self._compiled = replace(options, seed=0)
+        # What is compiled knows its options, but need not be compiled anew for other numbers.
+        self._compiled = replace(MonoOptions(), **{name: getattr(options, name) for name in _STATIC})
         self._remembered = remembered
         self._people = people(face, remembered)
         self._system = System(face, face, rig, search_of(rig, options))
@@ -196,7 +199,7 @@ class _MonoTracker:
             detections.images[[found.frame, -1]],
             zero,
             options=self._compiled,
-            past=found.past,
+            prior=self._options.prior._replace(past=found.past),
         )
         self._num_told, self._system = 0, self._system._replace(face=self._face)
         state = self._recognised(state)
@@ -208,7 +211,7 @@ class _MonoTracker:
         return self._recognised(state), track
 
     def remembered(self, state: MonoState) -> Remembered:
-        return as_remembered(self._system.stranger, self._system.face, state, self._compiled)
+        return as_remembered(self._system.stranger, self._system.face, state)
 
     def focal_length(self, state: MonoState) -> FocalLength:
         return focal_length(self._system.stranger, self._system.face, self.rig, state, self._compiled)

@@ -11,22 +11,11 @@ from jaxtyping import Array, Float, Int, Num
 
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.bundle import (
-    Adjustment,
-    Bundle,
-    Past,
-    Person,
-    Prior,
-    Reach,
-    Views,
-    adjust,
-    nothing_past,
-    posed_shape,
-    projected,
-)
+from jaxfilters.models.face.bundle import Adjustment, Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import SIZE, SKIN_NORMALS, WIDE_SIZE, patches_of, unknown_slopes, windows
+from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, posed_shape
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.recent import nothing_changed
 from jaxfilters.trackers.head.search import Searches, searches
@@ -125,7 +114,7 @@ def begin(
     images: Num[Array, "2 rows cols"],
     time: Float[Array, ""],
     options: MonoOptions,
-    past: Past | None = None,
+    prior: Prior,
 ) -> MonoState:
     """State in the last frame of the start, with templates from one of its frames.
 
@@ -139,7 +128,7 @@ def begin(
         images: That frame, and the last one.
         time: Of the last frame, seconds.
         options: Constants.
-        past: What is known of the person beside these landmarks.
+        prior: What holds the person, with what is known beside these landmarks.
     """
     bundle, uv, person = start.bundle, start.uv[frame], start.bundle.person
     first, last = jnp.asarray(images, uv.dtype)[:, None]
@@ -148,14 +137,16 @@ def begin(
     here, expressed = bundle.poses[-1], bundle.expressions[-1]
     x = jnp.concatenate([here, modes.coefficients(face, expressed)])
     variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
-    window = informed(face, rig, _first_window(bundle, views, uv, frame, options), person, options.prior)
+    window = informed(face, rig, _first_window(bundle, views, uv, frame, options), person, prior)
     size = window.information.shape[-1]
+    if prior.past is None and options.past == "marginalised":
+        prior = prior._replace(past=nothing_past(face))
     return MonoState(
         search=start_search(x, search_options(options)),
         belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
         who=jnp.zeros((), jnp.int32),
         person=person,
-        past=nothing_past(face) if past is None and options.past == "marginalised" else past,
+        prior=jax.tree.map(lambda a: jnp.asarray(a, x.dtype), prior),
         model=model,
         modes=modes,
         response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),

@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.bundle import Bundle, Past, Person, Prior, Reach, Views
+from jaxfilters.models.face.bundle import Bundle, Reach, Views
 from jaxfilters.models.face.patches import Patches, Slopes
+from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.state import Recent
 from jaxfilters.trackers.head_mono.person import Modes
@@ -145,8 +146,8 @@ class MonoState(NamedTuple):
     """0 for a stranger, else one of those who are remembered."""
     person: Person
     """About that face."""
-    past: Past | None
-    """What is known from beyond the window, if anything ever is; about the model's face, that of a stranger."""
+    prior: Prior
+    """What holds every adjustment; its past, if there ever is one, is about the model's face, that of a stranger."""
     model: FaceModel
     """Of the person: the expressions as orthonormal modes."""
     modes: Modes

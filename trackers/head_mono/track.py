@@ -65,13 +65,15 @@ def advance(
 
     def one(state: MonoState, inputs: tuple) -> tuple[MonoState, MonoTrack]:
         images, time, is_frame = inputs
-        _, empty = jax.eval_shape(lambda: _step(system, state, images, time, options))
+        step = lambda: _step(system, state, images, time, options)
+        _, empty = jax.eval_shape(step)
         nothing = lambda: (state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), empty))
-        return jax.lax.cond(is_frame, lambda: _step(system, state, images, time, options), nothing)
+        return jax.lax.cond(is_frame, step, nothing)
 
     return jax.lax.scan(one, state, (images, times, is_frame))
 
 
+@partial(jax.jit, static_argnames="options")  # traced once for its shapes and its program
 def _step(
     system: System, state: MonoState, images: Array, time: Array, options: MonoOptions
 ) -> tuple[MonoState, MonoTrack]:
@@ -103,7 +105,7 @@ def _step(
         is_fresh=~missed,
         window=state.window._replace(ages=state.window.ages + 1),
     )
-    return state, _track(system, state, score, info.effective_sample_size, is_adjusted, options)
+    return state, _track(system, state, score, info.effective_sample_size, is_adjusted)
 
 
 def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoOptions) -> tuple[Array, Array]:
@@ -175,7 +177,7 @@ def _adjusted(
 ) -> tuple[MonoState, Array]:
     """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
     stranger, face, rig, _ = system
-    frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, options.prior)
+    frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, state.prior)
     response = jnp.where(missed, state.response, frame.told.response)
     state = state._replace(response=jnp.where(jnp.all(jnp.isfinite(response)), response, state.response))
     if not options.adjust:
@@ -184,26 +186,24 @@ def _adjusted(
     allowed = ~missed & (score >= adjustment.LEAST_SCORE)
     allowed &= jnp.abs(frame.pose[4]) <= further * adjustment.MOST_YAW
     allowed &= jnp.abs(frame.pose[5]) <= further * adjustment.MOST_PITCH
-    place, deserves = adjustment.choose(face, state.window, state.past, frame, options)
+    place, deserves = adjustment.choose(face, state.window, state.prior, state.person, frame, options)
     tried = allowed & deserves
     anew = lambda: adjustment.adjusted(stranger, face, rig, state, frame, place, options)
     after = jax.lax.cond(tried, anew, lambda: state)
-    parts = ("person", "past", "belief", "model", "modes", "window", "registered")
+    parts = ("person", "prior", "belief", "model", "modes", "window", "registered")
     believed = lambda state: [getattr(state, part) for part in parts]
     sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(believed(after))]))
     return jax.lax.cond(sound, lambda: after, lambda: state), tried & sound
 
 
-def _track(
-    system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, options: MonoOptions
-) -> MonoTrack:
+def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array) -> MonoTrack:
     stranger, face, rig, _ = system
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
     x = state.belief.mean
     M = shape(state.model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
-    of_person = adjustment.uncertainty(face, state.window, state.past, state.response, options)
+    of_person = adjustment.uncertainty(face, state.window, state.prior, state.person, state.response)
     variance = jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
     expression = state.modes.expression(face, x[POSE:])
     return MonoTrack(

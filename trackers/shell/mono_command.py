@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxfilters.models.face.bundle import eyes_apart
 from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head_mono.dense import tracked
 from jaxfilters.trackers.head_mono.detectors import DETECTORS, Detector

@@ -9,22 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.face.bundle import (
-    Bundle,
-    Past,
-    Person,
-    Prior,
-    Reach,
-    Views,
-    adjust,
-    all_residuals,
-    box,
-    nothing_past,
-    parameters,
-    posed_shape,
-    projected,
-)
+from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, all_residuals, box, projected
 from jaxfilters.models.face.multilinear import learn
+from jaxfilters.models.face.person_prior import Past, Person, Prior, nothing_past, parameters, posed_shape
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 

@@ -7,9 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Person, Prior, Views, all_residuals, projected
+from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Views, all_residuals, projected
 from jaxfilters.models.face.frame_selection import by_angles, by_information, told
-from jaxfilters.models.face.multilinear import learn
+from jaxfilters.models.face.multilinear import expression_basis, learn, shape
+from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
@@ -149,7 +150,12 @@ def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scen
             bundle = Bundle(frame.poses + POSE_UNITS * own[:6], frame.expressions + face.expression_std * own[6:], who)
             seen = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
             apart = bundle.expressions[0] - face.expression_mean
-            return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True)])
+            # What it moves in proportion to the size of the face.
+            spread = lambda who, a: jnp.linalg.norm(jnp.std(shape(face, who, a)[:, :2], axis=0))
+            moved = lambda who: jnp.linalg.norm(expression_basis(face, who) @ root)
+            ratio = spread(who.identity, bundle.expressions[0]) / spread(face.identity_mean, face.expression_mean)
+            ratio = ratio * moved(face.identity_mean) / moved(who.identity)
+            return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True) / ratio])
 
         found = least_squares(
             jax.jit(residuals), np.zeros(11), jax.jit(jax.jacfwd(residuals)), xtol=1e-15, ftol=1e-15, gtol=1e-12

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian import Gaussian
-from jaxfilters.models.face.bundle import Adjustment, Bundle, Person, projected
+from jaxfilters.models.face.bundle import Adjustment, Bundle, projected
+from jaxfilters.models.face.multilinear import expression_basis, shape
+from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.rig import project_shape
-from jaxfilters.models.face.shape_model import shape
+from jaxfilters.models.face.shape_model import shape as shape_of_model
 from jaxfilters.trackers.head_mono.adjustment import Frame, adjusted, choose, frame_of, informed, uncertainty
 from jaxfilters.trackers.head_mono.start import Start, begin, detected
 from jaxfilters.trackers.head_mono.state import PUBLISHED, REACH, MonoOptions, Window
@@ -31,6 +33,11 @@ def bundle_of(face, seed=0):
     poses = np.array([0.0, 0, 650, 0, 0, 0]) + rng.normal(0, [20, 15, 30, 0.06, 0.2, 0.1], (NUM, 6))
     expressions = face.expression_mean + 0.7 * face.expression_std * rng.normal(size=(NUM, face.num_expressions))
     return Bundle(jnp.asarray(poses, jnp.float32), jnp.asarray(expressions, jnp.float32), person)
+
+
+def mean_person(face):
+    """At whom what holds a person is the inverse covariance of the training set."""
+    return Person(face.identity_mean, jnp.zeros_like(face.mean))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +70,9 @@ def state_of(rig, face, seen, options):
     bundle = true._replace(poses=true.poses + jnp.asarray(shift, jnp.float32))
     start = Start(bundle, Adjustment(*jnp.zeros(3)), views.uv)
     images = jnp.asarray(np.random.default_rng(1).uniform(0, 255, (2, 480, 640)), jnp.float32)
-    return begin(jax.random.key(0), face, rig, start, views, jnp.zeros((), int), images, jnp.zeros(()), options)
+    return begin(
+        jax.random.key(0), face, rig, start, views, jnp.zeros((), int), images, jnp.zeros(()), options, options.prior
+    )
 
 
 def new_frame(rig, face, state, seen, options):
@@ -117,7 +126,7 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     # The frames tell 0.3, 0.9, 0.5, 1 and 0.8 of what they do.
     window = window._replace(information=window.information * jnp.array([0.3, 0.9, 0.5, 1.0, 0.8])[:, None, None])
     new = window.information[3]
-    place, does = choose(face, window, None, told_by(window, new), options)
+    place, does = choose(face, window, options.prior, mean_person(face), told_by(window, new), options)
     expected = gains(window, new, options, face)
     first = 0 if options.is_published else 1
     assert int(place) == first + int(np.argmax(expected[first:]))
@@ -127,7 +136,7 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
 
 def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
     window = window_of(rig, face, seen, USUAL)
-    _, does = choose(face, window, None, told_by(window, 0.01 * window.information[2]), USUAL)
+    _, does = choose(face, window, USUAL.prior, mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL)
     assert not bool(does)
 
 
@@ -139,7 +148,7 @@ def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landm
     # The first frame faces the middle of all: to let it go gains most.
     poses = window.poses.at[0, 4:].set(jnp.mean(window.poses[1:, 4:], axis=0) + jnp.array([0.1, -0.06]))
     window = window._replace(poses=poses)
-    place, does = choose(face, window, None, frame, options)
+    place, does = choose(face, window, options.prior, mean_person(face), frame, options)
     spreads = []
     for i in range(NUM):
         angles = np.asarray(poses[:, 4:], float)
@@ -155,7 +164,9 @@ def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landm
 def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
     options = replace(USUAL, landmarks=landmarks, selection="latest")
     window = window_of(rig, face, seen, options)
-    place, does = choose(face, window, None, told_by(window, window.information[3]), options)
+    place, does = choose(
+        face, window, options.prior, mean_person(face), told_by(window, window.information[3]), options
+    )
     assert int(place) == oldest
     assert bool(does)
 
@@ -175,17 +186,24 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     state = state_of(rig, face, seen, USUAL)
     x = x.at[6:].set(state.modes.coefficients(face, true.expressions[2]))
     frame = frame_of(face, rig, alone, true.person, x, state.modes, USUAL.prior)
-    found = np.asarray(uncertainty(face, window, None, frame.told.response, USUAL), float)
+    found = np.asarray(uncertainty(face, window, USUAL.prior, mean_person(face), frame.told.response), float)
 
     units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std)])
-    expression = frame.expression
+    root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T
 
-    def pixels(who, own):
+    def rows(who, own):
+        """Landmarks to half a pixel; the expression as in the training set, in proportion to the size."""
         person = Person(who[: face.num_identities], who[face.num_identities :].reshape(face.mean.shape))
-        return projected(face, rig, Bundle(own[None, :6], own[None, 6:], person)).ravel()
+        uv = projected(face, rig, Bundle(own[None, :6], own[None, 6:], person)).ravel()
+        held = root @ (own[6:] - face.expression_mean) * strength(person.identity) / strength(face.identity_mean)
+        ratio = size(person.identity, own[6:]) / size(face.identity_mean, face.expression_mean)
+        return jnp.concatenate([uv / LANDMARK_PX, held / ratio])
+
+    size = lambda who, a: jnp.linalg.norm(jnp.std(shape(face, who, a)[:, :2], axis=0))
+    strength = lambda who: jnp.linalg.norm(expression_basis(face, who) @ np.linalg.inv(root))
 
     here = jnp.concatenate([true.person.identity, true.person.offset.ravel()])
-    by_person, by_own = jax.jacfwd(pixels, (0, 1))(here, jnp.concatenate([true.poses[2], expression]))
+    by_person, by_own = jax.jacfwd(rows, (0, 1))(here, jnp.concatenate([true.poses[2], frame.expression]))
     prior = np.linalg.inv(np.asarray(face.identity_covariance, float))
     known = np.zeros((units.size, units.size))
     known[: len(prior), : len(prior)] = face.identity_std[:, None] * prior * face.identity_std
@@ -193,13 +211,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     posterior = np.linalg.inv(known + np.asarray(window.information, float).sum(axis=0))
     rng = np.random.default_rng(4)
     persons = rng.normal(size=(num_persons, units.size)) @ np.linalg.cholesky(posterior).T * units
-    # Least squares: landmarks to half a pixel, and the expression held as in the training set.
-    root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T
-    held = np.pad(root, ((0, 0), (6, 0)))
-    rows = np.concatenate([np.asarray(by_own, float) / LANDMARK_PX, held])
-    seen_change = np.asarray(by_person, float) @ persons.T / LANDMARK_PX
-    target = np.concatenate([-seen_change, np.zeros((len(held), num_persons))])
-    answers = np.linalg.lstsq(rows, target)[0]
+    answers = -np.linalg.lstsq(np.asarray(by_own, float), np.asarray(by_person, float) @ persons.T)[0]
 
     whitened = np.linalg.solve(np.linalg.cholesky(found), answers)
     sample = whitened @ whitened.T / num_persons
@@ -235,7 +247,7 @@ def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     bundle = Bundle(window.poses[place][None], window.expressions[place][None], after.person)
     expected = projected(face, rig, bundle)[0]
     mean = after.belief.mean
-    points = project_shape(rig, shape(after.model, mean[6:]), mean[:6])[0][0]
+    points = project_shape(rig, shape_of_model(after.model, mean[6:]), mean[:6])[0][0]
     # Single precision of pixels up to 640.
     np.testing.assert_allclose(points, expected, atol=2e-3)
     np.testing.assert_array_equal(after.search.estimate, mean)
@@ -245,7 +257,7 @@ def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, mov
     """They are exact: what is left is what the prior pulls."""
     before, after, place = moved
     mean = after.belief.mean
-    points = project_shape(rig, shape(after.model, mean[6:]), mean[:6])[0][0]
+    points = project_shape(rig, shape_of_model(after.model, mean[6:]), mean[:6])[0][0]
     uv = after.window.views.uv[place]
     assert np.abs(np.asarray(points - uv)).max() < 1.0
     assert not np.allclose(uv, before.window.views.uv[place], atol=5.0)

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.bundle import Bundle, Person, Prior, all_residuals
+from jaxfilters.models.face.bundle import Bundle, all_residuals
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import shape
+from jaxfilters.models.face.person_prior import Prior, log_size
 from jaxfilters.models.face.pose import place
-from jaxfilters.trackers.head_mono.dense import log_size
 from jaxfilters.trackers.head_mono.irises import (
     BEFORE_MM,
     IRIS_MM,
@@ -66,8 +66,7 @@ def test_the_size_moves_as_far_as_the_irises_are_trusted(face, rig, begun, iris_
     expected = float(larger) * variance / (variance + float(std) ** 2)
     assert 0.1 * np.log(LARGER) < expected < 0.9 * np.log(LARGER)
     np.testing.assert_allclose(np.log(factor), expected, rtol=0.15)
-    identity, person = after.bundle.person.identity, start.bundle.person
-    moved = log_size(face, Person(identity, person.offset)) - log_size(face, person)
+    moved = log_size(face, after.bundle.person.identity) - log_size(face, start.bundle.person.identity)
     assert float(moved) == pytest.approx(expected, rel=0.2)
     # The landmarks stay where they are in the image, as far as a face of that size can have the same shape.
     np.testing.assert_allclose(after.uv, start.uv, atol=2.0)
@@ -83,7 +82,7 @@ def size_variance(face, rig, points, bundle):
     flat, unravel = jax.flatten_util.ravel_pytree(bundle)
     residuals = lambda y: all_residuals(face, rig, views, Bundle(*unravel(y)), PRIOR)
     J = np.asarray(jax.jacfwd(residuals)(flat), float)
-    sizes = lambda y: log_size(face, Person(unravel(y).person.identity, bundle.person.offset))
+    sizes = lambda y: log_size(face, unravel(y).person.identity)
     slope = np.asarray(jax.grad(sizes)(flat), float)
     # In units of each column's length, for the sake of rounding.
     unit = 1 / np.linalg.norm(J, axis=0)

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.bundle import Bundle, Person, Prior, Reach, Views, adjust, projected
+from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.multilinear import learn
+from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.remembered import hypotheses, remember
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head_mono.adjustment import informed
@@ -49,13 +50,19 @@ def window_of(face, rig, views, bundle, prior):
 
 @pytest.mark.parametrize("who", ["stranger", "remembered"])
 def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
-    """The past's Gaussian has the gradient of the frames that it replaces: nothing moves, but for rounding."""
+    """The past's Gaussian has the gradient of the frames that it replaces: nothing moves, but for rounding.
+
+    And but for the size in proportion to which an offset is held: that of the expressions in the frames at hand, here
+    about one per cent more or less, and so are offsets of half a millimetre.
+    """
     stranger, known, views, truth = scene
     face = stranger if who == "stranger" else known
     prior = OPTIONS.prior
     together = best(face, rig, views, truth, prior)
     window = window_of(face, rig, views, together, prior)
-    gone = [left_behind(stranger, face, window, together.person, jnp.asarray(i), OPTIONS) for i in range(KEPT, NUM)]
+    gone = [
+        left_behind(stranger, face, window, together.person, jnp.asarray(i), OPTIONS.prior) for i in range(KEPT, NUM)
+    ]
     past = seen_by(joined(joined(*gone[:2]), gone[2]), stranger, face)
     few = jax.tree.map(lambda leaf: leaf[:KEPT], views)
     start = together._replace(poses=together.poses[:KEPT], expressions=together.expressions[:KEPT])
@@ -63,17 +70,17 @@ def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     without = best(face, rig, few, start, prior)
     unit = np.asarray(stranger.identity_std)
     moved = lambda bundle: np.abs(np.asarray(bundle.person.identity - together.person.identity)) / unit
-    assert moved(with_past).max() < 2e-3
+    assert moved(with_past).max() < 5e-3
     assert moved(without).max() > 0.02
-    np.testing.assert_allclose(with_past.person.offset, together.person.offset, atol=2e-3)
-    np.testing.assert_allclose(with_past.poses[:, 2], together.poses[:KEPT, 2], atol=0.05)
+    np.testing.assert_allclose(with_past.person.offset, together.person.offset, atol=5e-3)
+    np.testing.assert_allclose(with_past.poses[:, 2], together.poses[:KEPT, 2], atol=0.1)
 
 
 def test_a_past_is_about_the_same_faces_whoever_it_is_told_to(x64, rig, scene):
     """Differences of its energy, for two faces written once about the stranger and once about the other."""
     stranger, known, views, truth = scene
     window = window_of(stranger, rig, views, truth, Prior(1.0, 0.7))
-    past = left_behind(stranger, stranger, window, truth.person, jnp.asarray(2), OPTIONS)
+    past = left_behind(stranger, stranger, window, truth.person, jnp.asarray(2), OPTIONS.prior)
     other = seen_by(past, stranger, known)
     rng = np.random.default_rng(1)
     about_stranger = rng.normal(0, 0.3, (2, 40))

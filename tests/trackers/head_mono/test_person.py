@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.bundle import Person, posed_shape
 from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis
+from jaxfilters.models.face.person_prior import Person, posed_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.trackers.head.state import NUM_MODES
 from jaxfilters.trackers.head_mono.person import model_of

@@ -13,17 +13,20 @@ from jaxfilters.trackers.head_mono.recognition import people
 from jaxfilters.trackers.head_mono.session import MonoSession
 from jaxfilters.trackers.head_mono.state import PUBLISHED
 
-START = 17
+START, IDENTITIES = 17, 15
 
 
 @pytest.fixture(scope="module")
 def taught():
-    """Faces of eleven people, of whom the fourth is the one before the camera; with a model of all."""
+    """Faces of eleven people, of whom the fourth is the one before the camera; with a model of all.
+
+    Of as many parameters as the model of the package: their programs are the same.
+    """
     user = make_identity(jax.random.split(jax.random.key(33), 3)[0])
     others = people_of(jax.random.key(0), 10)
     everybody = jax.tree.map(lambda own, rest: jnp.concatenate([rest[:3], own[None], rest[3:]]), user, others)
     shapes = generator_shapes(jax.random.key(1), everybody)
-    return learn(shapes), shapes
+    return learn(shapes, identities=IDENTITIES), shapes
 
 
 def process(session, images, times, size=16):
@@ -34,7 +37,7 @@ def process(session, images, times, size=16):
 def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, taught, talking, detected):
     face, shapes = taught
     made, images = talking
-    session = MonoSession(rig, face, detections=detected, remembered=remember(face, shapes))
+    session = MonoSession(rig, face, detections=detected, remembered=remember(face, shapes[:10]))
     track = process(session, images, made.times)
     assert set(track.who[START:]) <= {-1, 3}
     assert np.all(track.who[-20:] == 3)
@@ -53,7 +56,7 @@ def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     _, shapes = taught
     made, images = talking
     others = jnp.concatenate([shapes[:3], shapes[4:]])
-    face = learn(others)
+    face = learn(others, identities=IDENTITIES)
     session = MonoSession(rig, face, detections=detected, remembered=remember(face, others))
     track = process(session, images, made.times)
     assert np.all(track.who == -1)
@@ -95,10 +98,10 @@ def test_shares_of_the_prior(taught):
 
 
 def test_people_of_another_model_are_refused(rig, face, taught):
-    other, shapes = taught
-    known = remember(other, shapes[:2])
+    other, _ = taught
+    fewer = Remembered(*(jnp.zeros(shape) for shape in ((1, 10), (1, 10, 10), (1, 10, 3))))
     with pytest.raises(ValueError, match="remembered must be of the model, with shapes"):
-        MonoSession(rig, face, remembered=known)
-    fits = Remembered(*(jnp.zeros(shape) for shape in ((1, 10), (1, 10, 10), (1, 10, 3))))
+        MonoSession(rig, face, remembered=fewer)
+    fits = Remembered(*(jnp.zeros(shape) for shape in ((1, 15), (1, 15, 15), (1, 10, 3))))
     with pytest.raises(ValueError, match="that tracker knows nobody"):
         MonoSession(rig, other, PUBLISHED, remembered=fits)

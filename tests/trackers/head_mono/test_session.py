@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.bundle import eyes_apart
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.trackers.head.state import DEFORMABLE, INITIALISING, LOST, PATIENCE
 from jaxfilters.trackers.head_mono.session import MonoSession

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.bundle import Person
 from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.remembered import Remembered
 from jaxfilters.trackers.head_mono.focal import FocalLength
 from jaxfilters.trackers.head_mono.state import MonoTrack

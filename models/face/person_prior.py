@@ -1,0 +1,168 @@
+"""What is known of a face before the images: how large faces are, how they differ, and what was learnt of this one.
+
+A small face near by looks like a large one far away. Its millimetres are fewer, too, and whatever counts in squared
+millimetres likes it better for that, which is no evidence. So a face is held by its size, and by what it differs by
+from the mean person beside that in proportion to the size: of two faces that look alike neither is likelier but by how
+many people are as large.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfilters.linalg import safe_sqrt
+from jaxfilters.models.face.landmarks import EYES
+from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis, shape
+
+UNTOLD = 1e-6
+"""Information, as a share of that about each parameter itself, about what the past frames do not tell."""
+
+
+class Person(NamedTuple):
+    """Whose face it is."""
+
+    identity: Float[Array, " S"]
+    offset: Float[Array, "K 3"]
+    """What the model lacks of this face in every expression, model frame, millimetres."""
+
+
+class Past(NamedTuple):
+    """What frames that are no longer adjusted told of the person: a Gaussian, in information form.
+
+    Minus its logarithm is `p . information p / 2 - pull . p` for the parameters p: identity, then offset.
+    """
+
+    information: Float[Array, "d d"]
+    pull: Float[Array, " d"]
+
+
+class Prior(NamedTuple):
+    """What holds a bundle beside the images; a weight of 0 lets go, 1 is Bayes' rule."""
+
+    weight: Float[ArrayLike, ""]
+    """Of identity and expressions about those of the training set, with their covariances."""
+    offset_std: Float[ArrayLike, ""]
+    """Millimetres: of each coordinate of the offset, for a face as large as the mean one; 0 for none."""
+    eyes_apart: Float[ArrayLike, ""] = 0.0
+    """Millimetres between the centres of the eyes, if that is known: the size of everything follows from it."""
+    eyes_apart_std: Float[ArrayLike, ""] = 0.0
+    """Millimetres; 0 where it is not known."""
+    past: Past | None = None
+    """Of frames that were adjusted before."""
+
+
+def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
+    """Landmarks of a person with an expression in the model frame, millimetres ([4.15] and the offset)."""
+    return shape(face, person.identity, expression) + person.offset
+
+
+def parameters(person: Person) -> Float[Array, " d"]:
+    """Identity, then offset, as `Past` has them."""
+    return jnp.concatenate([person.identity, person.offset.ravel()])
+
+
+def nothing_past(face: MultilinearFace) -> Past:
+    """Of a person who is new."""
+    size = face.num_identities + face.mean.size
+    return Past(jnp.zeros((size, size), face.mean.dtype), jnp.zeros(size, face.mean.dtype))
+
+
+def eyes_apart(face: MultilinearFace, person: Person) -> Float[Array, ""]:
+    """Millimetres between the middles of the corners of either eye."""
+    corners = posed_shape(face, person, face.expression_mean)[jnp.asarray(EYES)]
+    right, left = jnp.mean(corners[:2], axis=0), jnp.mean(corners[2:], axis=0)
+    return jnp.sqrt(jnp.sum(jnp.square(left - right)))
+
+
+def log_size(
+    face: MultilinearFace, identity: Float[Array, " S"], expression: Float[Array, " A"] | None = None
+) -> Float[Array, ""]:
+    """Logarithm of how widely the landmarks spread across the line of sight of a face that looks into the camera.
+
+    Args:
+        face: Model.
+        identity: Whose face.
+        expression: The training set's mean if none.
+    """
+    across = shape(face, identity, face.expression_mean if expression is None else expression)[:, :2]
+    return 0.5 * jnp.log(jnp.sum(jnp.square(across - jnp.mean(across, axis=0))))
+
+
+def seen_size(
+    face: MultilinearFace, identity: Float[Array, " S"], expressions: Float[Array, "n A"]
+) -> Float[Array, ""]:
+    """How large a face is in frames with these expressions, their geometric mean, beside the mean person's."""
+    each = jax.vmap(lambda a: log_size(face, identity, a))(expressions)
+    return jnp.exp(jnp.mean(each) - log_size(face, face.identity_mean))
+
+
+def expression_residuals(
+    face: MultilinearFace, identity: Float[Array, " S"], expressions: Float[Array, "n A"]
+) -> Float[Array, "n A"]:
+    """Of expressions, in standard deviations, for what they move in proportion to the size of the face in each frame.
+
+    Whoever moves farther for his size with the same parameters than the mean person has stronger expressions.
+    """
+    root = jnp.linalg.cholesky(face.expression_covariance)
+    deviations = jax.scipy.linalg.solve_triangular(root, (expressions - face.expression_mean).T, lower=True).T
+
+    def strength(identity: Array) -> Array:
+        moved = jnp.matmul(expression_basis(face, identity), root, precision="highest")
+        return jnp.sqrt(jnp.sum(jnp.square(moved)))
+
+    sizes = jax.vmap(lambda a: seen_size(face, identity, a[None]))(expressions)
+    return deviations * strength(identity) / strength(face.identity_mean) / sizes[:, None]
+
+
+def residuals(
+    face: MultilinearFace, person: Person, expressions: Float[Array, "n A"], prior: Prior
+) -> Float[Array, " rows"]:
+    """Of identity, offset and size, and of what past frames told, in standard deviations.
+
+    Args:
+        face: Model.
+        person: Whose face.
+        expressions: With which it is seen. They change its size, too: it would shrink by them if they did not count.
+        prior: What is known.
+    """
+    known = jnp.asarray(prior.offset_std) > 0
+    std = seen_size(face, person.identity, expressions) * prior.offset_std
+    offset = jnp.where(known, person.offset / jnp.where(known, std, 1.0), 0.0)
+    measured = jnp.asarray(prior.eyes_apart_std) > 0
+    wrong = eyes_apart(face, person) - prior.eyes_apart
+    size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
+    before = jnp.zeros(0, offset.dtype) if prior.past is None else _of_past(face, prior.past, person)
+    identity = prior.weight * _of_identity(face, person.identity)
+    return jnp.concatenate([identity, offset.ravel(), size[None], before])
+
+
+def _of_identity(face: MultilinearFace, identity: Array) -> Array:
+    """In independent standard deviations: the size by its logarithm, the rest in proportion to the size."""
+    mean, root = face.identity_mean, jnp.linalg.cholesky(face.identity_covariance)
+    away = jax.scipy.linalg.solve_triangular(root, identity - mean, lower=True)
+    # What standard deviations change the logarithm of the size by; the rest is at right angles to it.
+    slope = jnp.matmul(root.T, jax.grad(lambda s: log_size(face, s))(mean), precision="highest")
+    std2 = jnp.sum(jnp.square(slope))
+    beside = away - slope * jnp.sum(slope * away) / std2
+    log_ratio = log_size(face, identity) - log_size(face, mean)
+    return beside / jnp.exp(log_ratio) + slope * log_ratio / std2
+
+
+def _of_past(face: MultilinearFace, past: Past, person: Person) -> Array:
+    """Residuals of which half the sum of squares is the past's part of the energy, but for a constant.
+
+    In units of each parameter's own information and about the mean person, so that one small constant can stand for
+    what the past does not tell, and rounding does not grow with what it does.
+    """
+    product = lambda a, b: jnp.matmul(a, b, precision="highest")
+    scale = safe_sqrt(jnp.diagonal(past.information))
+    unit = jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 1.0)
+    mean = parameters(Person(face.identity_mean, jnp.zeros_like(face.mean)))
+    pull = unit * (past.pull - product(past.information, mean))
+    untold = UNTOLD * jnp.eye(unit.size, dtype=unit.dtype)
+    root = jnp.linalg.cholesky(past.information * unit[:, None] * unit + untold)
+    towards = jax.scipy.linalg.solve_triangular(root, pull, lower=True)
+    return product(root.T, (parameters(person) - mean) / unit) - towards
