@@ -173,7 +173,7 @@ class _Parts:
 
     def joined(self, ten: Person, offset: Float[Array, "68 3"], misplaced: Float[ArrayLike, ""]) -> Float[Array, " d"]:
         """Of the ten's person, and the offset of all with what is misplaced."""
-        beside = (offset[self._ten] - ten.offset) / jnp.where(misplaced > 0, misplaced, 1.0)
+        beside = (offset[self._ten] - ten.offset) / jnp.where(jnp.asarray(misplaced) > 0, misplaced, 1.0)
         return jnp.concatenate([parameters(ten), offset[self._others].ravel(), beside.ravel()])
 
     def identity(self, y: Float[Array, " d"]) -> Float[Array, " S"]:
