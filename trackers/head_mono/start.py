@@ -139,14 +139,12 @@ def begin(
     variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
     window = informed(face, rig, _first_window(bundle, views, uv, frame, options), person, prior)
     size = window.information.shape[-1]
-    if prior.past is None and options.past == "marginalised":
-        prior = prior._replace(past=nothing_past(face))
     return MonoState(
         search=start_search(x, search_options(options)),
         belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
         who=jnp.zeros((), jnp.int32),
         person=person,
-        prior=jax.tree.map(lambda a: jnp.asarray(a, x.dtype), prior),
+        prior=_held(face, prior, options),
         model=model,
         modes=modes,
         response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
@@ -166,6 +164,13 @@ def begin(
         time=jnp.asarray(time, x.dtype),
         key=key,
     )
+
+
+def _held(face: MultilinearFace, prior: Prior, options: MonoOptions) -> Prior:
+    """As a state has it: arrays, and a past from the first where frames will leave one."""
+    if prior.past is None and options.past == "marginalised":
+        prior = prior._replace(past=nothing_past(face))
+    return jax.tree.map(lambda a: jnp.asarray(a, face.mean.dtype), prior)
 
 
 def search_options(options: MonoOptions) -> HeadOptions:
