@@ -11,21 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adjust, frame_residuals, projected
-from jaxfilters.models.face.frame_selection import reduced, told
+from jaxfilters.models.face.frame_selection import reduced
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, restricted
 from jaxfilters.models.face.person_prior import Past, Person, Prior, parameters, seen_size
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head_mono.adjustment import UNKNOWN
 from jaxfilters.trackers.head_mono.start import WIDE, Start
 
 NUM_DENSE = 68
 STEPS = (5, 30)
 """Of both stages of the adjustment, which sets out from that to the ten."""
-UNKNOWN = 1e-6
-"""Information about what nothing tells of, such as what a detector misplaces that is exact."""
 REACH = WIDE._replace(deviations=4.0)
 """Of the adjustment."""
 
@@ -121,7 +120,8 @@ def told_of_ten(
         prior: What held the bundle.
         misplaced: Standard deviation of the detector's part, millimetres.
     """
-    split, y = _Parts(face), _Parts(face).joined(person, bundle.person.offset, misplaced)
+    split = _Parts(face)
+    y = split.joined(person, bundle.person.offset, misplaced)
     units = jnp.concatenate([jnp.asarray(POSE_UNITS, y.dtype), face.expression_std])
     std = jnp.asarray(prior.offset_std), jnp.asarray(misplaced)
     of_face = jnp.sqrt(jnp.maximum(jnp.square(std[0]) - jnp.square(std[1]), 0.0))
@@ -151,10 +151,9 @@ def told_of_ten(
     # How the offsets of the ten are held is known to the tracker.
     ours = lambda y: jax.vmap(lambda a: held(y, a)[0])(bundle.expressions).ravel() / np.sqrt(len(views.uv))
     J, product = jax.jacfwd(ours)(y), lambda a, b: jnp.matmul(a, b, precision="highest")
-    kept, gone = np.split(np.arange(y.size), [split.ends[1]])
-    whole = Quadratic(information + jnp.diag(UNKNOWN * jnp.ones(y.size)), gradient)
-    told, before = without(whole, kept, gone), product(J.T, J)[np.ix_(kept, kept)]
-    information, gradient = told.information - before, told.gradient - product(J.T, ours(y))[kept]
+    count, known = parameters(person).size, UNKNOWN * jnp.eye(y.size, dtype=y.dtype)
+    information, gradient = _without_rest(information + known, gradient, count)
+    information, gradient = information - product(J.T, J)[:count, :count], gradient - product(J.T, ours(y))[:count]
     return Past(information, product(information, parameters(person)) - gradient)
 
 
@@ -191,38 +190,12 @@ class _Parts:
         return Person(self.identity(y), offset.at[self._ten].set(own + misplaced * beside).at[self._others].set(rest))
 
 
-class Quadratic(NamedTuple):
-    """An energy about a point: `gradient . x + x . information x / 2`."""
-
-    information: Float[Array, "d d"]
-    gradient: Float[Array, " d"]
-
-
-def without(energy: Quadratic, kept: Int[np.ndarray, " kept"], gone: Int[np.ndarray, " gone"]) -> Quadratic:
-    """The energy of some parameters where the others are the likeliest."""
-    H, g = energy
+def _without_rest(
+    information: Float[Array, "m m"], gradient: Float[Array, " m"], count: int
+) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
+    """An energy of the first parameters where all others are the likeliest for them."""
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
-    root = (jnp.linalg.cholesky(H[np.ix_(gone, gone)]), True)
-    share = jax.scipy.linalg.cho_solve(root, H[np.ix_(gone, kept)])
-    about = H[np.ix_(kept, kept)] - product(share.T, H[np.ix_(gone, kept)])
-    return Quadratic((about + about.T) / 2, g[kept] - product(share.T, g[gone]))
-
-
-def told_of_person(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Quadratic:
-    """What all views together tell of identity and offset, about those of a bundle, poses and expressions aside.
-
-    The offset's standard deviation must not be 0 if it is to be told of.
-    """
-
-    def one(inputs: tuple) -> tuple[Array, Array]:
-        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
-        of_frame = told(face, rig, view, Bundle(pose, expression, bundle.person), prior)
-        return of_frame.information, of_frame.gradient
-
-    # One by one: batches of factorisations can stand still on two cores.
-    each = jax.lax.map(one, (views, bundle.poses, bundle.expressions))
-    information, gradient = (jnp.sum(part, axis=0) for part in each)
-    known = jnp.asarray(prior.offset_std) > 0
-    offset = jnp.full(face.mean.size, 1.0, gradient.dtype) / jnp.where(known, prior.offset_std, 1.0)
-    inverse = jnp.concatenate([1 / face.identity_std, offset])
-    return Quadratic(inverse[:, None] * information * inverse, inverse * gradient)
+    root, cross = (jnp.linalg.cholesky(information[count:, count:]), True), information[count:, :count]
+    share = jax.scipy.linalg.cho_solve(root, cross)
+    about = information[:count, :count] - product(share.T, cross)
+    return (about + about.T) / 2, gradient[:count] - product(share.T, gradient[count:])

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.models.face.bundle import Views, projected
+from jaxfilters.models.face.bundle import Bundle, Views, projected
+from jaxfilters.models.face.frame_selection import told
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Past, Person, Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head_mono.adjustment import prior_information
-from jaxfilters.trackers.head_mono.dense import told_of_person
-from jaxfilters.trackers.head_mono.past import joined
+from jaxfilters.trackers.head_mono.past import joined, units
 from jaxfilters.trackers.head_mono.start import Start
 
 IRIS_MM, IRIS_STD_MM = 11.7, 0.5
@@ -60,7 +60,7 @@ def _resized(
     face: MultilinearFace, rig: CameraRig, start: Start, views: Views, past: Past, iris_px: Array, prior: Prior
 ) -> tuple[Start, Past]:
     bundle, count = start.bundle, face.num_identities
-    person, none = bundle.person, jnp.zeros(face.mean.size, start.uv.dtype)
+    person = bundle.person
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
     larger, std = measured(face, rig, start, iris_px)
     slope = jax.grad(lambda identity: log_size(face, identity))(person.identity)
@@ -71,15 +71,25 @@ def _resized(
     nothing = nothing_past(face)
     more = Past(nothing.information.at[:count, :count].set(information), nothing.pull.at[:count].set(pull))
     # The start is the likeliest without the irises; to first order this is the likeliest with them.
-    loose = jnp.where(jnp.asarray(prior.offset_std) > 0, prior.offset_std, 1.0)
-    unit = jnp.concatenate([face.identity_std, loose + none])
-    beside = past.information + more.information + told_of_person(face, rig, views, bundle, prior).information
+    unit, beside = units(face, prior), past.information + more.information
     total = prior_information(face, person, prior) + unit[:, None] * beside * unit
-    moved = unit * jnp.linalg.solve(total, unit * jnp.concatenate([slope / jnp.square(std) * larger, none]))
+    total = total + _told(face, rig, views, bundle, prior)
+    moved = unit * jnp.linalg.solve(total, unit * jnp.pad(slope / jnp.square(std) * larger, (0, face.mean.size)))
     factor = jnp.exp(jnp.sum(slope * moved[:count]))
     person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
     bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
     return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), joined(past, more)
+
+
+def _told(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Array:
+    """Information of all views about identity and offset, in standard deviations."""
+
+    def one(inputs: tuple) -> Array:
+        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
+        return told(face, rig, view, Bundle(pose, expression, bundle.person), prior).information
+
+    # One by one: batches of factorisations can stand still on two cores.
+    return jnp.sum(jax.lax.map(one, (views, bundle.poses, bundle.expressions)), axis=0)
 
 
 def measured(
