@@ -11,6 +11,7 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.trackers.head.state import DEFORMABLE, INITIALISING, LOST, PATIENCE
+from jaxfilters.trackers.head_mono.estimate import UNMODELLED_MM
 from jaxfilters.trackers.head_mono.session import MonoSession
 from jaxfilters.trackers.head_mono.start import initialise
 from jaxfilters.trackers.head_mono.state import PUBLISHED, MonoOptions
@@ -62,6 +63,19 @@ def test_the_face_is_adjusted_while_it_is_followed(followed):
     np.testing.assert_array_equal(changes > 0, track.is_adjusted[START + 1 :])
     np.testing.assert_allclose(session.person.offset, track.offset[-1], atol=1e-5)
     assert np.abs(track.offset[-1]).max() > 0.01
+
+
+def test_no_landmark_counts_for_more_than_a_model_knows_of_faces(followed, talking):
+    """By how far so many millimetres across the line of sight are in pixels, at the distance that is believed."""
+    made, _ = talking
+    window = followed[0]._following.state.window
+    least = np.linalg.eigvalsh(np.asarray(window.views.covariance, float))[..., 0]
+    taken = np.asarray(window.ages)[1:] < len(made) - START
+    assert taken.sum() >= 2
+    unmodelled_px = 800.0 * UNMODELLED_MM / np.asarray(window.poses[:, 2], float)
+    share = (least / unmodelled_px[:, None] ** 2)[1:][taken][np.asarray(window.views.seen)[1:][taken]]
+    # A landmark is up to 40 mm before or behind the middle of a head at 650 mm. What it is measured to comes on top.
+    assert np.all(share > 0.88)
 
 
 def test_standard_deviations_hold_what_is_not_known_of_the_person(followed, talking):
