@@ -82,13 +82,14 @@ def test_the_fit_is_far_within_half_of_the_published_errors(videos, kind):
 
 @pytest.mark.parametrize("kind", ["slow", "fast"])
 def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
-    """80 frames of one face, whose registration errs in its own way: half as much again is allowed.
+    """80 frames of one face, whose registration errs in its own way: twice as much is allowed.
 
-    Over three draws of the particles: the errors of one are off by a third either way.
+    Over twenty draws of the particles this face has up to 1.4 times the published errors where it moves fast, and the
+    squares of one draw's errors are off by half either way: four draws are beyond twice with a probability below 1e-4.
     """
-    tracks = [videos[kind].track(PAPER, seed)[1] for seed in range(3)]
-    errors = np.concatenate([videos[kind].errors(PAPER, seed) for seed in range(3)])
-    assert np.all(rms(errors) < 1.5 * np.array(PAPER_ADAPTIVE[kind]))
+    tracks = [videos[kind].track(PAPER, seed)[1] for seed in range(4)]
+    errors = np.concatenate([videos[kind].errors(PAPER, seed) for seed in range(4)])
+    assert np.all(rms(errors) < 2.0 * np.array(PAPER_ADAPTIVE[kind]))
     for track in tracks:
         np.testing.assert_array_equal(track.status, RIGID)
 
