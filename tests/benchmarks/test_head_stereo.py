@@ -168,8 +168,9 @@ def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
 
 @pytest.mark.slow
 def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
-    """Few particles and frames; fixed diffusions are left out, for every option takes long to compile."""
-    few = {name: HeadOptions(mode="paper", learn=False, num_particles=64) for name in ("_paper", "_paper_fixed5")}
+    """Few particles and frames; all parts share three trackers, for every option takes long to compile."""
+    usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0) for mode in ("modern", "paper")}
+    few = dict.fromkeys(("_paper", "_paper_fixed5"), usual["paper"])
     monkeypatch.setattr(head_stereo, "PAPER", few)
     monkeypatch.setattr(head_stereo, "ALWAYS", {"": HeadOptions(learn=False, num_particles=64)})
     monkeypatch.setattr(head_stereo, "QUICK_NUM_SEEDS", 1)
@@ -179,7 +180,7 @@ def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
     monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 50, 60))
     monkeypatch.setattr(head_stereo, "QUICK_COUNTS", (64,))
     monkeypatch.setattr(speed, "USUAL", 64)
-    chosen = {"rigid": HeadOptions(learn=False, num_particles=64), "deformable": HeadOptions(num_particles=64)}
+    chosen = {"rigid": HeadOptions(learn=False, num_particles=64), "deformable": usual["modern"]}
     monkeypatch.setattr(Schedule, "trackers", property(lambda self: chosen))
     metrics = head_stereo.run(quick=True, seed=0, out=tmp_path)
     for kind in ("slow", "fast"):
