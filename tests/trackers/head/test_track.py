@@ -85,7 +85,7 @@ def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
     """80 frames of one face, whose registration errs in its own way: twice as much is allowed.
 
     Over twenty draws of the particles this face has up to 1.4 times the published errors where it moves fast, and the
-    squares of one draw's errors are off by half either way: four draws are beyond twice with a probability below 1e-4.
+    squares of one draw's errors are off by half either way: of 1600 sets of four of the twenty, one is beyond.
     """
     tracks = [videos[kind].track(PAPER, seed)[1] for seed in range(4)]
     errors = np.concatenate([videos[kind].errors(PAPER, seed) for seed in range(4)])
