@@ -17,6 +17,7 @@ from pathlib import Path
 
 from jaxfilters.benchmarks import gate, metrics, scenarios
 from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.devices import use_all_cores
 
 REGRESSION, FAILURE = 1, 2
@@ -45,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"--truth: {options.scenario} compares with no file")
     try:
         measured = scenario.run(quick=options.quick, seed=options.seed, out=options.out, **more)
-    except RecordingError as error:
+    except (RecordingError, InputError) as error:
         return _fail(f"{options.scenario}: {error}")
     print(metrics.table(measured))
     if options.json:
@@ -96,7 +97,7 @@ def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
         default=gate.BASELINE,
         help="what to compare with (default: the committed one)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write the plots of the scenario there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write plots there, and what is finished")
     return parser
 
 

@@ -4,6 +4,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+Direction = Literal["lower", "higher"]
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -12,7 +14,7 @@ class Metric:
     value: float
     unit: str
     """As in "ms", "mm", "frames/s"; empty for ratios and probabilities."""
-    better: Literal["lower", "higher"]
+    better: Direction
     """Which direction is an improvement."""
 
 

@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+VARIABLE = "JAXFILTERS_DATA"
+"""Of the environment."""
+
 
 class RecordingError(Exception):
     """A recording that is not there, or a file of it that cannot be used; the message says what to do."""
@@ -14,10 +17,10 @@ def recording_folder(name: str) -> Path:
     Raises:
         RecordingError: if it is not there.
     """
-    root = os.environ.get("JAXFILTERS_DATA")
+    root = os.environ.get(VARIABLE)
     if not root:
-        raise RecordingError(f"JAXFILTERS_DATA is not set; it must name the folder that holds {name}.")
+        raise RecordingError(f"{VARIABLE} is not set; it must name the folder that holds {name}.")
     folder = Path(root) / name
     if not folder.is_dir():
-        raise RecordingError(f"JAXFILTERS_DATA is {root}, which holds no folder {name}.")
+        raise RecordingError(f"{VARIABLE} is {root}, which holds no folder {name}.")
     return folder

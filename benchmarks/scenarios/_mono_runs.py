@@ -63,6 +63,29 @@ class MonoRun(NamedTuple):
         return np.mean(np.abs(self.errors) <= 2 * np.asarray(self.track.pose_std) * DISPLAY, axis=0)
 
 
+def as_arrays(runs: Mapping[str, MonoRun]) -> dict[str, np.ndarray]:
+    """Runs by name, flat; see `from_arrays`."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, run in runs.items():
+        of_run = run._asdict()
+        parts = of_run.pop("track")._asdict() | of_run
+        arrays |= {f"{name}.{part}": np.asarray(value) for part, value in parts.items()}
+    return arrays
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, MonoRun]:
+    """Runs by name, of what `as_arrays` made of them."""
+    parts: dict[str, dict[str, np.ndarray]] = {}
+    for key, array in arrays.items():
+        name, _, part = key.rpartition(".")
+        parts.setdefault(name, {})[part] = array
+    track = lambda of: MonoTrack(*(of[part] for part in MonoTrack._fields))
+    return {
+        name: MonoRun(track(of), *(of[part] for part in MonoRun._fields if part != "track"))
+        for name, of in parts.items()
+    }
+
+
 class Contender(NamedTuple):
     """A tracker, and what it knows of faces."""
 

@@ -11,17 +11,19 @@ leave the window, `b_angles_` and `b_latest_` choose frames otherwise, `b_render
 the ICT face model. `_paper` is the tracker of the thesis, `_paper_map` the same with priors, `_projected` without
 measured landmarks. Starts are judged by how widely the five heads are turned. The modelled people need
 `ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos
-`talking_face_video`; what is missing is said and left out.
+`talking_face_video`; what is missing is said and left out. All of it takes hours: with `--out`, a run that was cut off
+goes on after the last user and the last part that it had finished.
 """
 
 import sys
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._mono_floor import size_errors
@@ -29,8 +31,10 @@ from jaxfilters.benchmarks.scenarios._mono_real import cross_model, modelled_met
 from jaxfilters.benchmarks.scenarios._mono_runs import (
     Contender,
     MonoRun,
+    as_arrays,
     eyes_apart_of,
     follow_all,
+    from_arrays,
     learnt_from,
     over_users,
     talking_head,
@@ -66,17 +70,19 @@ PAPER_MAP = replace(PUBLISHED, prior_weight=0.7)
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Run all parts, print the scores, return them."""
-    del out
-    users = 1 if quick else NUM_STRANGERS
-    metrics = experiment_metrics(range(users), QUICK_NUM_FRAMES if quick else NUM_FRAMES, seed, quick)
-    shapes = np.stack([np.asarray(_identity(FIRST_USER + user).neutral) for user in range(users)])
-    told = DISTANCE_MM * np.abs(size_errors(shapes))
-    metrics["error_b_z_of_exact_shape"] = Metric(float(np.mean(told)), "mm", "lower")
-    metrics |= start_metrics(learnt_from(people_but(None), 10, seed).face, seed, 2 if quick else 40)
-    metrics |= speed_metrics(seed, 3 if quick else 25)
-    for part in (modelled_metrics, video_metrics):
+    users = range(1 if quick else NUM_STRANGERS)
+    kept = Finished(out, scenario="head-mono", quick=quick, seed=seed)
+    metrics = experiment_metrics(users, QUICK_NUM_FRAMES if quick else NUM_FRAMES, seed, quick, kept)
+    parts = {
+        "floor": lambda: _floor(users),
+        "starts": lambda: start_metrics(learnt_from(people_but(None), 10, seed).face, seed, 2 if quick else 40),
+        "speed": lambda: speed_metrics(seed, 3 if quick else 25),
+        "modelled": lambda: modelled_metrics(quick, seed),
+        "videos": lambda: video_metrics(quick, seed),
+    }
+    for name, part in parts.items():
         try:
-            metrics |= part(quick, seed)
+            metrics |= kept.metrics(name, part)
         except RecordingError as error:
             sys.stderr.write(f"  left out: {error}\n")
     return metrics
@@ -117,12 +123,16 @@ def contenders_for(user: int, seed: int, quick: bool) -> dict[str, Contender]:
     return best | cross_model(seed)
 
 
-def experiment_metrics(users, num_frames: int, seed: int, quick: bool) -> dict[str, Metric]:
+def experiment_metrics(users: range, num_frames: int, seed: int, quick: bool, kept: Finished) -> dict[str, Metric]:
     """Errors of all trackers over the users."""
+
+    def follow(user: int) -> dict[str, np.ndarray]:
+        made = talking_head(FIRST_USER + user, num_frames)
+        return as_arrays(follow_all(made, contenders_for(user, seed, quick), seed + user))
+
     runs: dict[str, list[MonoRun]] = {}
     for user in users:
-        made = talking_head(FIRST_USER + user, num_frames)
-        for name, one in follow_all(made, contenders_for(user, seed, quick), seed + user).items():
+        for name, one in from_arrays(kept.arrays(f"user-{user}", partial(follow, user))).items():
             runs.setdefault(name, []).append(one)
             sys.stderr.write(f"  user {user}, {name}: {np.round(one.means[AXIS_ORDER], 2)}\n")
     metrics: dict[str, Metric] = {}
@@ -162,6 +172,13 @@ def errors_of(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
         f"error_{name}_landmark_worst": Metric(float(landmark.worst), "mm", "lower"),
         f"lost_share_{name}": Metric(100 * float(lost.mean), "%", "lower"),
     }
+
+
+def _floor(users: range) -> dict[str, Metric]:
+    """How well the depth of the same strangers can be told from their exact shapes."""
+    shapes = np.stack([np.asarray(_identity(FIRST_USER + user).neutral) for user in users])
+    told = DISTANCE_MM * np.abs(size_errors(shapes))
+    return {"error_b_z_of_exact_shape": Metric(float(np.mean(told)), "mm", "lower")}
 
 
 @cache

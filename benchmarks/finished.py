@@ -1,0 +1,79 @@
+"""Parts of a long benchmark that are done, kept in its folder, so that a run that was cut off goes on where it was."""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+import jaxfilters
+from jaxfilters import benchmarks, models, trackers
+from jaxfilters.benchmarks.environment import environment
+from jaxfilters.benchmarks.metrics import Direction, Metric
+from jaxfilters.benchmarks.recordings import VARIABLE
+from jaxfilters.trackers.shell.checkpoint import write_npz
+from jaxfilters.trackers.shell.npz_files import read_arrays
+
+_PACKAGES = (jaxfilters, models, trackers, benchmarks)
+"""In a checkout they lie side by side."""
+_WANTED = "without it, it is measured anew"
+
+
+class Finished:
+    """What was measured before by the same code with the same settings on the same machine."""
+
+    def __init__(self, out: Path | None, **settings: object) -> None:
+        """Without a folder nothing is kept, and everything is measured.
+
+        Args:
+            out: Folder of the run; what is finished goes into one beneath it.
+            settings: What the results depend on beside code, machine and recordings; JSON-able.
+        """
+        self._folder = None if out is None else out / f"finished-{_digest(settings)}"
+
+    def arrays(self, name: str, measure: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """What `measure` gives, or gave under this name.
+
+        Raises:
+            InputError: what was kept cannot be read.
+            OSError: the folder cannot be written.
+        """
+        if self._folder is None:
+            return measure()
+        path = self._folder / f"{name}.npz"
+        if path.exists():
+            return read_arrays(path, _WANTED)
+        measured = measure()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_npz(path, measured)
+        return measured
+
+    def metrics(self, name: str, measure: Callable[[], dict[str, Metric]]) -> dict[str, Metric]:
+        """As `arrays`, of numbers with their names."""
+        kept = self.arrays(name, lambda: _as_arrays(measure()))
+        rows = zip(kept["name"], kept["value"], kept["unit"], kept["better"], strict=True)
+        return {str(key): Metric(float(value), str(unit), cast(Direction, str(of))) for key, value, unit, of in rows}
+
+
+def _as_arrays(metrics: dict[str, Metric]) -> dict[str, np.ndarray]:
+    of = list(metrics.values())
+    return {
+        "name": np.array(list(metrics), str),
+        "value": np.array([metric.value for metric in of], float),
+        "unit": np.array([metric.unit for metric in of], str),
+        "better": np.array([metric.better for metric in of], str),
+    }
+
+
+def _digest(settings: dict[str, object]) -> str:
+    """Changes with whatever may change a result: numbers of other code never mix with those of this one."""
+    machine = {name: value for name, value in environment().items() if name != "load"}
+    told = json.dumps([settings, machine, os.environ.get(VARIABLE)], sort_keys=True)
+    digest = hashlib.sha256(told.encode())
+    for folder in (path for package in _PACKAGES for path in package.__path__):
+        for source in sorted(Path(folder).rglob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:12]
