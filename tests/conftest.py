@@ -8,6 +8,19 @@ import pytest
 MANY_MAPPINGS = 20_000
 """Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several."""
 
+QUICK = "jax_disable_most_optimizations"
+"""JAX's own option; where its variable in the environment is set, that decides for all tests."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Compiles in a third of the time, without most optimisations, but where a test runs for longer than it compiles.
+
+    A hook, not a fixture: what the fixtures of a module compile is for the test that asks for them first.
+    """
+    if QUICK.upper() not in os.environ:
+        jax.config.update(QUICK, item.get_closest_marker("optimised") is None)
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compiled_programs():

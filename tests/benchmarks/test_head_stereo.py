@@ -167,12 +167,13 @@ def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
-    """Few particles and frames; all parts share three trackers, for every option takes long to compile."""
-    usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0) for mode in ("modern", "paper")}
+    """Few particles and frames; all parts share two trackers, frame by frame: every other one takes long to compile."""
+    usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0, chunk=1) for mode in ("modern", "paper")}
     few = dict.fromkeys(("_paper", "_paper_fixed5"), usual["paper"])
     monkeypatch.setattr(head_stereo, "PAPER", few)
-    monkeypatch.setattr(head_stereo, "ALWAYS", {"": HeadOptions(learn=False, num_particles=64)})
+    monkeypatch.setattr(head_stereo, "ALWAYS", {"": usual["modern"]})
     monkeypatch.setattr(head_stereo, "QUICK_NUM_SEEDS", 1)
     monkeypatch.setattr(head_stereo, "QUICK_NUM_FRAMES", 31)
     monkeypatch.setattr(head_stereo, "STILL_FRAMES", 31)
@@ -180,8 +181,9 @@ def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
     monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 50, 60))
     monkeypatch.setattr(head_stereo, "QUICK_COUNTS", (64,))
     monkeypatch.setattr(speed, "USUAL", 64)
-    chosen = {"rigid": HeadOptions(learn=False, num_particles=64), "deformable": usual["modern"]}
-    monkeypatch.setattr(Schedule, "trackers", property(lambda self: chosen))
+    monkeypatch.setattr(speed, "BATCH", 1)
+    both = dict.fromkeys(("rigid", "deformable"), usual["modern"])
+    monkeypatch.setattr(Schedule, "trackers", property(lambda self: both))
     metrics = head_stereo.run(quick=True, seed=0, out=tmp_path)
     for kind in ("slow", "fast"):
         for axis in AXES:

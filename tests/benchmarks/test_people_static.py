@@ -10,6 +10,8 @@ from jaxfilters.benchmarks.scenarios import people_static
 from jaxfilters.benchmarks.scenarios._static_people import BODY_M, LOOKS, MODEL_M, SHAPE, Estimates, Look, Runs
 from jaxfilters.benchmarks.scenarios.people_static import GROUPS, HALVING, PAPER
 
+pytestmark = pytest.mark.optimised
+
 SEEDS = range(2)
 
 

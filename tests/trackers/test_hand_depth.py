@@ -9,6 +9,8 @@ from jaxfilters.trackers import hand_depth
 from jaxfilters.trackers.hand_depth import LOST, SEARCHING, TRACKING, HandDepthConfig
 from jaxfilters.trackers.shell.depth_files import open_depth
 
+pytestmark = pytest.mark.optimised
+
 CHUNK = 12
 NUM_PARTICLES = 96
 

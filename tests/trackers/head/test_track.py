@@ -13,6 +13,8 @@ from jaxfilters.trackers.head.registration import register
 from jaxfilters.trackers.head.search import first_diffusion, searches
 from jaxfilters.trackers.head.state import LOST, NUM_MODES, RIGID, UNITS, HeadOptions, compiled
 
+pytestmark = pytest.mark.optimised
+
 CHUNK = 8
 MODERN, PAPER = HeadOptions(), HeadOptions(mode="paper")
 FIXED = HeadOptions(mode="paper", diffusion="fixed", fixed_diffusion=1.0)

@@ -53,7 +53,9 @@ def window_of(rig, face, seen, options):
     size = face.num_identities + face.mean.size
     ages = jnp.array([9, 1, 2, 4, 3], jnp.int32)
     empty = jnp.zeros((NUM, size, size)), jnp.zeros((NUM, size))
-    return informed(face, rig, Window(views, true.poses, true.expressions, ages, *empty), true.person, options.prior)
+    return jax.jit(informed)(
+        face, rig, Window(views, true.poses, true.expressions, ages, *empty), true.person, options.prior
+    )
 
 
 def told_by(window, information):
@@ -70,7 +72,7 @@ def state_of(rig, face, seen, options):
     bundle = true._replace(poses=true.poses + jnp.asarray(shift, jnp.float32))
     start = Start(bundle, Adjustment(*jnp.zeros(3)), views.uv)
     images = jnp.asarray(np.random.default_rng(1).uniform(0, 255, (2, 480, 640)), jnp.float32)
-    return begin(
+    return jax.jit(begin, static_argnames="options")(
         jax.random.key(0), face, rig, start, views, jnp.zeros((), int), images, jnp.zeros(()), options, options.prior
     )
 
@@ -83,7 +85,7 @@ def new_frame(rig, face, state, seen, options):
     view = detected(projected(face, rig, now), LANDMARK_PX)
     believed = now.poses[0] + jnp.array([0.5, 0.5, 3, 0.01, 0.01, -0.01])
     x = jnp.concatenate([believed, state.modes.coefficients(face, now.expressions[0])])
-    return frame_of(face, rig, view, state.person, x, state.modes, options.prior)
+    return jax.jit(frame_of)(face, rig, view, state.person, x, state.modes, options.prior)
 
 
 @pytest.fixture(scope="module")
@@ -185,8 +187,8 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     x = jnp.concatenate([true.poses[2], jnp.zeros(face.num_expressions)])
     state = state_of(rig, face, seen, USUAL)
     x = x.at[6:].set(state.modes.coefficients(face, true.expressions[2]))
-    frame = frame_of(face, rig, alone, true.person, x, state.modes, USUAL.prior)
-    found = np.asarray(uncertainty(face, window, USUAL.prior, mean_person(face), frame.told.response), float)
+    frame = jax.jit(frame_of)(face, rig, alone, true.person, x, state.modes, USUAL.prior)
+    found = np.asarray(jax.jit(uncertainty)(face, window, USUAL.prior, mean_person(face), frame.told.response), float)
 
     units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std)])
     root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T
@@ -203,7 +205,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     strength = lambda who: jnp.linalg.norm(expression_basis(face, who) @ np.linalg.inv(root))
 
     here = jnp.concatenate([true.person.identity, true.person.offset.ravel()])
-    by_person, by_own = jax.jacfwd(rows, (0, 1))(here, jnp.concatenate([true.poses[2], frame.expression]))
+    by_person, by_own = jax.jit(jax.jacfwd(rows, (0, 1)))(here, jnp.concatenate([true.poses[2], frame.expression]))
     prior = np.linalg.inv(np.asarray(face.identity_covariance, float))
     known = np.zeros((units.size, units.size))
     known[: len(prior), : len(prior)] = face.identity_std[:, None] * prior * face.identity_std

@@ -111,7 +111,7 @@ def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(
     both = np.hypot(PRIOR.offset_std, misplaced_mm)
     own = (PRIOR.offset_std / both) ** 2 * truth.person.offset[chosen]
     person = Person(truth.person.identity, own)
-    past = told_of_ten(face, rig, views, truth, person, Prior(1.0, both), misplaced_mm)
+    past = jax.jit(told_of_ten)(face, rig, views, truth, person, Prior(1.0, both), misplaced_mm)
     kept = parameters(person)
     parts = truth.poses, truth.expressions, truth.person.offset.at[chosen].add(-own)
     flat, unravel = jax.flatten_util.ravel_pytree(parts)
@@ -131,13 +131,13 @@ def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(
         return jnp.concatenate([of_frames, *held(identity, ours, offset, expressions)])
 
     y = jnp.concatenate([kept, flat])
-    J, r = np.asarray(jax.jacfwd(rest)(y)), np.asarray(rest(y))
+    J, r = np.asarray(jax.jit(jax.jacfwd(rest))(y)), np.asarray(jax.jit(rest)(y))
     normal, gradient = J.T @ J, J.T @ r
     n = kept.size
     share = np.linalg.solve(normal[n:, n:], normal[n:, :n])
     # Less what holds the offsets of the ten, which the tracker knows.
     ours = lambda y: held(*split(y), parts[2], truth.expressions)[0]
-    J, r = np.asarray(jax.jacfwd(ours)(kept)), np.asarray(ours(kept))
+    J, r = np.asarray(jax.jit(jax.jacfwd(ours))(kept)), np.asarray(jax.jit(ours)(kept))
     expected = normal[:n, :n] - normal[:n, n:] @ share - J.T @ J
     expected_pull = expected @ np.asarray(kept) - (gradient[:n] - share.T @ gradient[n:] - J.T @ r)
     np.testing.assert_allclose(past.information, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())

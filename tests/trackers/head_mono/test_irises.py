@@ -81,7 +81,7 @@ def size_variance(face, rig, points, bundle):
     views = detected(points, 1.0)
     flat, unravel = jax.flatten_util.ravel_pytree(bundle)
     residuals = lambda y: all_residuals(face, rig, views, Bundle(*unravel(y)), PRIOR)
-    J = np.asarray(jax.jacfwd(residuals)(flat), float)
+    J = np.asarray(jax.jit(jax.jacfwd(residuals))(flat), float)
     sizes = lambda y: log_size(face, unravel(y).person.identity)
     slope = np.asarray(jax.grad(sizes)(flat), float)
     # In units of each column's length, for the sake of rounding.

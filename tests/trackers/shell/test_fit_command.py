@@ -33,6 +33,7 @@ def fit(*arguments):
     return main(["fit", "face-model", *map(str, arguments)])
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     assert fit("--out", tmp_path / "model.npz") == 0
