@@ -9,6 +9,8 @@ from jaxfilters.benchmarks.scenarios.people_cameras import SETUPS, Setup, handov
 from jaxfilters.trackers.people import demo_room as demo
 from jaxfilters.trackers.people.demo_room import demo_room
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture(scope="module")
 def room():

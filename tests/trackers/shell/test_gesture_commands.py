@@ -74,6 +74,7 @@ def test_without_data_symbols_are_drawn(tmp_path, capsys, monkeypatch):
     assert told[-1] == "24 strokes, 0 rejected; of 24 with a label 24 are right, 100.0 %"
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     assert run("fit", "gestures", "--out", tmp_path / "model.npz") == 0
