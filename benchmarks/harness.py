@@ -32,6 +32,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.json and not options.json.parent.is_dir():
         return _fail(f"--json: no folder {options.json.parent}")
     try:
+        if options.out:
+            options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        return _fail(f"--out: no folder {options.out} can be made ({error.strerror})")
+    try:
         bounds = gate.load(options.baseline, options.scenario) if options.gate else {}
     except ValueError as error:
         return _fail(f"--gate: {error}")

@@ -70,6 +70,9 @@ def test_mistakes_are_named(tmp_path, capsys):
     assert expected in capsys.readouterr().err
     assert main(["two-numbers", "--json", str(tmp_path / "missing" / "r.json")]) == 2
     assert "--json: no folder" in capsys.readouterr().err
+    (tmp_path / "taken").touch()
+    assert main(["two-numbers", "--out", str(tmp_path / "taken")]) == 2
+    assert "--out: no folder" in capsys.readouterr().err
 
 
 def test_the_columns_of_the_table_are_aligned():
