@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import cast
 
@@ -71,7 +72,9 @@ def _as_arrays(metrics: dict[str, Metric]) -> dict[str, np.ndarray]:
 def _digest(settings: dict[str, object]) -> str:
     """Changes with whatever may change a result: numbers of other code never mix with those of this one."""
     machine = {name: value for name, value in environment().items() if name != "load"}
-    told = json.dumps([settings, machine, os.environ.get(VARIABLE)], sort_keys=True)
+    # Any package may matter: a part leaves out what needs one that is missing.
+    installed = sorted(f"{one.name} {one.version}" for one in distributions())
+    told = json.dumps([settings, machine, installed, os.environ.get(VARIABLE)], sort_keys=True)
     digest = hashlib.sha256(told.encode())
     for folder in (path for package in _PACKAGES for path in package.__path__):
         for source in sorted(Path(folder).rglob("*.py")):

@@ -1,5 +1,7 @@
 """What a long benchmark keeps of its finished parts."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,14 @@ def test_other_code_measures_anew(tmp_path, monkeypatch):
     Finished(tmp_path).metrics("speed", measure)
     (package / "tracker.py").write_text("STEPS = 2")
     Finished(tmp_path).metrics("speed", measure)
+    assert measure.times == 2
+
+
+def test_another_package_measures_anew(tmp_path, monkeypatch):
+    measure = Measuring()
+    for packages in ([], [SimpleNamespace(name="mediapipe", version="0.10.14")]):
+        monkeypatch.setattr(finished, "distributions", lambda packages=packages: packages)
+        Finished(tmp_path).metrics("speed", measure)
     assert measure.times == 2
 
 
