@@ -13,12 +13,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfilters.linalg import safe_sqrt
+from jaxfilters.models.face import past
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis, shape
-
-UNTOLD = 1e-6
-"""Information, as a share of that about each parameter itself, about what the past frames do not tell."""
+from jaxfilters.models.face.past import Past
 
 
 class Person(NamedTuple):
@@ -27,16 +25,6 @@ class Person(NamedTuple):
     identity: Float[Array, " S"]
     offset: Float[Array, "K 3"]
     """What the model lacks of this face in every expression, model frame, millimetres."""
-
-
-class Past(NamedTuple):
-    """What frames that are no longer adjusted told of the person: a Gaussian, in information form.
-
-    Minus its logarithm is `p . information p / 2 - pull . p` for the parameters p: identity, then offset.
-    """
-
-    information: Float[Array, "d d"]
-    pull: Float[Array, " d"]
 
 
 class Prior(NamedTuple):
@@ -51,7 +39,7 @@ class Prior(NamedTuple):
     eyes_apart_std: Float[ArrayLike, ""] = 0.0
     """Millimetres; 0 where it is not known."""
     past: Past | None = None
-    """Of frames that were adjusted before."""
+    """What frames that are no longer adjusted told of `parameters`."""
 
 
 def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
@@ -60,14 +48,13 @@ def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, 
 
 
 def parameters(person: Person) -> Float[Array, " d"]:
-    """Identity, then offset, as `Past` has them."""
+    """Identity, then offset."""
     return jnp.concatenate([person.identity, person.offset.ravel()])
 
 
 def nothing_past(face: MultilinearFace) -> Past:
     """Of a person who is new."""
-    size = face.num_identities + face.mean.size
-    return Past(jnp.zeros((size, size), face.mean.dtype), jnp.zeros(size, face.mean.dtype))
+    return past.nothing(face.num_identities + face.mean.size, face.mean.dtype)
 
 
 def eyes_apart(face: MultilinearFace, person: Person) -> Float[Array, ""]:
@@ -134,7 +121,7 @@ def residuals(
     measured = jnp.asarray(prior.eyes_apart_std) > 0
     wrong = eyes_apart(face, person) - prior.eyes_apart
     size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
-    before = jnp.zeros(0, offset.dtype) if prior.past is None else _of_past(face, prior.past, person)
+    before = jnp.zeros(0, offset.dtype) if prior.past is None else past.residuals(prior.past, parameters(person))
     identity = prior.weight * _of_identity(face, person.identity)
     return jnp.concatenate([identity, offset.ravel(), size[None], before])
 
@@ -149,20 +136,3 @@ def _of_identity(face: MultilinearFace, identity: Array) -> Array:
     beside = away - slope * jnp.sum(slope * away) / std2
     log_ratio = log_size(face, identity) - log_size(face, mean)
     return beside / jnp.exp(log_ratio) + slope * log_ratio / std2
-
-
-def _of_past(face: MultilinearFace, past: Past, person: Person) -> Array:
-    """Residuals of which half the sum of squares is the past's part of the energy, but for a constant.
-
-    In units of each parameter's own information and about the mean person, so that one small constant can stand for
-    what the past does not tell, and rounding does not grow with what it does.
-    """
-    product = lambda a, b: jnp.matmul(a, b, precision="highest")
-    scale = safe_sqrt(jnp.diagonal(past.information))
-    unit = jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 1.0)
-    mean = parameters(Person(face.identity_mean, jnp.zeros_like(face.mean)))
-    pull = unit * (past.pull - product(past.information, mean))
-    untold = UNTOLD * jnp.eye(unit.size, dtype=unit.dtype)
-    root = jnp.linalg.cholesky(past.information * unit[:, None] * unit + untold)
-    towards = jax.scipy.linalg.solve_triangular(root, pull, lower=True)
-    return product(root.T, (parameters(person) - mean) / unit) - towards

@@ -13,11 +13,12 @@ from jaxfilters.models.face import person_prior
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Views, adjust, square
 from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.past import joined
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.state import POSE
-from jaxfilters.trackers.head_mono.past import joined, left_behind, seen_by, units
+from jaxfilters.trackers.head_mono.past import left_behind, seen_by, units
 from jaxfilters.trackers.head_mono.person import Modes, model_of
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, Window
 

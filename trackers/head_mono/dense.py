@@ -17,9 +17,11 @@ from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adju
 from jaxfilters.models.face.frame_selection import reduced
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, restricted
-from jaxfilters.models.face.person_prior import Past, Person, Prior, parameters, seen_size
+from jaxfilters.models.face.past import Past, of_energy
+from jaxfilters.models.face.person_prior import Person, Prior, parameters, seen_size
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head_mono.adjustment import UNKNOWN
+from jaxfilters.trackers.head_mono.past import units as person_units
 from jaxfilters.trackers.head_mono.start import WIDE, Start
 
 NUM_DENSE = 68
@@ -154,7 +156,8 @@ def told_of_ten(
     count, known = parameters(person).size, UNKNOWN * jnp.eye(y.size, dtype=y.dtype)
     information, gradient = _without_rest(information + known, gradient, count)
     information, gradient = information - product(J.T, J)[:count, :count], gradient - product(J.T, ours(y))[:count]
-    return Past(information, product(information, parameters(person)) - gradient)
+    unit = person_units(tracked(face), prior)
+    return of_energy(unit[:, None] * information * unit, unit * gradient, parameters(person), unit)
 
 
 class _Parts:

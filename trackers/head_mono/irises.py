@@ -13,11 +13,12 @@ from jaxfilters.models.face.bundle import Bundle, Views, projected
 from jaxfilters.models.face.frame_selection import told
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Past, Person, Prior, log_size, nothing_past, posed_shape
+from jaxfilters.models.face.past import Past, joined, of_measurements
+from jaxfilters.models.face.person_prior import Person, Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head_mono.adjustment import prior_information
-from jaxfilters.trackers.head_mono.past import joined, units
+from jaxfilters.trackers.head_mono.past import units
 from jaxfilters.trackers.head_mono.start import Start
 
 IRIS_MM, IRIS_STD_MM = 11.7, 0.5
@@ -26,8 +27,6 @@ MEASURED_SHARE, MEASURED_PX = 0.02, 1.0
 """Standard deviation of a detector's widths, a share and pixels: the same in all frames, so that more do not help."""
 BEFORE_MM = 5.0
 """By how much an iris is nearer than the middle of the eye's corners; assumed."""
-REGULAR = 1e-3
-"""Share of what is known of all people that counts twice, so that the information is of full rank."""
 
 
 def with_irises(
@@ -61,24 +60,19 @@ def _resized(
 ) -> tuple[Start, Past]:
     bundle, count = start.bundle, face.num_identities
     person = bundle.person
-    product = lambda a, b: jnp.matmul(a, b, precision="highest")
     larger, std = measured(face, rig, start, iris_px)
     slope = jax.grad(lambda identity: log_size(face, identity))(person.identity)
-    people = jnp.square(prior.weight) * jnp.linalg.inv(face.identity_covariance)
-    information = slope[:, None] * slope / jnp.square(std) + REGULAR * people
-    pull = slope / jnp.square(std) * (larger + jnp.sum(slope * person.identity))
-    pull = pull + REGULAR * product(people, face.identity_mean)
-    nothing = nothing_past(face)
-    more = Past(nothing.information.at[:count, :count].set(information), nothing.pull.at[:count].set(pull))
+    size = (larger + jnp.sum(slope * person.identity)) / std
+    more = of_measurements(jnp.pad(slope / std, (0, face.mean.size))[None], size[None])
     # The start is the likeliest without the irises; to first order this is the likeliest with them.
-    unit, beside = units(face, prior), past.information + more.information
-    total = prior_information(face, person, prior) + unit[:, None] * beside * unit
+    past, unit = joined(past, more), units(face, prior)
+    total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
     total = total + _told(face, rig, views, bundle, prior)
     moved = unit * jnp.linalg.solve(total, unit * jnp.pad(slope / jnp.square(std) * larger, (0, face.mean.size)))
     factor = jnp.exp(jnp.sum(slope * moved[:count]))
     person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
     bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
-    return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), joined(past, more)
+    return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), past
 
 
 def _told(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Array:

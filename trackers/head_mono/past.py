@@ -4,7 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Past, Person, Prior, parameters
+from jaxfilters.models.face.past import Past, of_energy, seen_from
+from jaxfilters.models.face.person_prior import Person, Prior, parameters
 from jaxfilters.trackers.head_mono.state import Window
 
 
@@ -31,21 +32,11 @@ def left_behind(
         place: Of the frame.
         prior: What holds the person.
     """
-    unit = units(face, prior)
-    inverse = jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
-    information = inverse[:, None] * window.information[place] * inverse
     person = person._replace(offset=person.offset + face.mean - stranger.mean)
-    told = jnp.matmul(information, parameters(person), precision="highest")
-    return Past(information, told - inverse * window.gradient[place])
-
-
-def joined(past: Past, more: Past) -> Past:
-    """Both."""
-    return Past(past.information + more.information, past.pull + more.pull)
+    return of_energy(window.information[place], window.gradient[place], parameters(person), units(face, prior))
 
 
 def seen_by(past: Past, stranger: MultilinearFace, face: MultilinearFace) -> Past:
     """The same about the offset from another face."""
     offset = (face.mean - stranger.mean).ravel()
-    moved = jnp.concatenate([jnp.zeros_like(face.identity_mean), offset])
-    return Past(past.information, past.pull - jnp.matmul(past.information, moved, precision="highest"))
+    return seen_from(past, jnp.concatenate([jnp.zeros_like(face.identity_mean), offset]))

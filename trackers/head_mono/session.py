@@ -11,7 +11,8 @@ from jaxtyping import Float, UInt8
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Past, Person
+from jaxfilters.models.face.past import Past
+from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel

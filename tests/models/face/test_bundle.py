@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, all_residuals, box, projected
 from jaxfilters.models.face.multilinear import learn
-from jaxfilters.models.face.person_prior import Past, Person, Prior, nothing_past, parameters, posed_shape
+from jaxfilters.models.face.past import of_measurements
+from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, parameters, posed_shape
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
@@ -185,19 +186,20 @@ def test_a_point_behind_the_camera_is_a_large_residual_and_no_nan(x64):
 
 
 def test_a_past_is_the_gaussian_that_it_says(x64):
-    """Energies of two people differ by what the information form says, also where it tells nothing of a direction."""
+    """Energies of two people differ by what was measured, also where that tells nothing of a direction."""
     rng = np.random.default_rng(11)
     true = truth(10)
     views = views_of(true)
     root = rng.normal(size=(12, 40))
-    past = Past(jnp.asarray(root.T @ root), jnp.asarray(root.T @ rng.normal(size=12)))
+    values = rng.normal(size=12)
+    past = of_measurements(jnp.asarray(root), jnp.asarray(values))
 
     def energy(bundle, prior):
         return 0.5 * np.sum(np.square(all_residuals(face(), rig(), views, bundle, prior)))
 
     def told(bundle):
         p = np.asarray(parameters(bundle.person))
-        return 0.5 * p @ np.asarray(past.information) @ p - p @ np.asarray(past.pull)
+        return 0.5 * np.sum((root @ p - values) ** 2)
 
     other = true._replace(person=truth(12).person._replace(offset=jnp.asarray(rng.normal(0, 0.5, (10, 3)))))
     held = HELD._replace(past=past)

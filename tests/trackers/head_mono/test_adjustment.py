@@ -284,3 +284,16 @@ def test_particles_go_with_the_estimate(moved):
     nearest = np.linalg.lstsq(np.asarray(after.model.basis), np.asarray(before.model.basis) @ apart_before[6:])[0]
     np.testing.assert_allclose(apart_after[6:], nearest, atol=1e-3)
     np.testing.assert_array_equal(after.search.velocity, before.search.velocity)
+
+
+def test_what_frames_leave_behind_never_stops_an_adjustment(rig, face, seen):
+    """Each tells nothing of some directions, but for rounding: in single precision the sum has no Cholesky root."""
+    options = replace(USUAL, past="marginalised")
+    state = state_of(rig, face, seen, options)
+    adjust = jax.jit(lambda state, frame, place: adjusted(face, face, rig, state, frame, place, options))
+    held = []
+    for i in range(8):
+        state = adjust(state, new_frame(rig, face, state, seen, options), jnp.asarray(1 + i % 4))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.person))
+        held.append(float(jnp.trace(state.prior.past.information)))
+    assert np.all(np.diff(held) > 0)

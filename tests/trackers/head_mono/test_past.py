@@ -7,11 +7,12 @@ import pytest
 
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.multilinear import learn
+from jaxfilters.models.face.past import joined
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.remembered import hypotheses, remember
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head_mono.adjustment import informed
-from jaxfilters.trackers.head_mono.past import joined, left_behind, seen_by
+from jaxfilters.trackers.head_mono.past import left_behind, seen_by
 from jaxfilters.trackers.head_mono.state import MonoOptions, Window
 
 NUM, KEPT = 8, 5
