@@ -150,7 +150,7 @@ def numerical_ranks(X: Float[Array, "..."], tolerance: float | None = None) -> I
     found = []
     for mode in range(X.ndim):
         unfolded = unfold(X, mode)
-        values = jnp.linalg.svd(unfolded, compute_uv=False)
+        values = jnp.linalg.svd(unfolded, full_matrices=False, compute_uv=False)  # not even asked for, they take room
         least = max(unfolded.shape) * float(jnp.finfo(X.dtype).eps) if tolerance is None else tolerance
         found.append(jnp.sum(values > least * values[0]))
     return jnp.stack(found)

@@ -139,6 +139,12 @@ def test_ranks_of_exact_and_of_noisy_data(x64):
     assert numerical_ranks(X + noise, 1e-4 * (12**0.5 + 108**0.5) / largest).tolist() == [4, 3, 2]
 
 
+def test_a_long_mode_needs_no_square_of_its_length():
+    """All of its singular vectors would be 4 TB."""
+    X = np.random.default_rng(7).normal(size=(3, 2, 1_000_000)).astype(np.float32)
+    assert numerical_ranks(jnp.asarray(X)).tolist() == [3, 2, 6]
+
+
 @pytest.mark.parametrize(
     ("ranks", "message"),
     [
