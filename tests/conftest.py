@@ -5,8 +5,14 @@ from pathlib import Path
 import jax
 import pytest
 
-MANY_MAPPINGS = 20_000
-"""Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several."""
+MANY_MAPPINGS = 40_000
+"""Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several, and no file
+of tests adds more than 3000."""
+
+# Tracing makes millions of small objects that live on: looking through all of them for garbage, again and again, is
+# a tenth of a run.
+gc.freeze()
+gc.set_threshold(100_000, 20, 100)
 
 QUICK = "jax_disable_most_optimizations"
 """JAX's own option; where its variable in the environment is set, that decides for all tests."""
