@@ -12,6 +12,8 @@ from jaxfilters.benchmarks.scenarios._mesh_agreement import agreement
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, camera, follow_all
 from jaxfilters.benchmarks.scenarios.head_real import VIDEOS, detector_distances, longest, read_video
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.landmarks import FROM_68
+from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs
 from jaxfilters.models.face.multilinear import MultilinearFace, learn
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
@@ -19,6 +21,7 @@ from jaxfilters.models.synthetic.face_training import ict_shapes
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import ict_sequence
+from jaxfilters.trackers.head_mono.dense import NUM_DENSE
 from jaxfilters.trackers.head_mono.session import MonoSession
 from jaxfilters.trackers.head_mono.state import MonoOptions
 from jaxfilters.trackers.shell.face_model_files import default_face_model
@@ -47,15 +50,21 @@ PIECE = 48
 """Frames that are handed over at once."""
 
 
-def modelled_face(seed: int) -> MultilinearFace:
+def modelled_face(seed: int, landmarks: tuple[int, ...] = FROM_68, pairs: Pairs = PAIRS) -> MultilinearFace:
     """What people of the ICT face model differ in.
+
+    Args:
+        seed: Of the people.
+        landmarks: Which of the 68 of iBUG.
+        pairs: (right, left) among them.
 
     Raises:
         RecordingError: if the model is not there.
     """
     model = read_ict(recording_folder("ict_face_model"))
-    shapes = ict_shapes(jax.random.key(TRAINING_KEY + seed), model, NUM_TRAINING, noise_mm=0.5)
-    return learn(shapes, identities=IDENTITIES, expressions=EXPRESSIONS)
+    key = jax.random.key(TRAINING_KEY + seed)
+    shapes = ict_shapes(key, model, NUM_TRAINING, landmarks=landmarks, noise_mm=0.5)
+    return learn(shapes, identities=IDENTITIES, expressions=EXPRESSIONS, pairs=pairs)
 
 
 @cache
@@ -71,8 +80,8 @@ def cross_model(seed: int) -> dict[str, Contender]:
 def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Mean absolute errors of the rotation of modelled people, by axis and by yaw, with two models of faces.
 
-    What networks reach on the real images is said beside, for an idea of the scale: those are other faces, light and
-    cameras, and no track.
+    With one of them also from all 68 landmarks of the first frames. What networks reach on the real images is said
+    beside, for an idea of the scale: those are other faces, light and cameras, and no track.
 
     Raises:
         RecordingError: if a recording is missing.
@@ -82,6 +91,8 @@ def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     speech = read_livelink(recording_folder("livelinkface_take"), model.names)
     contenders = {"modelled": Contender(modelled_face(seed), MonoOptions())}
     if not quick:
+        dense = modelled_face(seed, tuple(range(NUM_DENSE)), PAIRS_68)
+        contenders["modelled_68"] = Contender(dense, MonoOptions())
         contenders["modelled_rendered"] = Contender(default_face_model().model, MonoOptions())
     runs: dict[str, list[MonoRun]] = {name: [] for name in contenders}
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES

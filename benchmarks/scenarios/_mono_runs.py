@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.models.face.multilinear import MultilinearFace, learn
 from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.face.rig import CameraRig, monocular
@@ -17,6 +18,7 @@ from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, 
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
 from jaxfilters.models.synthetic.face_training import generator_shapes
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
+from jaxfilters.trackers.head_mono.dense import NUM_DENSE, Dense
 from jaxfilters.trackers.head_mono.detections import Detections
 from jaxfilters.trackers.head_mono.session import MonoSession
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoTrack
@@ -174,4 +176,14 @@ def _detections(made: FaceSequence | IctSequence, seed: int) -> Detections:
     frames = [i for i in START_FRAMES if i < len(made)]
     noise = np.random.default_rng(seed).normal(0, DETECTED_PX, (len(frames), *made.uv.shape[2:]))
     images = np.concatenate([made.frames(i, i + 1)[:, 0] for i in frames])
-    return Detections(made.uv[frames, 0] + noise, images, float(made.times[frames[-1]]))
+    points = made.uv[frames, 0] + noise
+    dense = _dense(made.uv68[frames, 0], points, seed) if isinstance(made, IctSequence) else None
+    return Detections(points, images, float(made.times[frames[-1]]), dense=dense)
+
+
+def _dense(uv: np.ndarray, ten: np.ndarray, seed: int) -> Dense:
+    """The 68 landmarks with noise, for whoever has a model of them; the ten among them are the same ones."""
+    found = uv + np.random.default_rng([seed, NUM_DENSE]).normal(0, DETECTED_PX, uv.shape)
+    found[:, list(FROM_68)] = ten
+    covariance = np.broadcast_to(DETECTED_PX**2 * np.eye(2), (*found.shape, 2))
+    return Dense(found, covariance, np.ones(found.shape[:2], bool), 0.0)

@@ -9,10 +9,11 @@ learnt from the ten of the eleven who are not the user, as in the thesis, and ma
 `b_eyes_` is `b_` and knows the distance between the user's eyes to a millimetre, `b_past_` keeps what frames told that
 leave the window, `b_angles_` and `b_latest_` choose frames otherwise, `b_rendered_modelled_` has learnt from people of
 the ICT face model. `_paper` is the tracker of the thesis, `_paper_map` the same with priors, `_projected` without
-measured landmarks. Starts are judged by how widely the five heads are turned. The modelled people need
-`ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos
-`talking_face_video`; what is missing is said and left out. All of it takes hours: with `--out`, a run that was cut off
-goes on after the last user and the last part that it had finished.
+measured landmarks. Starts are judged by how widely the five heads are turned. Modelled people are followed by two
+models of faces, by one of them also from 68 landmarks, `modelled_68_`; they need `ict_face_model`,
+`biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos `talking_face_video`; what is
+missing is said and left out. All of it takes hours: with `--out`, a run that was cut off goes on after the last user
+and the last part that it had finished.
 """
 
 import sys

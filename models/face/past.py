@@ -8,7 +8,7 @@ looks the same. In single precision the sum of what many frames told is then not
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxfilters.linalg import tria
@@ -31,7 +31,7 @@ class Past(NamedTuple):
         return jnp.matmul(self.root.T, self.towards, precision="highest")
 
 
-def nothing(num_parameters: int, dtype: np.typing.DTypeLike) -> Past:
+def nothing(num_parameters: int, dtype: DTypeLike) -> Past:
     """Of parameters of which nothing was told."""
     return Past(jnp.zeros((num_parameters, num_parameters), dtype), jnp.zeros(num_parameters, dtype))
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
 from jaxfilters.models.synthetic.face_motion import FPS
 from jaxfilters.models.synthetic.face_sequence import pieces, rendered
@@ -40,6 +41,8 @@ class IctSequence:
     """Landmarks in the model frame, millimetres about the centroid of the neutral face."""
     uv: Float[np.ndarray, "frames C 10 2"]
     """Their pixels, whether they are seen or behind the nose."""
+    uv68: Float[np.ndarray, "frames C 68 2"]
+    """The same of all landmarks of iBUG."""
     gain: Float[np.ndarray, " frames"]
     """Factor of the light."""
 
@@ -96,7 +99,7 @@ def ict_sequence(
     who, looks, walls, noise = jax.random.split(key, 4)
     person, num_frames = make_ict_person(who, model), len(poses)
     expressions = np.zeros((num_frames, len(model.names))) if expressions is None else expressions
-    shapes, uv = _truth(model, person, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
+    shapes, uv68 = _truth(model, person, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
     return IctSequence(
         key=noise,
         model=model,
@@ -109,7 +112,8 @@ def ict_sequence(
         poses=poses,
         expressions=expressions,
         shapes=np.asarray(shapes),
-        uv=np.asarray(uv),
+        uv=np.asarray(uv68)[:, :, list(FROM_68)],
+        uv68=np.asarray(uv68),
         gain=np.ones(num_frames) if gain is None else gain,
     )
 
@@ -118,7 +122,7 @@ def ict_sequence(
 def _truth(model, person, rig, poses, expressions):
     def of_frame(frame):
         pose, weights = frame
-        shape = ten_landmarks(model, deformed(model, person, weights))
-        return shape, project_shape(rig, shape, pose)[0]
+        vertices = deformed(model, person, weights)
+        return ten_landmarks(model, vertices), project_shape(rig, vertices[model.landmarks], pose)[0]
 
     return jax.lax.map(of_frame, (poses, expressions))

@@ -65,7 +65,6 @@ def test_a_real_face_is_found_and_followed(monkeypatch, data_dir):
     assert metrics["cap12_detector_distance"].value < 0.1
 
 
-@pytest.mark.optimised
 @pytest.mark.data
 @pytest.mark.slow
 def test_a_modelled_person_is_followed_while_the_head_turns(monkeypatch, data_dir):

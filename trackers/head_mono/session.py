@@ -1,6 +1,7 @@
 """The one-camera head tracker from the first image on: waiting for a face, following it, finding it again."""
 
 import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -24,7 +25,7 @@ from jaxfilters.trackers.head_mono.detections import Collector, Detections
 from jaxfilters.trackers.head_mono.detectors import Detector
 from jaxfilters.trackers.head_mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head_mono.irises import with_irises
-from jaxfilters.trackers.head_mono.recognition import as_remembered, one_of, people, recognised
+from jaxfilters.trackers.head_mono.recognition import People, as_remembered, one_of, people, recognised
 from jaxfilters.trackers.head_mono.start import Start, begin, detected, initialise, search_of
 from jaxfilters.trackers.head_mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head_mono.track import System, advance
@@ -156,6 +157,9 @@ class _MonoTracker:
         """Adjustments when it was last asked who it is."""
         self._detector = detector
         self._collector = Collector(detector)
+        self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
+        self._ready: Future[MonoState] | None = None
+        """What a face that comes back needs first, compiled beside the frames."""
 
     @property
     def can_wait(self) -> bool:
@@ -204,6 +208,8 @@ class _MonoTracker:
         )
         self._num_told, self._system = 0, self._system._replace(face=self._face)
         state = self._recognised(state)
+        if self._pool is not None and self._ready is None:
+            self._ready = self._pool.submit(self._asked_who, self._system, state)
         what = "registered, a face that is known" if int(state.who) else "registered"
         return Beginning(state, detections.time, what)
 
@@ -227,11 +233,16 @@ class _MonoTracker:
 
     def _remember(self, old: MonoState) -> None:
         """Who was followed may come back, beside those who were remembered from the first."""
-        if self._options.is_published:
-            return
-        last = self.remembered(old)
-        known = last if self._remembered is None else joined(self._remembered, last)
-        self._people = people(self._face, known)
+        if not self._options.is_published:
+            self._people = self._people_with(self._system, old)
+
+    def _people_with(self, system: System, state: MonoState) -> People:
+        last = as_remembered(system.stranger, system.face, state)
+        return people(self._face, last if self._remembered is None else joined(self._remembered, last))
+
+    def _asked_who(self, system: System, state: MonoState) -> MonoState:
+        """As when a face comes back. Frames of a camera must not wait while this is compiled for one person more."""
+        return recognised(self._people_with(system, state), self.rig, state, self._compiled)
 
     def empty(self, count: int) -> MonoTrack:
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import FROM_68, MEAN_SHAPE
-from jaxfilters.models.face.rig import monocular
+from jaxfilters.models.face.rig import monocular, project_shape
 from jaxfilters.models.rendering.depth import render_mesh
 from jaxfilters.models.rendering.geometry import Mesh
 from jaxfilters.models.synthetic import ict_render
@@ -184,6 +184,11 @@ def test_recorded_faces_open_their_mouths_and_turn(ict, data_dir):
     assert moved[1:3].max() < 2
     assert np.abs(np.degrees(sequence.poses[:, 4])).max() > 30
     assert np.degrees(np.abs(np.diff(sequence.poses[:, 3:], axis=0))).max() < 10
+    shape, pose = jnp.asarray(sequence.shapes[200], float), jnp.asarray(sequence.poses[200], float)
+    np.testing.assert_allclose(project_shape(sequence.rig, shape, pose)[0], sequence.uv[200], atol=0.01)
+    # iBUG's first landmark is at the right ear, to the image's left, its ninth the chin.
+    assert np.all(sequence.uv68[0, :, 0, 0] < sequence.uv[0, :, :, 0].min(axis=1))
+    assert np.all(sequence.uv68[0, :, 8, 1] > sequence.uv[0, :, :, 1].max(axis=1))
 
 
 @pytest.mark.data

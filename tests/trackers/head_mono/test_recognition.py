@@ -9,9 +9,9 @@ from jaxfilters.models.face.multilinear import learn
 from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.synthetic.face import make_identity
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
-from jaxfilters.trackers.head_mono.recognition import people
+from jaxfilters.trackers.head_mono.recognition import people, recognised
 from jaxfilters.trackers.head_mono.session import MonoSession
-from jaxfilters.trackers.head_mono.state import PUBLISHED
+from jaxfilters.trackers.head_mono.state import PUBLISHED, MonoOptions
 
 START, IDENTITIES = 17, 15
 
@@ -88,6 +88,20 @@ def test_somebody_who_was_lost_is_known_when_found_elsewhere(rig, face, talking,
     assert beginning.what == "registered, a face that is known"
     apart = np.asarray(beginning.state.person.identity - state.person.identity) / np.asarray(face.identity_std)
     assert np.abs(apart).max() < 0.3
+
+
+def test_frames_of_a_camera_need_not_wait_for_a_face_that_comes_back(rig, face, talking, detected):
+    """What asks whether it is the same one is compiled by then."""
+    made, images = talking
+    recognised.clear_cache()
+    session = MonoSession(rig, face, MonoOptions(live=True), detections=detected)
+    process(session, images[:32], made.times[:32])
+    tracker, state = session._tracker, session._following.state
+    tracker._ready.result()
+    assert recognised._cache_size() == 1
+    found, _ = tracker._checked(detected)
+    assert tracker.begin(found, state, 60).what == "registered, a face that is known"
+    assert recognised._cache_size() == 1
 
 
 def test_shares_of_the_prior(taught):
