@@ -155,6 +155,16 @@ def test_what_a_detector_misplaces_is_no_part_of_the_face(face68, rig):
     assert trace(loose) < 0.5 * trace(exact)
 
 
+def test_no_detection_counts_for_more_than_a_model_knows_of_faces(face68, rig):
+    """To .05 px instead of .5, of what the model leaves of a face: .68 px at 650 mm."""
+    points, _ = somebody(face68, rig, 4)
+    first, usual = begun(face68, rig, points)
+    exact = dense_of(points)._replace(covariance=dense_of(points).covariance / 100)
+    precise = start_densely(face68, rig, first, exact, PRIOR)
+    trace = lambda found: float(jnp.trace(found.past.information))
+    assert 1.0 < trace(precise) / trace(usual) < 1 + 0.25 / 0.457
+
+
 def test_models_of_other_landmarks_are_refused(face, face68):
     assert tracked(face) is face
     np.testing.assert_array_equal(tracked(face68).mean, np.asarray(face68.mean)[list(FROM_68)])
