@@ -23,12 +23,7 @@ class Past(NamedTuple):
     @property
     def information(self) -> Float[Array, "d d"]:
         """Inverse covariance, where it has one."""
-        return jnp.matmul(self.root.T, self.root, precision="highest")
-
-    @property
-    def pull(self) -> Float[Array, " d"]:
-        """Information times mean, where it has one."""
-        return jnp.matmul(self.root.T, self.towards, precision="highest")
+        return _product(self.root.T, self.root)
 
 
 def nothing(num_parameters: int, dtype: DTypeLike) -> Past:

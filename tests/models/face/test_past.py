@@ -32,12 +32,12 @@ def test_an_energy_is_kept_but_for_a_constant(x64):
         assert energy(past, p) - energy(past, at) == pytest.approx(expected, rel=1e-9)
 
 
-def test_information_and_pull_are_those_of_the_energy(x64):
+def test_information_and_mean_are_those_of_the_energy(x64):
     information, gradient, at = told_of_few(np.random.default_rng(1))
     past = of_energy(*map(jnp.asarray, (information, gradient, at, STD)))
     raw = information / STD[:, None] / STD
     np.testing.assert_allclose(past.information, raw, rtol=1e-9, atol=1e-9 * np.abs(raw).max())
-    np.testing.assert_allclose(past.pull, raw @ at - gradient / STD, rtol=1e-8)
+    np.testing.assert_allclose(past.root.T @ past.towards, raw @ at - gradient / STD, rtol=1e-8)
 
 
 def test_joined_energies_add_up(x64):
@@ -49,7 +49,7 @@ def test_joined_energies_add_up(x64):
     assert energy(both, p) - energy(both, q) == pytest.approx(expected, rel=1e-9)
     alone = joined(nothing(SIZE, float), one)
     np.testing.assert_allclose(alone.information, one.information, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(alone.pull, one.pull, rtol=1e-8)
+    np.testing.assert_allclose(alone.root.T @ alone.towards, one.root.T @ one.towards, rtol=1e-8)
 
 
 def test_a_shift_moves_the_energy(x64):

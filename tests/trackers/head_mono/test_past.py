@@ -88,7 +88,7 @@ def test_a_past_is_about_the_same_faces_whoever_it_is_told_to(x64, rig, scene):
     apart = np.concatenate([np.zeros(10), np.asarray(known.mean - stranger.mean).ravel()])
 
     def energy(past, p):
-        return 0.5 * p @ np.asarray(past.information) @ p - p @ np.asarray(past.pull)
+        return 0.5 * p @ np.asarray(past.information) @ p - p @ np.asarray(past.root.T @ past.towards)
 
     differences = [
         energy(past, about_stranger[0]) - energy(past, about_stranger[1]),
