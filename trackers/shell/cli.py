@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
+from jaxfilters.trackers.shell.compiled import keep_compiled_programs
 from jaxfilters.trackers.shell.devices import use_all_cores
 from jaxfilters.trackers.shell.fingertip_options import add_fingertips
 from jaxfilters.trackers.shell.fit_options import add_fit
@@ -19,6 +20,13 @@ from jaxfilters.trackers.shell.people_options import add_people
 
 FAILURE, INTERRUPTED = 2, 130
 """Exit codes: wrong input or a full disk; Ctrl-C."""
+
+
+def command() -> int:
+    """What the shell runs: `main`, with compiled programs kept for the next run, but where speed is measured."""
+    if sys.argv[1:2] != ["bench"] and (trouble := keep_compiled_programs()):
+        print(f"jaxfilters: {trouble}.", file=sys.stderr)
+    return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -218,4 +226,4 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())
