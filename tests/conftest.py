@@ -28,6 +28,26 @@ def pytest_runtest_setup(item):
         jax.config.update(QUICK, item.get_closest_marker("optimised") is None)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _videos_of_faces_are_rendered_quickly():
+    """The programs that render them are few and run in hundreds of frames: always with all optimisations."""
+    from jaxfilters.models.synthetic import face_sequence, ict_sequence  # checked by jaxtyping if imported this late
+
+    def rendered(*arguments):
+        before = jax.config.values[QUICK]
+        jax.config.update(QUICK, False)
+        try:
+            return original(*arguments)
+        finally:
+            jax.config.update(QUICK, before)
+
+    original = face_sequence.rendered
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (face_sequence, ict_sequence):
+            patch.setattr(module, "rendered", rendered)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compiled_programs():
     """Drops the programs of earlier files once they are many: a worker that runs half of the suite would crash."""
