@@ -91,7 +91,6 @@ def hand_video_metrics(folder: Path, out: Path | None = None, *, num_frames: int
     video = load_hand_video(folder, num_frames=num_frames)
     fits = list(fit_frames(video))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         for i in range(0, len(fits), max(1, len(fits) // 24)):
             cv2.imwrite(str(out / f"hand_video_{i:04d}.png"), overlay(video.frames[i], fits[i]))
     return _metrics(fits, finger_reach(video.joints))

@@ -69,7 +69,6 @@ def deformation_metrics(seeds: range, schedule: Schedule, out: Path | None) -> d
     runs = deforming_runs(seeds, schedule, AMPLITUDE, schedule.trackers)
     metrics = judged("", runs, schedule)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         plot(out / "deformation.png", runs, schedule)
     modern = {name: schedule.trackers[name] for name in ("rigid", "deformable")}
     return metrics | judged("mild_", deforming_runs(seeds[:1], schedule, MILD_AMPLITUDE, modern), schedule)

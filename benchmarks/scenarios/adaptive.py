@@ -72,7 +72,6 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     for name, filter in face_filters().items():
         metrics |= face_metrics(name, face, follow(filter, keys, face.observed))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         settings = f"{num_seeds} seeds, {NUM_FRAMES} frames, {NUM_PARTICLES} likelihoods a frame"
         (out / "adaptive.txt").write_text(f"{settings}\n{table(metrics)}\n")
     return metrics

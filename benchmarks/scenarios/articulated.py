@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.recordings import VARIABLE
 from jaxfilters.benchmarks.scenarios import _articulated_paper as paper
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.filter import run as run_filter
@@ -32,8 +33,6 @@ COLORS = {"literal": (40, 120, 230), "recommended": (200, 110, 30)}
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Filter everything, print the tables, return their numbers."""
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     seeds = range(seed, seed + (QUICK_NUM_SEEDS if quick else NUM_SEEDS))
     held = range(seed, seed + (QUICK_NUM_HELD_SEEDS if quick else NUM_HELD_SEEDS))
     metrics = paper_metrics(seeds)
@@ -143,9 +142,9 @@ def time_metrics(rounds: int) -> dict[str, Metric]:
 
 
 def _real_metrics(quick: bool) -> dict[str, Metric]:
-    folder = os.environ.get("JAXFILTERS_DATA")
+    folder = os.environ.get(VARIABLE)
     if not folder:
-        _say("JAXFILTERS_DATA is not set: no real hands")
+        _say(f"{VARIABLE} is not set: no real hands")
         return {}
     from jaxfilters.benchmarks.scenarios._real_motion import real_motion_metrics
 

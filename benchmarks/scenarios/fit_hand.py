@@ -145,7 +145,6 @@ def real_metrics(stills: Stills, method: object, out: Path | None) -> dict[str, 
         f"this hand {np.round(1000 * after, 2)}\n"
     )
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         _draw(out / "fit_hand.png", others, fitted.theta)
     return {
         "real_error_average_mm": Metric(1000 * float(before.mean()), "mm", "lower"),

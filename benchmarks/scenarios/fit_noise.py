@@ -72,7 +72,6 @@ def _row(name: str, seen: np.ndarray, truth: np.ndarray, out: Path | None) -> li
         f"error {raw:.2f} -> {filtered:.2f} filtered, {smoothed:.2f} smoothed, {nominal:.2f} with round numbers\n"
     )
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         _draw(out / "fit_noise.png", seen[half:], truth[half:], np.asarray(found.smoothed) + means)
     return [raw, filtered, smoothed, nominal, ratio]
 

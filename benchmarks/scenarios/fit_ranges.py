@@ -127,7 +127,6 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     for name, found in learnt.items():
         sys.stdout.write(f"{name}\n{found}\n\n")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         _draw(out / "fit_ranges.png", recording, robots, errors)
     return _metrics(recording, robots, errors, half) | _learnt_metrics(recording, learnt["scale"])
 

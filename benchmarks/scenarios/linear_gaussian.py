@@ -66,7 +66,6 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     text = _table(rows, float(truth.log_evidence.sum()), len(keys))
     sys.stdout.write(text + "\n")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         (out / "linear_gaussian.txt").write_text(text)
     return _metrics(rows, float(truth.log_evidence.sum()))
 

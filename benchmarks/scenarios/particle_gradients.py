@@ -114,7 +114,6 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     text = _table(rows, exact)
     sys.stdout.write(text)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         (out / "particle_gradients.txt").write_text(text)
     return _metrics(rows)
 

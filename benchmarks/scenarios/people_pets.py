@@ -74,7 +74,6 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
         metrics |= score_metrics(scores, suffix)
     metrics |= _speed(followed)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         write_tracks(out / "tracks.csv", kept)
         draw_floor_plan(out / "floor_plan.png", annotated, within(positions(kept), pets, covered), pets.area)
     return metrics

@@ -58,8 +58,6 @@ def run(
     num_frames: int | None = None,
 ) -> dict[str, Metric]:
     """Measure times, then accuracy; what is not given is as the command line would have it."""
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     num_seeds = num_seeds or (QUICK_NUM_SEEDS if quick else NUM_SEEDS)
     num_frames = num_frames or (QUICK_NUM_FRAMES if quick else None)
     _say(out, _preamble(num_particles, num_seeds, num_frames))

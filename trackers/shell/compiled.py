@@ -22,7 +22,8 @@ def keep_compiled_programs() -> str:
     `JAX_COMPILATION_CACHE_DIR` names another folder; `JAX_ENABLE_COMPILATION_CACHE=0` keeps nothing. What
     is returned says that nothing is kept since the folder cannot be written, or is empty.
     """
-    if jax.config.jax_compilation_cache_dir or not jax.config.jax_enable_compilation_cache:
+    settings = jax.config.values
+    if settings["jax_compilation_cache_dir"] or not settings["jax_enable_compilation_cache"]:
         return ""
     folder = platformdirs.user_cache_path("jaxfilters") / "compiled" / _instruction_set()
     if not os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK):
