@@ -26,7 +26,7 @@ def keep_compiled_programs() -> str:
     if settings["jax_compilation_cache_dir"] or not settings["jax_enable_compilation_cache"]:
         return ""
     folder = platformdirs.user_cache_path("jaxfilters") / "compiled" / _instruction_set()
-    if not os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK):
+    if not os.access(next(path for path in (folder, *folder.parents) if os.path.exists(path)), os.W_OK):
         return f"{folder} cannot be written: what is compiled now is not kept"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_TO_COMPILE)

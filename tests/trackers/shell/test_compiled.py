@@ -33,6 +33,12 @@ def no_folder(monkeypatch):
         jax.config.update(name, value)
 
 
+def no_look(path):
+    if "compiled" in path.parts:
+        raise PermissionError(13, "Permission denied", str(path))
+    return os.path.exists(path)
+
+
 def run_with(cache, **more):
     inherited = {name: value for name, value in os.environ.items() if "CACHE" not in name}
     environment = {**inherited, "XDG_CACHE_HOME": str(cache), "HOME": str(cache), **more}
@@ -57,7 +63,9 @@ def test_a_folder_that_the_user_chose_is_left_alone(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_said(no_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(compiled.platformdirs, "user_cache_path", lambda _: tmp_path)
-    monkeypatch.setattr(compiled.os, "access", lambda *_: False)  # root may write everywhere
+    # Root may write everywhere; whoever has another user's home may not even look.
+    monkeypatch.setattr(compiled.os, "access", lambda *_: False)
+    monkeypatch.setattr(type(tmp_path), "exists", no_look)
     assert str(tmp_path / "compiled") in compiled.keep_compiled_programs()
     assert jax.config.jax_compilation_cache_dir is None
 
