@@ -3,12 +3,11 @@
 import os
 import platform
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
 
-from jaxfilters.trackers.shell.devices import available_cores
+from jaxfilters.trackers.shell.devices import available_cores, processor
 
 
 def environment() -> dict[str, Any]:
@@ -18,17 +17,10 @@ def environment() -> dict[str, Any]:
         **{package: version(package) for package in ("jaxfilters", "jax", "jaxlib", "numpy")},
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "cpu": _cpu_model(),
+        "cpu": processor("model name") or platform.processor() or platform.machine(),
         "cores": available_cores(),
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "backend": jax.default_backend(),
         "device": devices[0].device_kind,
         "devices": len(devices),
     }
-
-
-def _cpu_model() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or platform.machine()

@@ -3,10 +3,11 @@
 import hashlib
 import os
 import platform
-from pathlib import Path
 
 import jax
 import platformdirs
+
+from jaxfilters.trackers.shell.devices import processor
 
 SECONDS_TO_COMPILE = 0.1
 """Programs that compile faster are not kept. Of a tracker's hundreds, a dozen take longer, and they are nearly all of
@@ -19,8 +20,10 @@ MEGABYTES = 256
 def keep_compiled_programs() -> str:
     """Let JAX find what earlier runs have compiled, and leave what this one compiles; not if JAX has a folder already.
 
-    `JAX_COMPILATION_CACHE_DIR` names another folder; `JAX_ENABLE_COMPILATION_CACHE=0` keeps nothing. What
-    is returned says that nothing is kept since the folder cannot be written, or is empty.
+    `JAX_COMPILATION_CACHE_DIR` names another folder; `JAX_ENABLE_COMPILATION_CACHE=0` keeps nothing.
+
+    Returns:
+        Why nothing is kept, if the folder cannot be written; else an empty string.
     """
     settings = jax.config.values
     if settings["jax_compilation_cache_dir"] or not settings["jax_enable_compilation_cache"]:
@@ -36,8 +39,5 @@ def keep_compiled_programs() -> str:
 
 def _instruction_set() -> str:
     """A name for what this processor can do: a home folder may be shared by machines that cannot run each other's."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    features = [line for line in lines if line.startswith(("flags", "Features"))]
-    text = features[0] if features else platform.processor()
+    text = processor("flags", "Features") or platform.processor()
     return f"{platform.machine()}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"

@@ -1,6 +1,7 @@
-"""One host device per core, chosen before JAX starts. For programs; the library never does this."""
+"""What this machine computes with: one host device per core, chosen before JAX starts, for programs alone."""
 
 import os
+from pathlib import Path
 
 _FLAG = "--xla_force_host_platform_device_count"
 
@@ -21,3 +22,11 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def processor(*names: str) -> str:
+    """What Linux says of the first processor under the first of the names that it knows; empty elsewhere."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    told = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    return next((told[name] for name in names if name in told), "")

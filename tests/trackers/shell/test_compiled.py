@@ -5,7 +5,7 @@ import sys
 import jax
 import pytest
 
-from jaxfilters.trackers.shell import cli, compiled
+from jaxfilters.trackers.shell import cli, compiled, devices
 
 RUN = """
 import jax
@@ -74,7 +74,7 @@ def test_machines_that_cannot_run_each_others_programs_have_folders_of_their_own
     files = []
     for flags in ("fpu avx2", "fpu avx2 avx512f"):
         (tmp_path / "cpuinfo").write_text(f"model name\t: Same\nflags\t\t: {flags}\n")
-        monkeypatch.setattr(compiled, "Path", lambda _: tmp_path / "cpuinfo")
+        monkeypatch.setattr(devices, "Path", lambda _: tmp_path / "cpuinfo")
         files.append(compiled._instruction_set())
     assert files[0] != files[1]
 
