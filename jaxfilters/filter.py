@@ -5,18 +5,18 @@ not seen is a prediction without an update.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.typing import AnyKey, Collect, Init, Predict, Update
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class Filter:
     """A recursive Bayesian filter: static pure functions and traced parameters.
 
@@ -109,7 +109,7 @@ def run(
     return _scan(filter, scan_key, state, observations, controls, mask, collect)
 
 
-def loglikelihood(
+def log_evidence(
     filter: Filter,
     key: AnyKey,
     observations: PyTree,

@@ -1,54 +1,27 @@
-"""Standard normal numbers for whole ensembles: those of `jax.random.normal`, drawn in one pass.
+"""Sources of the randomness that moves an ensemble: what `noise=` of a particle filter takes."""
 
-On a CPU `jax.random` keeps its generator (Threefry, 20 rounds) as a loop over two arrays of counters, each as large as
-the result. Here the rounds are written out and become one loop over the numbers: nothing is stored but the result. That
-takes two thirds of the time for 1e5 particles, a third for 1e6, and a third of the time to compile. For keys that are
-split, and single numbers, it would be the wrong thing: the compiler repeats the rounds wherever they are used.
-"""
-
-import math
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, DTypeLike, Float
+from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._xla.noise import standard_normal
 from jaxfilters.typing import AnyKey
 
-_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
-_PARITY = 0x1BD11BDA
+
+def random_keys(key: AnyKey, num_particles: int) -> PyTree:
+    """Noise: one random key for each particle."""
+    keys = jax.random.split(key, num_particles)
+    return jnp.moveaxis(keys, 0, -1)
 
 
-def standard_normal(key: AnyKey, shape: tuple[int, ...], dtype: DTypeLike = float) -> Float[Array, "..."]:
-    """Independent standard normal numbers, bit for bit those of `jax.random.normal(key, shape, dtype)`.
+@dataclass(frozen=True)
+class StandardNormal:
+    """Noise: `shape` independent standard normal numbers for each particle."""
 
-    Keys of another kind than JAX's default, and other types than float32 and float64, are left to `jax.random`.
-    """
-    kind = jnp.finfo(jnp.zeros((), dtype).dtype)
-    # A setting of JAX, on unless a user clears it, gives every number a counter of its own.
-    known = jax.random.key_impl(key) == "threefry2x32" and bool(jax.threefry_partitionable.value)
-    if not known or math.prod(shape) >= 2**32 or kind.bits not in (32, 64):
-        return jax.random.normal(key, shape, dtype)
-    high, low = _threefry(key, shape)
-    bits = (high.astype(jnp.uint64) << 32) | low.astype(jnp.uint64) if kind.bits == 64 else high ^ low
-    # Numbers in [1, 2) by their mantissa; from there to the open interval (-1, 1).
-    one = np.ones((), kind.dtype).view(f"uint{kind.bits}")
-    mantissa = jax.lax.bitcast_convert_type((bits >> (kind.bits - kind.nmant)) | one, kind.dtype)
-    lowest = np.nextafter(np.asarray(-1, kind.dtype), np.asarray(0, kind.dtype))
-    uniform = jnp.maximum(lowest, (mantissa - 1) * (1 - lowest) + lowest)
-    return math.sqrt(2) * jax.lax.erf_inv(uniform)
+    shape: int | tuple[int, ...]
 
-
-def _threefry(key: AnyKey, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Threefry-2x32 of 0, 1, 2 ... (J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011)."""
-    first, second = jax.random.key_data(key)
-    counters = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
-    keys = (first, second, first ^ second ^ np.uint32(_PARITY))
-    a, b = jnp.broadcast_to(first, shape), counters + second
-    for group in range(5):
-        for rotation in _ROTATIONS[group % 2]:
-            a = a + b
-            b = ((b << rotation) | (b >> (32 - rotation))) ^ a
-        a = a + keys[(group + 1) % 3]
-        b = b + keys[(group + 2) % 3] + np.uint32(group + 1)
-    return a, b
+    def __call__(self, key: AnyKey, num_particles: int) -> Float[Array, "... n"]:
+        shape = (self.shape,) if isinstance(self.shape, int) else self.shape
+        return standard_normal(key, (*shape, num_particles))

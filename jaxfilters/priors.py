@@ -8,16 +8,17 @@ instructions. What is here is such a function, too, but knows how to draw a whol
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol, no_type_check, runtime_checkable
+from dataclasses import field
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxfilters import linalg
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.noise import standard_normal
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.noise import standard_normal
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, DrawNoise, SamplePrior, as_pytree
 
 
@@ -32,9 +33,7 @@ class EnsemblePrior(Protocol):
         ...
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class FromNoise:
     """Particles made of noise."""
 
@@ -51,9 +50,7 @@ class FromNoise:
         return jax.vmap(self.transform, in_axes=-1, out_axes=-1)(self.noise(key, num_particles))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class GaussianPrior:
     """Vectors of n numbers."""
 

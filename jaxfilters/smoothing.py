@@ -1,62 +1,19 @@
-"""Beliefs given the future too: the Rauch-Tung-Striebel smoother of any filter made by `extended`."""
+"""Smoothing: the distribution of earlier states given later observations, for every kind of filter.
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import PyTree
+| belief | whole sequences | with a fixed delay |
+|---|---|---|
+| Gaussian | `rts`, `filter_and_smooth`; `parallel_kalman` with `parallel_rts`, parallel in time | `fixed_lag_rts` |
+| particles | `trajectories`, `backward_sampling` | `fixed_lag` |
+"""
 
-from jaxfilters.extended import Extended, linear_transition, noise_of_step
-from jaxfilters.filter import Filter, keep_all, run
-from jaxfilters.manifold import Belief, increments, seen_from, settle
-from jaxfilters.typing import AnyKey, Mask
-
-
-def smooth(
-    filter: Filter, key: AnyKey, observations: PyTree, controls: PyTree = None, *, mask: Mask | None = None
-) -> tuple[Belief, PyTree]:
-    """Beliefs given the whole sequence, time first, and the infos of the filter that found them.
-
-    `infos.log_evidence.sum()` is the log evidence of the sequence. Arguments as for `jaxfilters.run`.
-    """
-    _, (beliefs, infos) = run(filter, key, observations, controls, mask=mask, collect=keep_all)
-    return rts(filter, beliefs, controls), infos
-
-
-def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
-    """Beliefs given the whole sequence, time first, from those of the filter, each given the past.
-
-    Each is conditioned on what the next one, which already knows the future, says of the step between them (S. Särkkä,
-    "Bayesian Filtering and Smoothing", 2013, theorem 8.2; made linear as `filter` does, section 9.2). A frame without
-    an observation is no different: its belief is the prediction.
-
-    Args:
-        filter: Made by `extended`.
-        beliefs: The states that `run` collects, time first; or what a wrapper of the filter made of them.
-        controls: As `run` had them, time first.
-
-    Raises:
-        ValueError: If `filter` is another kind of filter, or `controls` has another length than `beliefs`.
-    """
-    if not isinstance(filter.params, Extended):
-        raise ValueError(f"filter must be made by extended; its parameters are {type(filter.params).__name__}.")
-    length = beliefs.mean.shape[0]
-    lengths = {leaf.shape[0] for leaf in jax.tree.leaves(controls)}
-    if not lengths <= {length}:
-        raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
-    return _backward(filter.params, beliefs, controls)
-
-
-@jax.jit
-def _backward(model: Extended, beliefs: Belief, controls: PyTree) -> Belief:
-    def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
-        belief, control = inputs
-        origin, ahead = linear_transition(model, belief, control)
-        known = seen_from(model.manifold, origin, following)
-        noise = noise_of_step(model, control)
-        delta = model.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
-        smoothed = settle(model.manifold, belief.mean, delta)
-        return smoothed, smoothed
-
-    last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
-    earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
-    _, smoothed = jax.lax.scan(step, last, (earlier, jax.tree.map(lambda leaf: leaf[1:], controls)), reverse=True)
-    return jax.tree.map(lambda most, end: jnp.concatenate([most, end[None]]), smoothed, last)
+from jaxfilters.gaussian.parallel_in_time import LinearModel as LinearModel
+from jaxfilters.gaussian.parallel_in_time import parallel_kalman as parallel_kalman
+from jaxfilters.gaussian.parallel_in_time import parallel_rts as parallel_rts
+from jaxfilters.gaussian.smoothing import filter_and_smooth as filter_and_smooth
+from jaxfilters.gaussian.smoothing import rts as rts
+from jaxfilters.particle.fixed_lag import fixed_lag as fixed_lag
+from jaxfilters.particle.fixed_lag import fixed_lag_rts as fixed_lag_rts
+from jaxfilters.particle.smoothing import History as History
+from jaxfilters.particle.smoothing import backward_sampling as backward_sampling
+from jaxfilters.particle.smoothing import keep_history as keep_history
+from jaxfilters.particle.smoothing import trajectories as trajectories

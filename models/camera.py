@@ -1,19 +1,17 @@
 """Pinhole cameras: pixels to rays and back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import no_type_check
+from dataclasses import field, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+
+@pytree_dataclass
 class Pinhole:
     """A pinhole camera without distortion: x right, y down, z forward.
 

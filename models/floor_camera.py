@@ -1,22 +1,20 @@
 """Fixed cameras over a floor: world points to undistorted pixels and back onto the plane Z = 0."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
+
 STEEP = np.cos(np.deg2rad(10.0))
 """An optical axis nearer to the vertical than this has no useful direction on the floor."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class FloorCamera:
     """A projection matrix of a camera that stands still, in its canonical scale.
 

@@ -4,8 +4,7 @@ Every coordinate is a sequence of its own, a Kalman filter with position and vel
 are what a detector says: no truth is needed, since jitter that no motion explains is the sensor's.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters import fit
-from jaxfilters.extended import Measured, extended
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter, run
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.smoothing import rts
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.extended import Observation, extended_kalman
+from jaxfilters.gaussian.smoothing import rts
 
 
 class PointNoise(NamedTuple):
@@ -71,9 +71,7 @@ def position(x: Float[Array, "2"]) -> Float[Array, "1"]:
     return x[:1]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class _Drive:
     """Covariance of what white acceleration adds to position and velocity."""
 
@@ -84,9 +82,7 @@ class _Drive:
         return jnp.square(self.drive) * rows
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class PointFilter:
     """The filter of one coordinate, as a function of the noises."""
 
@@ -96,12 +92,12 @@ class PointFilter:
     def __call__(self, noise: PointNoise) -> Filter:
         prior = Gaussian(jnp.zeros(2), jnp.diag(jnp.square(jnp.stack([2 * self.extent, 5 * self.extent]))))
         observed = jnp.square(noise.sensor)[None, None]
-        return extended(prior, drift, _Drive(noise.drive).__call__, position, observed)
+        return extended_kalman(prior, drift, _Drive(noise.drive).__call__, position, observed)
 
 
 def learn(tracks: Tracks) -> fit.Fit:
     """`PointNoise` of most likelihood, with standard errors."""
-    y = Measured(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
+    y = Observation(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
     density = fit.over_sequences(_no_key(), PointFilter(tracks.extent), y, tracks.seconds)
     start = PointNoise(0.05 * tracks.extent, 5 * tracks.extent)
     return fit.maximize(density, start, fit.positive)

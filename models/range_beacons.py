@@ -6,19 +6,18 @@ much, the noise and the share of outliers are parameters, to be learnt with thos
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters import linalg
-from jaxfilters.contaminated import contaminated
-from jaxfilters.extended import extended
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.robust import robust
+from jaxfilters.math import linalg
 
 
 class Step(NamedTuple):
@@ -33,9 +32,7 @@ class Step(NamedTuple):
     seconds: Float[Array, "..."]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class LinearExcess:
     """Ranges that are too long by a constant, and by a share of the distance."""
 
@@ -48,9 +45,7 @@ class LinearExcess:
         return self.bias + self.scale * distance
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class RangeRobot:
     """Parameters of the robot's motion and of its ranges: what can be learnt."""
 
@@ -73,9 +68,7 @@ class RangeRobot:
         return jnp.diag(jnp.stack([slip, slip, jnp.square(self.turn_noise) * step.seconds]))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class _Sight:
     """Ranges to all beacons as the robot would read them."""
 
@@ -106,8 +99,8 @@ def localisation(robot: RangeRobot, beacons: Float[Array, "b 2"], prior: Gaussia
     """
     sight = _Sight(robot, beacons)
     noise = jnp.square(robot.noise) * jnp.eye(beacons.shape[0])
-    inner = extended(prior, drive, robot.process_noise, sight.__call__, noise)
-    return contaminated(inner, robot.outlier_share, jnp.square(robot.outlier_noise) * jnp.eye(beacons.shape[0]))
+    inner = extended_kalman(prior, drive, robot.process_noise, sight.__call__, noise)
+    return robust(inner, robot.outlier_share, jnp.square(robot.outlier_noise) * jnp.eye(beacons.shape[0]))
 
 
 def steps_between(

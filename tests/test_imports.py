@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = {"jaxfilters": 0, "models": 1, "trackers": 2, "benchmarks": 3}
 """Folders, lowest first; each may import itself and what is below."""
-MODULE_NAMES = {"opencv-python-headless": "cv2"}
+MODULE_NAMES = {"opencv-python-headless": "cv2", "lazy-loader": "lazy_loader"}
 """Where a distribution is not imported by its own name."""
 
 SOURCES = sorted(path for folder in LAYERS for path in (ROOT / folder).rglob("*.py"))

@@ -3,6 +3,8 @@ import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
+import jaxfilters
+
 ROOT = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PYPROJECT["tool"]["setuptools"]
@@ -17,6 +19,12 @@ def folders_with_code():
     return names
 
 
+def folder_of(package):
+    folders = SETUPTOOLS["package-dir"]
+    mapped = max((name for name in folders if f"{package}.".startswith(f"{name}.")), key=len)
+    return ROOT / folders[mapped] / package.removeprefix(mapped).replace(".", "/").strip("/")
+
+
 def test_every_folder_with_code_is_listed_as_a_package():
     """A folder that is not listed works in a checkout and is missing from the wheel."""
     assert set(SETUPTOOLS["packages"]) == folders_with_code()
@@ -24,24 +32,20 @@ def test_every_folder_with_code_is_listed_as_a_package():
 
 
 def test_every_package_has_an_init():
-    folders = SETUPTOOLS["package-dir"]
     for name in SETUPTOOLS["packages"]:
-        mapped = max((package for package in folders if f"{name}.".startswith(f"{package}.")), key=len)
-        folder = ROOT / folders[mapped] / name.removeprefix(mapped).replace(".", "/").strip("/")
-        assert (folder / "__init__.py").exists(), folder
+        assert (folder_of(name) / "__init__.py").exists(), name
 
 
 def test_data_files_that_are_promised_exist():
     for package, patterns in SETUPTOOLS["package-data"].items():
-        folder = ROOT / SETUPTOOLS["package-dir"][package]
+        folder = folder_of(package)
         for pattern in patterns:
             assert list(folder.glob(pattern)), f"{package}: {pattern}"
 
 
 def test_the_version_is_in_the_changelog_and_is_the_installed_one():
-    number = PYPROJECT["project"]["version"]
-    assert f"## [{number}]" in (ROOT / "CHANGELOG.md").read_text()
-    assert version("jaxfilters") == number
+    assert f"## [{jaxfilters.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert version("jaxfilters") == jaxfilters.__version__
 
 
 def test_the_licence_is_the_one_that_is_stated():

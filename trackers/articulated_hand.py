@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.mixture import MixtureState, heaviest
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.gaussian_sum import GaussianSumState, map_component
 from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
@@ -102,7 +103,7 @@ class ArticulatedTrack(NamedTuple):
 class TrackState(NamedTuple):
     """Everything the next frame needs."""
 
-    bank: MixtureState
+    bank: GaussianSumState
     time: Float[Array, ""]
     """Of the last frame, seconds."""
     misses: Array
@@ -110,8 +111,7 @@ class TrackState(NamedTuple):
     key: Array
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class _Setup:
     """What one tracker is made of, as data."""
 
@@ -180,13 +180,13 @@ def _filter(setup: _Setup, prior: Gaussian) -> Filter:
     return make(setup.hand, prior, setup.limits, gate=setup.config.gate or math.inf)
 
 
-def _starting_bank(setup: _Setup, starts: Starts) -> MixtureState:
+def _starting_bank(setup: _Setup, starts: Starts) -> GaussianSumState:
     def state(mean: Array, covariance: Array) -> Any:
         filter = _filter(setup, Gaussian(mean, covariance))
         return filter.init(filter.params, jax.random.key(0))
 
     components = jax.vmap(state)(starts.means, starts.covariances)
-    return MixtureState(components, jax.nn.log_softmax(-starts.costs))
+    return GaussianSumState(components, jax.nn.log_softmax(-starts.costs))
 
 
 def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
@@ -201,12 +201,12 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     return TrackState(bank, jnp.zeros((), dtype=float), misses, key)
 
 
-def _with_slots(setup: _Setup, start: MixtureState, capacity: int) -> MixtureState:
+def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
     filter = hypotheses(_filter(setup, _first_belief(start)), setup.hand, capacity=capacity, start=start)
     return filter.init(filter.params, jax.random.key(0))
 
 
-def _first_belief(bank: MixtureState) -> Gaussian:
+def _first_belief(bank: GaussianSumState) -> Gaussian:
     return belief_of(jax.tree.map(lambda leaf: leaf[0], bank.components))
 
 
@@ -273,9 +273,9 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
 
 
 def _report(
-    setup: _Setup, bank: MixtureState, told: Report, nis: Array, log_evidence: Array, status: Array
+    setup: _Setup, bank: GaussianSumState, told: Report, nis: Array, log_evidence: Array, status: Array
 ) -> ArticulatedTrack:
-    belief = belief_of(heaviest(bank))
+    belief = belief_of(map_component(bank))
     hand, q = setup.hand, belief.mean[setup.hand.layout.quaternion]
     nothing = jnp.isnan(log_evidence)
     return ArticulatedTrack(

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.lie import quaternion_multiply, so3_exp
+from jaxfilters.gaussian.constraints import LinearConstraints
+from jaxfilters.math.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.articulated.motion import ANGLE_SPREAD
 from jaxfilters.models.articulated.projection import Perspective
-from jaxfilters.truncation import LinearConstraints
 
 NUM_STARTS = 6
 FEWEST_POINTS = 4

@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters import weights
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.guided import Guidance, GuidedState, guided
-from jaxfilters.lie import quaternion_mean
-from jaxfilters.marginal import MarginalState, rao_blackwell_shared
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.math.lie import quaternion_mean
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.motion import HandMotion, per_coordinate
@@ -47,7 +46,9 @@ from jaxfilters.models.hand.skeleton import (
 from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
-from jaxfilters.particle import ParticleInfo, TemperToShare
+from jaxfilters.particle.bootstrap import AdaptiveTempering, ParticleInfo
+from jaxfilters.particle.guided import Guidance, GuidedState, guided
+from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.trackers.depth_sequence import DepthSequence, from_array
 from jaxfilters.trackers.detect import nearest_hand
 from jaxfilters.trackers.tracker import HandTrack, SequenceTracker
@@ -139,8 +140,7 @@ class TrackState(NamedTuple):
     key: Array
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class _Setup:
     """What one tracker is made of, as data: the compiled functions below take it as an argument."""
 
@@ -230,7 +230,7 @@ def _filter(setup: _Setup, pose: Array, scale: Array) -> Filter:
         noise_dim=TANGENT_SIZE,
         retract=retract,
         ess_threshold=1.0,
-        temper=TemperToShare(TEMPERED_SHARE),
+        temper=AdaptiveTempering(TEMPERED_SHARE),
     )
     if not setup.config.guide:
         return inner
@@ -357,7 +357,7 @@ def look(camera: Pinhole, frame: Array, expected: Float[Array, " 22"], scale: fl
     return hand_image(window, isolate(window, observed, expected, scale))
 
 
-def _particles(state: MarginalState | GuidedState) -> tuple[Array, Array]:
+def _particles(state: RaoBlackwellState | GuidedState) -> tuple[Array, Array]:
     ensemble = state.ensemble if isinstance(state, GuidedState) else state
     return ensemble.particles, ensemble.log_weights
 

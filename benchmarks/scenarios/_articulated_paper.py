@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.articulated.filters import (
     Inequalities,
     Look,

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxfilters import kalman, smoothing
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _filter_baselines as baselines
 from jaxfilters.benchmarks.scenarios import _filter_models as models
@@ -25,10 +24,12 @@ from jaxfilters.benchmarks.scenarios import hmm
 from jaxfilters.benchmarks.scenarios._gaussian_models import Problem, build, coupled, ranging
 from jaxfilters.benchmarks.scenarios.gaussian import check_agreement
 from jaxfilters.benchmarks.timing import Spent, spent, taking_turns
-from jaxfilters.extended import extended
-from jaxfilters.filter import loglikelihood
-from jaxfilters.linearize import unscented
-from jaxfilters.resampling import systematic
+from jaxfilters.filter import log_evidence as log_evidence_of
+from jaxfilters.gaussian import arithmetic as arithmetics
+from jaxfilters.gaussian import smoothing
+from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.linearize import unscented
+from jaxfilters.particle.resampling import systematic
 
 Calls = dict[str, Callable[[], Any]]
 Metrics = dict[str, Metric]
@@ -80,7 +81,7 @@ def particle(setting: Setting, num_particles: str, num_steps: str) -> Metrics:
     """The bootstrap filter of a state of ten numbers, resampling in every step."""
     count, full = setting.size(int(num_particles), 64), int(num_particles)
     problem = models.drift(setting.seed, setting.size(int(num_steps)))
-    run = jax.jit(loglikelihood)
+    run = jax.jit(log_evidence)
     ours = partial(run, models.plain(problem.model, count))
     evidences: dict[str, peers.OfKey] = {"ours": lambda key: ours(key, problem.readings)}
     # cuthbert keeps the particles of every step.
@@ -102,7 +103,7 @@ def marginal(setting: Setting) -> Metrics:
     for suffix, size, linear_size, num_particles in (("", 1, 3, 1000), ("_wide", 3, 6, 2000)):
         problem = models.mixed(setting.seed, size, linear_size, setting.size(100))
         count = setting.size(num_particles, 64)
-        run = jax.jit(loglikelihood)
+        run = jax.jit(log_evidence)
         evidences: dict[str, peers.OfKey] = {
             name: partial(_of_key, run, models.marginalised(problem.model, count, shared=shared), problem.readings)
             for name, shared in (("own", False), ("shared", True))
@@ -164,7 +165,7 @@ def first_call(setting: Setting, what: str, library: str) -> Metrics:
     if what == "pf":
         drift = models.drift(setting.seed, setting.size(200))
         filter = models.plain(drift.model, 1000)
-        ours: peers.OfKey = lambda key: loglikelihood(filter, key, drift.readings)
+        ours: peers.OfKey = lambda key: log_evidence_of(filter, key, drift.readings)
         of_key = ours if library == "ours" else getattr(peers, library)(drift, 1000)
         call: Callable[[], Any] = partial(of_key, jax.random.key(0))
     else:
@@ -182,8 +183,8 @@ def _extended(setting: Setting, problem: Problem) -> Metrics:
     calls: Calls = {name: partial(jax.jit(of), *arguments) for name, of in found.items()}
     check_agreement({name: call() for name, call in calls.items()})
     # Without a `jit` around it.
-    filter = build(problem, problem.model, kalman.joseph)
-    calls["as_used"] = partial(loglikelihood, filter, jax.random.key(0), problem.readings)
+    filter = build(problem, problem.model, arithmetics.joseph)
+    calls["as_used"] = partial(log_evidence_of, filter, jax.random.key(0), problem.readings)
     for name in ("joseph", "dynamax"):
         if name in found:
             calls[f"gradient_{name}"] = partial(jax.jit(jax.value_and_grad(found[name])), *arguments)
@@ -210,8 +211,8 @@ def _pair(setting, name, problem, ours, peer) -> Metrics:
     return _ratios(setting, times, {f"ratio_{name}_to_dynamax": ("ours", "dynamax")}) | _milliseconds(name, times)
 
 
-def _extended_log_evidences(setting, problem, arithmetics):
-    found = {name: partial(_extended_log_evidence, problem, getattr(kalman, name)) for name in arithmetics}
+def _extended_log_evidences(setting, problem, names):
+    found = {name: partial(_extended_log_evidence, problem, getattr(arithmetics, name)) for name in names}
     for name in ("dynamax", "cuthbert"):
         if name in setting.peers:
             found[name] = getattr(gaussian_peers, name)(problem)
@@ -219,26 +220,26 @@ def _extended_log_evidences(setting, problem, arithmetics):
 
 
 def _extended_log_evidence(problem, arithmetic, model, readings):
-    return loglikelihood(build(problem, model, arithmetic), jax.random.key(0), readings)
+    return log_evidence_of(build(problem, model, arithmetic), jax.random.key(0), readings)
 
 
 def _linear_log_evidence(problem, model, readings):
     Q, R = _noises(problem)
-    filter = extended(problem.start, Partial(_move_linearly, model), Q, Partial(_observe_linearly, model), R)
-    return loglikelihood(filter, jax.random.key(0), readings)
+    filter = extended_kalman(problem.start, Partial(_move_linearly, model), Q, Partial(_observe_linearly, model), R)
+    return log_evidence_of(filter, jax.random.key(0), readings)
 
 
 def _unscented_log_evidence(problem, model, readings):
-    return loglikelihood(_unscented(problem, model), jax.random.key(0), readings)
+    return log_evidence_of(_unscented(problem, model), jax.random.key(0), readings)
 
 
 def _unscented(problem, model):
     Q, R = _noises(problem)
-    return extended(problem.start, model.move, Q, model.observe, R, linearize=unscented())
+    return extended_kalman(problem.start, model.move, Q, model.observe, R, linearize=unscented())
 
 
 def _smoothed_means(problem, model, readings):
-    return smoothing.smooth(build(problem, model, kalman.joseph), jax.random.key(0), readings)[0].mean
+    return smoothing.filter_and_smooth(build(problem, model, arithmetics.joseph), jax.random.key(0), readings)[0].mean
 
 
 def _noises(problem):

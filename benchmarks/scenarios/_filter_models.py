@@ -1,6 +1,5 @@
 """The models on which particle filters are timed, and what they say about simulated readings."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -8,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.marginal import MixedDynamics, rao_blackwell, rao_blackwell_shared
-from jaxfilters.particle import StandardNormal, bootstrap
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import bootstrap
+from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell, rao_blackwell_shared
 from jaxfilters.priors import from_noise
 from jaxfilters.typing import AnyKey
 
@@ -19,8 +20,7 @@ DT = 0.1
 POSE = 5
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class Drift:
     """Five coordinates with steady velocities, and the distances of the first three to three beacons."""
 
@@ -87,8 +87,7 @@ def plain(model: Drift, num_particles: int) -> Filter:
     )
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class Mixed:
     """A nonlinear state that a linear one drives, seen through an arctangent."""
 

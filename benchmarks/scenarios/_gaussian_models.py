@@ -1,6 +1,5 @@
 """The two models on which Gaussian filters are timed, and what they say about simulated readings."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -8,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.extended import extended
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian, GaussianRoot
-from jaxfilters.kalman import Arithmetic, square_root
+from jaxfilters.gaussian.arithmetic import Arithmetic, square_root
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.gaussian.extended import extended_kalman
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class Coupled:
     """A state whose components all drive one another, seen through saturating sensors."""
 
@@ -35,8 +34,7 @@ class Coupled:
         return linear + 0.1 * jnp.tanh(linear)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class Ranging:
     """A point in space with a steady velocity, and its distances to three beacons."""
 
@@ -108,5 +106,7 @@ def build(problem: Problem, model: Coupled | Ranging, arithmetic: Arithmetic) ->
     if arithmetic is square_root:
         prior = GaussianRoot(mean, jnp.sqrt(covariance))
         roots = [jnp.sqrt(noise) for noise in noises]
-        return extended(prior, model.move, roots[0], model.observe, roots[1], arithmetic=arithmetic)
-    return extended(Gaussian(mean, covariance), model.move, noises[0], model.observe, noises[1], arithmetic=arithmetic)
+        return extended_kalman(prior, model.move, roots[0], model.observe, roots[1], arithmetic=arithmetic)
+    return extended_kalman(
+        Gaussian(mean, covariance), model.move, noises[0], model.observe, noises[1], arithmetic=arithmetic
+    )

@@ -7,15 +7,15 @@ filter", sections 6 and 7; what the paper leaves open is the specification's, as
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.marginal import condition_on_increment, rao_blackwell_shared
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs, gibbs_sq
 from jaxfilters.models.hand.motion import HandMotion, paper_motion, per_coordinate
@@ -31,8 +31,10 @@ from jaxfilters.models.hand.skeleton import (
 )
 from jaxfilters.models.hand.surface import CapsuleHand, HandSurface
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, INITIAL_VELOCITY_STD, START
-from jaxfilters.particle import StandardNormal, TemperToShare, bootstrap
-from jaxfilters.proposals import Proposal, exact
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import AdaptiveTempering, bootstrap
+from jaxfilters.particle.proposals import Proposal, exact
+from jaxfilters.particle.rao_blackwell import condition_on_increment, rao_blackwell_shared
 from jaxfilters.trackers.hand_depth import pose_moments
 from jaxfilters.typing import AnyKey
 
@@ -158,13 +160,11 @@ def _without_limits(likelihood: HandLikelihood, pose: Array, image: HandImage) -
     return likelihood.form(likelihood.cost(pose, image), likelihood.sigma)
 
 
-def _temper(setting: Setting) -> TemperToShare | None:
-    return None if setting.tempered_share is None else TemperToShare(setting.tempered_share)
+def _temper(setting: Setting) -> AdaptiveTempering | None:
+    return None if setting.tempered_share is None else AdaptiveTempering(setting.tempered_share)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class View:
     """How a frame is looked at."""
 

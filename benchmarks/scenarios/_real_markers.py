@@ -3,13 +3,12 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import no_type_check
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.kinematics import finger_points
 
@@ -27,9 +26,7 @@ class Marker:
     """Joints from the finger's base: 0 is the base, 1.5 the middle of the second link, 3 the tip."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class MarkedHand(ArticulatedHand):
     """An articulated hand whose observation is the image of its markers, (x, y) one after the other."""
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import pixel_grid, standing

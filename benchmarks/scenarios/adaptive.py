@@ -19,13 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxfilters import diffusion, weights
-from jaxfilters.adaptive import AdaptiveState, adaptive_particle_filter
+from jaxfilters import weights
 from jaxfilters.benchmarks.metrics import Metric, table
 from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
-from jaxfilters.layered import Layers, consecutive, counted_once
-from jaxfilters.particle import ParticleInfo
+from jaxfilters.math import diffusion
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState, adaptive_diffusion
+from jaxfilters.particle.bootstrap import ParticleInfo
+from jaxfilters.particle.partitioned import Partitions, consecutive, counted_once
 from jaxfilters.typing import AnyKey
 
 POSE, DEFORMATION = 6, 5
@@ -130,13 +131,15 @@ def face_filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
     groups = consecutive(POSE, DEFORMATION)
     return {
         "one_stage": build(num_particles=num_particles),
-        "halfway": build(num_particles=num_particles // 2, layers=Layers(groups)),
-        "halfway_once": build(num_particles=num_particles // 2, layers=Layers(groups, stage_weights=counted_once)),
+        "halfway": build(num_particles=num_particles // 2, partitions=Partitions(groups)),
+        "halfway_once": build(
+            num_particles=num_particles // 2, partitions=Partitions(groups, stage_weights=counted_once)
+        ),
     }
 
 
 def _filter(fit: diffusion.DiffusionFit, *, size: int = POSE, **options: Any) -> Filter:
-    return adaptive_particle_filter(
+    return adaptive_diffusion(
         _sample_pose if size == POSE else _sample_face,
         _log_likelihood,
         fit,
@@ -169,7 +172,7 @@ def follow(filter: Filter, keys: Key[Array, " s"], observed: Float[Array, "s t d
     return jax.vmap(lambda key, ys: run_filter(filter, key, ys, collect=_belief)[1])(keys, observed)
 
 
-def _belief(state: AdaptiveState, info: ParticleInfo) -> Belief:
+def _belief(state: AdaptiveDiffusionState, info: ParticleInfo) -> Belief:
     del info
     spread = jnp.diagonal(weights.covariance(state.particles, state.log_weights))
     return Belief(state.estimate, jnp.sqrt(jnp.maximum(spread, 0)))

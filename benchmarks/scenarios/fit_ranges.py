@@ -8,9 +8,9 @@ place of what was learnt; `bias` learns a constant excess of the ranges, `scale`
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -20,11 +20,12 @@ import scipy.io
 from jaxtyping import Array, Float, PyTree
 
 from jaxfilters import filter, fit
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
-from jaxfilters.extended import Measured
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.extended import Observation
 from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, localisation, steps_between
 from jaxfilters.trackers.shell.chart import Curve, draw_chart
 
@@ -38,9 +39,7 @@ QUICK_NUM_RANGES = 400
 KEY = jax.random.key(0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class NetworkExcess:
     """Any smooth excess: a layer of units, each of which switches at some distance."""
 
@@ -88,7 +87,7 @@ class Recording(NamedTuple):
 
     seconds: Float[np.ndarray, " t"]
     steps: Step
-    ranges: Measured
+    ranges: Observation
     beacons: Float[Array, "b 2"]
     start: Float[Array, "3"]
     """True x, y (metres) and heading (radians) before the first step."""
@@ -101,9 +100,7 @@ class Recording(NamedTuple):
         return self._replace(**dict(zip(("seconds", "steps", "ranges", "truth"), cut, strict=True)))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Localisation:
     """The filter of a robot among beacons, as a function of its parameters."""
 
@@ -147,7 +144,7 @@ def read(path: Path) -> Recording:
     steps = steps_between(ranges[:, 0], *odometry.T)
     heard = ranges[:, 2:3] == beacons[:, 0]
     places = np.stack([np.interp(ranges[:, 0], truth[:, 0], truth[:, i]) for i in (1, 2)], axis=-1)
-    measured = Measured(jnp.asarray(np.where(heard, ranges[:, 3:], 0.0), jnp.float32), jnp.asarray(heard))
+    measured = Observation(jnp.asarray(np.where(heard, ranges[:, 3:], 0.0), jnp.float32), jnp.asarray(heard))
     start = jnp.asarray(truth[0, 1:4], jnp.float32)
     seconds = ranges[:, 0] - truth[0, 0]
     steps = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), steps)

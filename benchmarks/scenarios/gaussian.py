@@ -20,17 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxfilters import kalman
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _gaussian_peers as peers
 from jaxfilters.benchmarks.scenarios._gaussian_models import Problem, build, coupled, ranging
-from jaxfilters.filter import loglikelihood
+from jaxfilters.filter import log_evidence as log_evidence_of
+from jaxfilters.gaussian import arithmetic as arithmetics
 
 NUM_STEPS, NUM_SHORT_STEPS = 500, 100
 BATCHES = (64, 1000)
 ROUNDS, QUICK_ROUNDS = 25, 5
 SLOW_ROUNDS = 5
-ARITHMETICS = {"joseph": kalman.joseph, "fast": kalman.fast, "square_root": kalman.square_root}
+ARITHMETICS = {"joseph": arithmetics.joseph, "fast": arithmetics.fast, "square_root": arithmetics.square_root}
 Calls = dict[str, Callable[[], Any]]
 
 
@@ -53,8 +53,8 @@ def _one_sequence(problem: Problem, present: list[str], rounds: int) -> dict[str
     for name, log_evidence in _log_evidences(problem, present).items():
         values[name] = partial(jax.jit(log_evidence), problem.model, problem.readings)
         gradients[name] = partial(jax.jit(jax.value_and_grad(log_evidence)), problem.model, problem.readings)
-    filter = build(problem, problem.model, kalman.joseph)
-    calls: Calls = {**values, "as_used": partial(loglikelihood, filter, jax.random.key(0), problem.readings)}
+    filter = build(problem, problem.model, arithmetics.joseph)
+    calls: Calls = {**values, "as_used": partial(log_evidence_of, filter, jax.random.key(0), problem.readings)}
     calls |= {f"gradient_{name}": gradients[name] for name in gradients if name in ("joseph", "square_root", "dynamax")}
     first = {name: _seconds(call) for name, call in calls.items()}
     slow = {"filterpy": peers.filterpy(problem)} if "filterpy" in present else {}
@@ -113,7 +113,7 @@ def _log_evidences(problem: Problem, present: list[str]) -> dict[str, peers.LogE
 
 
 def _log_evidence(problem, arithmetic, model, readings):
-    return loglikelihood(build(problem, model, arithmetic), jax.random.key(0), readings)
+    return log_evidence_of(build(problem, model, arithmetic), jax.random.key(0), readings)
 
 
 def check_agreement(log_evidences: Mapping[str, Array | float], tolerance: float = 1e-5) -> None:

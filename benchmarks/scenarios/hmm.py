@@ -87,14 +87,14 @@ def ours(model: HiddenMarkovModel, codes: Int[Array, "n t"], training: Int[Array
 
     @jax.jit
     def forward(model: HiddenMarkovModel, columns: Int[Array, "t n"]) -> Array:
-        return hmm.log_likelihood(model, jax.vmap(model.log_likelihoods, -1, -1)(columns))
+        return hmm.log_evidence(model, jax.vmap(model.log_likelihoods, -1, -1)(columns))
 
     def train() -> Array:
         found = hmm.baum_welch(model, training_columns, max_iterations=num_iterations, tolerance=-1.0)
         return jnp.exp(found.model.log_transition)
 
     return Calls(
-        partial(hmm.log_likelihood, model, scores),
+        partial(hmm.log_evidence, model, scores),
         partial(forward, model, columns),
         lambda: hmm.viterbi(model, scores),
         lambda: hmm.posterior(model, scores),
@@ -105,7 +105,7 @@ def ours(model: HiddenMarkovModel, codes: Int[Array, "n t"], training: Int[Array
 def given_first(model: HiddenMarkovModel, codes: Int[Array, "n t"]):
     """The forward pass by `vmap` over sequences that lie along the first axis."""
     scores = jax.block_until_ready(jax.jit(jax.vmap(model.log_likelihoods))(codes))
-    return partial(jax.jit(jax.vmap(hmm.log_likelihood, (None, 0))), model, scores)
+    return partial(jax.jit(jax.vmap(hmm.log_evidence, (None, 0))), model, scores)
 
 
 def check(model: HiddenMarkovModel, codes: Int[Array, "n t"], libraries: dict[str, Calls]) -> None:

@@ -27,8 +27,8 @@ from jaxtyping import Array
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _least_squares_peers as peers
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.least_squares import BoxLevenbergMarquardt
-from jaxfilters.shared_least_squares import Split, solve_shared
+from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt
+from jaxfilters.optimize.shared_least_squares import Split, solve_shared
 
 NUM_PROBLEMS, QUICK_NUM_PROBLEMS, BATCH = 300, 30, 256
 SIZE, NUM_RESIDUALS, MOST_STEPS = 4, 8, 400

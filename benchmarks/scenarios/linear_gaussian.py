@@ -22,11 +22,12 @@ from jaxfilters import weights
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import joseph
-from jaxfilters.marginal import MarginalState, MixedDynamics, rao_blackwell_shared
-from jaxfilters.particle import ParticleInfo, ParticleState, StandardNormal, bootstrap
-from jaxfilters.proposals import Proposal, exact, paper, paper_corrected
+from jaxfilters.gaussian.arithmetic import joseph
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import ParticleInfo, ParticleState, bootstrap
+from jaxfilters.particle.proposals import Proposal, exact, plug_in, plug_in_corrected
+from jaxfilters.particle.rao_blackwell import MixedDynamics, RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.typing import AnyKey
 
 DT, Q_N, Q_L, R = 1 / 30, 0.3, 40.0, 0.02
@@ -36,7 +37,7 @@ PRIOR_POSE, PRIOR_VELOCITY = 0.5, 4.0
 NUM_FRAMES = 150
 NUM_PARTICLES, NUM_SEEDS = 5000, 8
 QUICK_NUM_SEEDS = 2
-PROPOSALS = (exact, paper, paper_corrected)
+PROPOSALS = (exact, plug_in, plug_in_corrected)
 
 
 class Belief(NamedTuple):
@@ -152,9 +153,9 @@ def particles(filter: Filter, keys: Key[Array, " s"], observations: Float[Array,
     return jax.vmap(lambda key: follow(filter, key, observations)[1])(keys)
 
 
-def _belief(state: MarginalState | ParticleState, info: ParticleInfo) -> Belief:
+def _belief(state: RaoBlackwellState | ParticleState, info: ParticleInfo) -> Belief:
     both, within = state.particles, jnp.zeros(2)
-    if isinstance(state, MarginalState):
+    if isinstance(state, RaoBlackwellState):
         both = jnp.concatenate([state.particles, state.linear_mean])
         within = within.at[1].set(state.covariance[0, 0])
     variance = jnp.diagonal(weights.covariance(both, state.log_weights)) + within

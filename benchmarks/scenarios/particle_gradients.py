@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,16 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.differentiable_resampling import EnsembleScheme, Resampled, soft, transport
-from jaxfilters.filter import Filter, loglikelihood
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import joseph
-from jaxfilters.particle import StandardNormal, bootstrap
-from jaxfilters.resampling import systematic
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.arithmetic import joseph
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import bootstrap
+from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Resampled, soft, transport
+from jaxfilters.particle.resampling import systematic
 from jaxfilters.typing import AnyKey, ResamplingScheme
 
 DT, NUM_FRAMES = 0.1, 50
@@ -65,9 +67,7 @@ WAYS: dict[str, ResamplingScheme | EnsembleScheme] = {
 }
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Damped:
     """The model: parameters as one vector, so that its gradient is one."""
 
@@ -161,7 +161,7 @@ def gradients(
     """`(theta, ys, keys) -> (log evidences, gradients)`, compiled."""
 
     def log_evidence(key: AnyKey, theta: Array, ys: Array) -> Array:
-        return loglikelihood(filter_of(theta, num_particles, scheme), key, ys)
+        return log_evidence(filter_of(theta, num_particles, scheme), key, ys)
 
     @jax.jit
     def evaluate(theta: Array, ys: Array, keys: Array) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.room import floor_camera, looking, room_camera, room_image
 from jaxfilters.models.synthetic.walkers import Walker

@@ -36,7 +36,7 @@ from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure, measu
 from jaxfilters.filter import Filter
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, START, kinect_v2
-from jaxfilters.proposals import paper, paper_corrected
+from jaxfilters.particle.proposals import plug_in, plug_in_corrected
 from jaxfilters.trackers import hand_depth
 from jaxfilters.typing import AnyKey
 
@@ -107,7 +107,7 @@ def _filters(num_particles: int, quick: bool) -> dict[str, dict[str, Filtering]]
     improved = hand.improved()
     extra = {
         f"rbpf_{proposal.__name__}": _filtering(improved, hand.rao_blackwellized(improved, num_particles, proposal))
-        for proposal in (paper, paper_corrected)
+        for proposal in (plug_in, plug_in_corrected)
     }
     wide = hand.particle_filter(improved, num_particles, hand.spread_of_increments(improved))
     guided = {f"{name}_guided": _guided(name, num_particles) for name in ("pf", "rbpf")}

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.mesh import HandMesh, capsule_mesh, hand_mesh, part_meshes, pose_vertices
 from jaxfilters.models.hand.parts import part_transforms

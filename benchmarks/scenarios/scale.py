@@ -22,19 +22,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters import kalman
 from jaxfilters import run as run_filter
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _filter_models as models
 from jaxfilters.benchmarks.scenarios.gaussian import check_agreement
 from jaxfilters.benchmarks.timing import Spent, spent, taking_turns
-from jaxfilters.differentiable_resampling import transport
-from jaxfilters.extended import extended
 from jaxfilters.filter import Filter, keep_info
-from jaxfilters.gaussian import GaussianRoot
-from jaxfilters.parallel_in_time import LinearModel, filter_in_parallel, smooth_in_parallel
-from jaxfilters.sharding import sharded
-from jaxfilters.smoothing import smooth
+from jaxfilters.gaussian import arithmetic
+from jaxfilters.gaussian.belief import GaussianRoot
+from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.parallel_in_time import LinearModel, parallel_kalman, parallel_rts
+from jaxfilters.gaussian.smoothing import filter_and_smooth
+from jaxfilters.particle.differentiable_resampling import transport
+from jaxfilters.particle.sharding import sharded
 
 LENGTHS, QUICK_LENGTHS = (100, 1000), (50,)
 ENSEMBLES, QUICK_ENSEMBLES = (100_000, 1_000_000), (2_000,)
@@ -68,13 +68,13 @@ def in_time(seed: int, length: int, rounds: int) -> dict[str, Metric]:
     root_Q, root_R = 0.3 * jnp.eye(STATES), 0.5 * jnp.eye(READINGS)
     model = LinearModel(F, root_Q, H, root_R)
     transition, observe = jax.tree_util.Partial(_moved, F), jax.tree_util.Partial(jnp.matmul, H)
-    filter = extended(prior, transition, root_Q, observe, root_R, arithmetic=kalman.square_root)
+    filter = extended_kalman(prior, transition, root_Q, observe, root_R, arithmetic=arithmetic.square_root)
     key = jax.random.key(0)
-    both = jax.jit(lambda ys: smooth_in_parallel(filter_in_parallel(prior, model, ys)[0], model).mean)
+    both = jax.jit(lambda ys: parallel_rts(parallel_kalman(prior, model, ys)[0], model).mean)
     calls: dict[str, Callable[[], Any]] = {
         "filter": lambda: run_filter(filter, key, ys, collect=keep_info)[1].log_evidence,
         "filter_parallel": jax.jit(partial(_log_evidences, prior, model, ys)),
-        "smoother": lambda: smooth(filter, key, ys)[0].mean,
+        "smoother": lambda: filter_and_smooth(filter, key, ys)[0].mean,
         "smoother_parallel": partial(both, ys),
     }
     values = {name: call() for name, call in calls.items()}
@@ -145,7 +145,7 @@ def _from_a_start(filter: Filter, readings: Float[Array, "t 3"]) -> Callable[[],
 
 
 def _log_evidences(prior, model, ys):
-    return filter_in_parallel(prior, model, ys)[1]
+    return parallel_kalman(prior, model, ys)[1]
 
 
 def _moved(F, x, control):

@@ -1,20 +1,18 @@
 """A pytree of parameters as one vector of coordinates without limits, and back."""
 
 import math
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.constraints import Box, Constraint, Fixed, Interval, bounds
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Chart:
     """Coordinates of parameters about those where a search began."""
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters import lie
+from jaxfilters.math import lie
 
 _UNIT = 1e-3
 """How far from 1 a sum of probabilities or the length of a quaternion may be; float32 is well within."""

@@ -5,25 +5,25 @@ to be maximised by either of two choices: `common_random_numbers` or `fresh_keys
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, no_type_check
+from dataclasses import field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxfilters.extended import Measured
-from jaxfilters.filter import Filter, loglikelihood
+from jaxfilters import filter as filters
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.extended import Observation
 from jaxfilters.typing import AnyKey, as_pytree
 
 LogDensity = Callable[[PyTree], Float[Array, ""]]
 RandomLogDensity = Callable[[AnyKey, PyTree], Float[Array, ""]]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class CommonRandomNumbers:
     """A random log density with one key for all parameters."""
 
@@ -34,9 +34,7 @@ class CommonRandomNumbers:
         return self.log_density(self.key, theta)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class FreshKeys:
     """A random log density with a new key at every step of the search."""
 
@@ -51,9 +49,7 @@ class FreshKeys:
         return self.log_density(jax.random.fold_in(self.key, step), theta)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class WithPrior:
     """A log density and a log prior."""
 
@@ -104,9 +100,7 @@ def at_step(log_density: Callable, step: Int[Array, ""], theta: PyTree) -> Float
     return log_density(theta)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class LogEvidence:
     """Log evidence of a sequence, or the sum over several, as a function of the parameters."""
 
@@ -122,7 +116,7 @@ class LogEvidence:
 
         def one(key: AnyKey, *data: PyTree) -> Float[Array, ""]:
             observations, controls, mask = data
-            return loglikelihood(filter, key, observations, controls, mask=mask)
+            return filters.log_evidence(filter, key, observations, controls, mask=mask)
 
         data = (self.observations, self.controls, self.mask)
         if not self.sequences:
@@ -187,9 +181,9 @@ def check_observations(observations: PyTree, mask: Array | np.ndarray | None = N
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((observations, mask))):
         return
-    found = jax.tree_util.tree_leaves_with_path(observations, is_leaf=lambda node: isinstance(node, Measured))
+    found = jax.tree_util.tree_leaves_with_path(observations, is_leaf=lambda node: isinstance(node, Observation))
     for path, leaf in found:
-        y, own_mask = (leaf.y, leaf.mask) if isinstance(leaf, Measured) else (leaf, None)
+        y, own_mask = (leaf.y, leaf.mask) if isinstance(leaf, Observation) else (leaf, None)
         y = np.asarray(y)
         if not np.issubdtype(y.dtype, np.floating):
             continue

@@ -1,15 +1,15 @@
 """Parameters by maximum likelihood, or with a prior by maximum a posteriori, and how certain they are."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
-from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.chart import Chart, boxed, chart_about, check_inside
 from jaxfilters.fit.constraints import free
 from jaxfilters.fit.density import at_step, is_noisy
@@ -19,9 +19,7 @@ from jaxfilters.fit.uncertainty import Errors, intervals, observed_information
 from jaxfilters.typing import as_pytree
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Fit:
     """Parameters, how certain they are, and how they were found. Printed, it is a table."""
 
@@ -107,9 +105,7 @@ def maximize(
     return _start(log_density, boxed(chart) if method.knows_bounds else chart, method, errors)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class _Negative:
     """Minus the log density in the coordinates."""
 

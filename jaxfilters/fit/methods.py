@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.search import Move
-from jaxfilters.least_squares import BoxLevenbergMarquardt
+from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt
 from jaxfilters.typing import as_pytree
 
 _SMOOTHING = 0.9
@@ -157,9 +158,7 @@ class Lbfgsb:
         return LBFGSB(fun, maxiter=self.max_steps, tol=self.tolerance, jit=True, unroll=False, implicit_diff=False)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Residuals:
     """A log density that is minus half the sum of squared residuals, for `least_squares`."""
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxfilters import linalg
 from jaxfilters.fit.chart import Chart, chart_about
 from jaxfilters.fit.constraints import free
 from jaxfilters.fit.density import at_step
+from jaxfilters.math import linalg
 from jaxfilters.typing import as_pytree
 
 Errors = Callable[[Callable, Array], Array]

@@ -30,7 +30,7 @@ from jaxfilters.hmm.recursions import Path as Path
 from jaxfilters.hmm.recursions import Posterior as Posterior
 from jaxfilters.hmm.recursions import backward as backward
 from jaxfilters.hmm.recursions import forward as forward
-from jaxfilters.hmm.recursions import log_likelihood as log_likelihood
+from jaxfilters.hmm.recursions import log_evidence as log_evidence
 from jaxfilters.hmm.recursions import posterior as posterior
 from jaxfilters.hmm.recursions import viterbi as viterbi
 from jaxfilters.hmm.spotting import Candidate as Candidate

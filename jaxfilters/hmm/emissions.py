@@ -7,16 +7,17 @@ has these methods will do.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import reduce
 from operator import add
-from typing import Any, Protocol, no_type_check, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32, PyTree
 
-from jaxfilters import linalg
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey
 
 
@@ -41,9 +42,7 @@ class Emission(Protocol):
         ...
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Codes:
     """One of S symbols, as an integer from 0; any other integer is impossible."""
 
@@ -80,9 +79,7 @@ class Codes:
         return self.pseudo_count * jnp.sum(jnp.where(possible, self.log_probability, 0.0))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class DiagonalGaussian:
     """A vector of d numbers, independent of each other."""
 
@@ -117,9 +114,7 @@ class DiagonalGaussian:
         return jnp.zeros((), self.mean.dtype)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class FullGaussian:
     """A vector of d numbers."""
 
@@ -160,9 +155,7 @@ class FullGaussian:
         return jnp.zeros((), self.mean.dtype)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Independent:
     """Several observations at once, independent given the state; each with its own emission."""
 

@@ -1,21 +1,19 @@
 """A hidden Markov model: its probabilities, the transitions that it allows, and draws from it."""
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, no_type_check
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.hmm.emissions import Emission
 from jaxfilters.typing import AnyKey
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class HiddenMarkovModel:
     """A chain of hidden states, and what each of them lets one observe."""
 

@@ -1,20 +1,18 @@
 """Several models as one: side by side, in a loop, and the ergodic threshold that a symbol has to beat."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.hmm.model import HiddenMarkovModel
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Network:
     """The states of several models in one row."""
 

@@ -33,18 +33,18 @@ Lengths = Int[Array, "*batch"] | None
 class Filtered(NamedTuple):
     """What is known of the states from the frames so far."""
 
-    log_likelihood: Float[Array, "*batch"]
+    log_evidence: Float[Array, "*batch"]
     """log p(y_1:T)."""
     probabilities: Float[Array, "t q *batch"]
     """p(s_t | y_1:t); zero in padding, and from an impossible observation on."""
-    log_evidence: Float[Array, "t *batch"]
+    log_evidence_per_step: Float[Array, "t *batch"]
     """log p(y_t | y_1:t-1), zero in padding."""
 
 
 class Posterior(NamedTuple):
     """What is known of the states from the whole sequence."""
 
-    log_likelihood: Float[Array, "*batch"]
+    log_evidence: Float[Array, "*batch"]
     """log p(y_1:T)."""
     states: Float[Array, "t q *batch"]
     """p(s_t | y_1:T); zero in padding and for impossible sequences."""
@@ -62,7 +62,7 @@ class Path(NamedTuple):
 
 
 @jax.jit
-def log_likelihood(
+def log_evidence(
     model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"], lengths: Lengths = None
 ) -> Float[Array, "*batch"]:
     """Log p(y_1:T), in one pass that stores nothing.

@@ -5,13 +5,13 @@ best path of the null model, and it competes with the null model alone (H.-K. Le
 model approach for gesture recognition", IEEE PAMI 21(10), 1999, sections 4-5). Paths are Viterbi's, in logarithms.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.hmm.model import HiddenMarkovModel
 from jaxfilters.hmm.networks import Network, threshold
@@ -62,9 +62,7 @@ class SpotterInfo(NamedTuple):
     """That symbol."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Spotter:
     """Parameters of a spotter."""
 

@@ -98,8 +98,8 @@ def baum_welch(
     def improve(state: tuple) -> tuple:
         model, objectives, i, _, _ = state
         found = _expected(model, observations, seen, lengths)
-        possible = found.log_likelihood > -jnp.inf
-        objective = jnp.sum(jnp.where(possible, found.log_likelihood, 0.0)) + _log_prior(model, transition_pseudo_count)
+        possible = found.log_evidence > -jnp.inf
+        objective = jnp.sum(jnp.where(possible, found.log_evidence, 0.0)) + _log_prior(model, transition_pseudo_count)
         before = objectives[jnp.maximum(i - 1, 0)]
         converged = (i > 0) & (objective - before <= tolerance * jnp.abs(objective))
         objectives = jnp.where(jnp.arange(max_iterations) >= i, objective, objectives)

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters.lie import quaternion_multiply
-from jaxfilters.linalg import safe_norm
+from jaxfilters.math.lie import quaternion_multiply
+from jaxfilters.math.linalg import safe_norm
 from jaxfilters.models.articulated.features import wrap
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.kinematics import finger_frames, flexion_sums, turn, unit_rotation

@@ -7,21 +7,31 @@ Kalman filter, half-spaces one after the other in every frame. `unconstrained` i
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import linalg, mixture
-from jaxfilters.constrained import AfreshEachFrame, ConstrainedInfo, ConstrainedState, Remembering, constrained
-from jaxfilters.extended import Measured, condition
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import KalmanInfo, joseph
-from jaxfilters.linearize import Linearize, second_order, taylor
+from jaxfilters.gaussian import gaussian_sum
+from jaxfilters.gaussian.arithmetic import KalmanInfo, joseph
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.consider import SchmidtInfo, SchmidtState, schmidt_kalman
+from jaxfilters.gaussian.constraints import LinearConstraints, TruncationInfo, cut, linear_constraints
+from jaxfilters.gaussian.constraints.constrained import (
+    ConstrainedInfo,
+    ConstrainedState,
+    EPConstraints,
+    TruncateEachStep,
+    constrained,
+)
+from jaxfilters.gaussian.extended import Observation, condition
+from jaxfilters.gaussian.linearize import Linearize, second_order_covariance_only, taylor
+from jaxfilters.math import linalg
 from jaxfilters.models.articulated.ambiguity import (
     depth_mirrors,
     mirror_trigger,
@@ -31,9 +41,7 @@ from jaxfilters.models.articulated.ambiguity import (
 )
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.limits import LimitRows
-from jaxfilters.truncation import LinearConstraints, TruncationInfo, cut, linear_constraints
 from jaxfilters.typing import AnyKey
-from jaxfilters.views import ViewInfo, ViewState, each_view_once
 
 NEW_VIEW = 4.0
 """Standard deviations of a point's noise by which some joint must be seen elsewhere for a view to be new."""
@@ -45,7 +53,7 @@ LOG_RATIO = 12.0
 BRANCHES = 4
 
 
-_State = ViewState | ConstrainedState | Gaussian
+_State = SchmidtState | ConstrainedState | Gaussian
 
 
 class Inequalities(NamedTuple):
@@ -75,9 +83,7 @@ class Look(NamedTuple):
     """Whether the prediction is to be mirrored in depth first; `None` is no."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class HandBelief:
     """Parameters of the innermost filter: predict, and condition on a `Look`."""
 
@@ -92,20 +98,20 @@ class HandBelief:
 
 def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """Second-order filter, limits counted once, lengths learnt from new views; observations are `Look`s."""
-    inner = constrained(_belief(hand, prior, gate, second_order, turned), Remembering(*limits))
+    inner = constrained(_belief(hand, prior, gate, second_order_covariance_only, turned), EPConstraints(*limits))
     constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
-    return each_view_once(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
+    return schmidt_kalman(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
 
 
 def literal(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """The paper's filter: first-order, half-spaces one by one in every frame (Shimada et al., sections 3 to 5)."""
-    return constrained(_belief(hand, prior, gate, taylor, added), AfreshEachFrame(limits.constraints, one_by_one))
+    return constrained(_belief(hand, prior, gate, taylor, added), TruncateEachStep(limits.constraints, one_by_one))
 
 
 def unconstrained(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """Second-order filter that knows of no limits."""
     del limits
-    return _belief(hand, prior, gate, second_order, turned)
+    return _belief(hand, prior, gate, second_order_covariance_only, turned)
 
 
 def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"]:
@@ -122,7 +128,7 @@ def one_by_one(belief: Any, constraints: LinearConstraints) -> tuple[Any, Trunca
 
 def belief_of(state: _State) -> Gaussian:
     """The belief in the state of any of the filters above."""
-    state = state.inner if isinstance(state, ViewState) else state
+    state = state.inner if isinstance(state, SchmidtState) else state
     return state.belief if isinstance(state, ConstrainedState) else state
 
 
@@ -136,23 +142,25 @@ class Report(NamedTuple):
     """Whether lengths were learnt."""
 
 
-def report_of(info: ViewInfo | ConstrainedInfo | KalmanInfo) -> Report:
+def report_of(info: SchmidtInfo | ConstrainedInfo | KalmanInfo) -> Report:
     """The same diagnostics of every filter, whatever it is wrapped in."""
-    if isinstance(info, ViewInfo):
+    if isinstance(info, SchmidtInfo):
         return report_of(info.inner)._replace(is_new_view=info.is_new)
     if isinstance(info, ConstrainedInfo):
         return report_of(info.inner)._replace(least_distance=info.least_distance)
     return Report(info, jnp.full_like(info.log_evidence, jnp.inf), jnp.ones((), bool))
 
 
-def hypotheses(inner: Filter, hand: ArticulatedHand, *, capacity: int, start: mixture.MixtureState | None) -> Filter:
+def hypotheses(
+    inner: Filter, hand: ArticulatedHand, *, capacity: int, start: gaussian_sum.GaussianSumState | None
+) -> Filter:
     """A bank over the depth ambiguities of a hand (Shimada et al., section 6); observations are `Look`s.
 
     Every hypothesis is made linear at its mean; where the image of a link hardly depends on its angle, at both poses of
     the link that is most in doubt instead [30]; and where all fingers may be straight, also with the hand mirrored.
     Those that leave a limit by more than three standard deviations are given up. Arguments as in `mixture.mixture`.
     """
-    return mixture.mixture(
+    return gaussian_sum.gaussian_sum(
         inner,
         capacity=capacity,
         start=start,
@@ -192,7 +200,7 @@ def _update(model: HandBelief, key: AnyKey, belief: Gaussian, look: Look) -> tup
     at = belief.mean if look.at is None else look.at
     H = jax.jacfwd(hand.observe)(at)
     noise = jnp.diag(look.std**2)
-    measured = Measured(look.y, look.mask & _within_gate(model, belief, look, H, at), noise)
+    measured = Observation(look.y, look.mask & _within_gate(model, belief, look, H, at), noise)
     posterior, info = condition(
         belief, measured, hand.observe, noise, at=at, linearize=model.linearize, residual=hand.residual
     )

@@ -1,14 +1,13 @@
 """The articulated hand as one model: how its state moves, what is seen of it, and with how much noise."""
 
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.linalg import matmul, safe_norm
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.linalg import matmul, safe_norm
 from jaxfilters.models.articulated.features import (
     FULL,
     SHORTEST_LINK,
@@ -27,9 +26,7 @@ POINT_STD, ALPHA_STD, RHO_STD = 1.0, float(np.deg2rad(2.0)), 1.0
 """Pixels, radians, pixels."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class ArticulatedHand:
     """Links seen by one camera, for any Gaussian filter; made by `articulated_hand`.
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxfilters import linalg
+from jaxfilters.math import linalg
 
 LINKS = 3
 """Links of a finger."""

@@ -5,15 +5,13 @@ Strategies with the same verbs. Frames are the unit of time; layouts are those o
 """
 
 import math
-from dataclasses import dataclass
-from typing import no_type_check
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.linalg import safe_sqrt
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.linalg import safe_sqrt
 from jaxfilters.models.articulated.layout import Layout, white_acceleration_root
 
 FRAME_INTERVAL = 1 / 30
@@ -34,9 +32,7 @@ REMEMBERED = 5.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class ConstantVelocity:
     """Everything moves on by its rate; accelerations are constant within a frame and independent between [6], [8]."""
 
@@ -52,9 +48,7 @@ class ConstantVelocity:
         return white_acceleration_root(layout, self.acceleration_std, dt)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class AboutEase:
     """Rates die away, and angles return to those of a hand at ease; white accelerations keep both alive.
 

@@ -5,21 +5,19 @@ x right, y down, z away from the camera.
 """
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar, no_type_check
+from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import quaternion_normalize
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.lie import quaternion_normalize
 from jaxfilters.models.articulated.kinematics import scaled_rotation, turn, unit_rotation
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.camera import Pinhole
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class WeakPerspective:
     """Orthographic projection times one scale, the quaternion's squared length; everything is in pixels [9]."""
 
@@ -57,9 +55,7 @@ class WeakPerspective:
         return x
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Perspective:
     """A pinhole camera: position and lengths in metres, the length of the quaternion means nothing."""
 

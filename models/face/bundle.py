@@ -16,11 +16,11 @@ import optimistix
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
-from jaxfilters.least_squares import BoxLevenbergMarquardt, cauchy, huber
 from jaxfilters.models.face import person_prior
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig, project_shape
+from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt, cauchy, huber
 
 POSE_UNITS = np.array([10.0, 10.0, 20.0, *np.radians([3.0, 3.0, 3.0])])
 """Of the pose, millimetres and radians, in which the solver counts: by so much it may be off."""

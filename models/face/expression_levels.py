@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters.math.multilinear import check_finite
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.rigid import align
-from jaxfilters.multilinear import check_finite
 
 LEVELS = 5
 """Of each action."""

@@ -7,18 +7,18 @@ matrices with orthonormal columns, and `(c identity, expression / c)` is the sam
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import no_type_check
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.linalg import safe_sqrt
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.linalg import safe_sqrt
+from jaxfilters.math.multilinear import check_finite, hooi
+from jaxfilters.math.tensor_completion import complete
 from jaxfilters.models.face.mirroring import PAIRS, Pairs, symmetrised
-from jaxfilters.multilinear import check_finite, hooi
-from jaxfilters.tensor_completion import complete
 
 IDENTITIES, EXPRESSIONS = 10, 5
 """S' and A' of the thesis."""
@@ -28,9 +28,7 @@ PEOPLE_MODE, EXPRESSION_MODE = 2, 3
 """Of the data tensor (K, 3, 2S, A)."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class MultilinearFace:
     """K symmetric landmarks, S parameters of identity, A of expression, and how people differ in them."""
 

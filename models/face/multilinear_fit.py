@@ -11,8 +11,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from jaxfilters import linalg
-from jaxfilters.least_squares import BoxLevenbergMarquardt
+from jaxfilters.math import linalg
 from jaxfilters.models.face.multilinear import (
     EXPRESSION_MODE,
     EXPRESSIONS,
@@ -22,6 +21,7 @@ from jaxfilters.models.face.multilinear import (
     of_tensor,
     shape,
 )
+from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt
 
 LIMIT = 2.0
 """Standard deviations from their mean within which parameters are looked for."""

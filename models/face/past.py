@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from jaxfilters.linalg import tria
+from jaxfilters.math.linalg import tria
 
 
 class Past(NamedTuple):

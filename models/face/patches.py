@@ -5,14 +5,14 @@ an affine map for each camera and landmark, and how it bends. How the surface is
 first, from an average head, and how it is curved not at all; what a turned head shows of both is learnt (`Slopes`).
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.correlation import cut
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 
@@ -41,9 +41,7 @@ NUM_RELIEF = 5
 """Two slopes, and the curvatures along the first direction, across, and along the second one."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Patches:
     """What was seen at registration; C cameras, K landmarks, windows of T x T pixels in TT numbers."""
 

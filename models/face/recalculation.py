@@ -16,7 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Num, Real
 
-from jaxfilters import linalg
+from jaxfilters.math import linalg
 from jaxfilters.models.face.correlation import cut, inside
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.patches import Slopes
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape

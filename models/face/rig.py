@@ -5,8 +5,7 @@ Pixels as everywhere: the centre of pixel (row i, column j) is the point (u, v) 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face import pose as head
 
@@ -21,9 +21,7 @@ NEAREST = 1.0
 """Millimetres before a camera's centre; points that are nearer, or behind it, have no image."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class CameraRig:
     """C calibrated cameras: `X_c = rotation_c X_world + translation_c`."""
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters import linalg
+from jaxfilters.math import linalg
 
 
 def align(

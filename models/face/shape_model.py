@@ -1,18 +1,13 @@
 """A face of one person: mean shape, linear deformations, and what its landmarks look like."""
 
-from dataclasses import dataclass
-from typing import no_type_check
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfilters import linalg
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math import linalg
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class FaceModel:
     """K landmarks with B modes of deformation, seen by C cameras; B may be 0."""
 

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import kalman, linalg
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import KalmanInfo
+from jaxfilters.gaussian import arithmetic
+from jaxfilters.gaussian.arithmetic import KalmanInfo
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.math import linalg
 
 STATE = 4
 H = np.eye(2, STATE)
@@ -64,7 +65,7 @@ def new_belief(
 
 def predict(motion: Motion, belief: Gaussian, q: float | Float[Array, ""]) -> Gaussian:
     """Belief one frame later [P8, P9, the part outside the braces]; all there is to do in a frame without a match."""
-    return kalman.joseph.predict(belief, motion.F, _drive(motion, q))
+    return arithmetic.joseph.predict(belief, motion.F, _drive(motion, q))
 
 
 def correct(
@@ -75,7 +76,7 @@ def correct(
     The covariance has Joseph's form, which stays symmetric. `nis` is in units of the measurement's variance.
     """
     mask = None if seen is None else jnp.broadcast_to(seen, (2,))
-    return kalman.joseph.update(belief, position, jnp.asarray(H, dtype=float), jnp.eye(2), mask=mask)
+    return arithmetic.joseph.update(belief, position, jnp.asarray(H, dtype=float), jnp.eye(2), mask=mask)
 
 
 def correct_velocity(
@@ -90,7 +91,7 @@ def correct_velocity(
         seen: Whether there is a hint.
     """
     innovation = jnp.where(seen, velocity - belief.mean[2:], 0.0)
-    found = kalman.joseph.condition(
+    found = arithmetic.joseph.condition(
         belief.covariance, jnp.asarray(H_VELOCITY, dtype=float), jnp.eye(2) * variance, innovation
     )
     return Gaussian(belief.mean + found.shift, jnp.where(seen, found.covariance, belief.covariance))
@@ -109,7 +110,7 @@ def ahead(motion: Motion, belief: Gaussian, q: float | Float[Array, ""], frames:
         powers.append(linalg.matmul(motion.F, powers[-1]))
     driven = jnp.stack([linalg.matmul(power, motion.G) for power in powers[:-1]])
     noise = q * jnp.einsum("lik,ljk->ij", driven, driven, precision="highest")
-    return kalman.joseph.predict(belief, powers[-1], noise)
+    return arithmetic.joseph.predict(belief, powers[-1], noise)
 
 
 def uncertainty(belief: Gaussian) -> Float[Array, "*batch"]:

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import kalman
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian import arithmetic
+from jaxfilters.gaussian.belief import Gaussian
 
 THUMB_SCORE = 0.5
 """Score from which on a finger is taken for the thumb."""
@@ -160,10 +160,10 @@ def observe(
     def one(before: Gaussian, newly: Array, deviation: Array) -> tuple[Gaussian, Array]:
         predicted = _partly_new(before, newly, posture)
         innovation = jnp.where(seen, deviation - jnp.sum(predicted.mean), 0.0)
-        found = kalman.joseph.condition(predicted.covariance, H, R, innovation[None])
+        found = arithmetic.joseph.condition(predicted.covariance, H, R, innovation[None])
         covariance = jnp.where(seen, found.covariance, predicted.covariance)
         corrected = Gaussian(predicted.mean + found.shift, covariance)
-        return kalman.joseph.predict(corrected, F, Q), found.log_density
+        return arithmetic.joseph.predict(corrected, F, Q), found.log_density
 
     following, evidence = jax.vmap(one)(belief.angle, jnp.where(seen, newly, 0.0), deviations)
     return ThumbBelief(following, jnp.where(seen, log_odds + evidence[1] - evidence[0], belief.log_odds))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.linalg import safe_norm
+from jaxfilters.math.linalg import safe_norm
 
 NUM_POINTS = 40
 """Of a resampled stroke, unless told otherwise."""

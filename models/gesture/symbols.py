@@ -1,9 +1,9 @@
 """Symbols told apart by hidden Markov models of what their strokes look like."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Int32, PyTree
 from scipy.cluster.vq import kmeans2
 
 from jaxfilters import hmm
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.hmm import Emission, HiddenMarkovModel
 from jaxfilters.models.gesture.rejection import threshold_log_likelihood
 
@@ -24,9 +25,7 @@ CHUNK = 128
 """Strokes that `recognise_all` judges at once."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class Symbols:
     """Models of symbols, each of one or more ways to draw one."""
 
@@ -169,7 +168,7 @@ def recognise(
     seen = _seen(symbols, observations)
     bar = jnp.full(leaf.shape[-1], -jnp.inf, seen.dtype)
     if threshold is not None:
-        bar = hmm.log_likelihood(threshold, jax.vmap(threshold.log_likelihoods, -1, -1)(observations), lengths)
+        bar = hmm.log_evidence(threshold, jax.vmap(threshold.log_likelihoods, -1, -1)(observations), lengths)
     return _decided(symbols, seen, bar, lengths, margin, distance, sharpness)
 
 
@@ -223,7 +222,7 @@ def _seen(symbols: Symbols, observations: PyTree) -> Float[Array, "m p q n"]:
 
 def _decided(symbols, seen, bar, lengths, margin, distance, sharpness) -> Recognition:
     num_points = jnp.maximum(lengths, 1)
-    by_model = jax.vmap(hmm.log_likelihood, (0, 0, None))(symbols.models, seen, lengths)
+    by_model = jax.vmap(hmm.log_evidence, (0, 0, None))(symbols.models, seen, lengths)
     own = symbols.owner == jnp.arange(len(symbols.names))[:, None]
     totals = jnp.max(jnp.where(own[..., None], by_model, -jnp.inf), axis=1)
     best = jnp.argmax(totals, axis=0).astype(jnp.int32)

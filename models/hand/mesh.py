@@ -1,22 +1,18 @@
 """A triangle hand made procedurally: one watertight convex part per capsule, posed rigidly with its bone."""
 
-from dataclasses import dataclass
-from typing import no_type_check
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.hand.parts import part_transforms
 from jaxfilters.models.hand.skeleton import PART_NAMES, HandGeometry, check_geometry
 
 
 # Shapes are those of one hand; under `vmap` the leaves may carry one axis more, so they are not checked at run time.
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class HandMesh:
     """Triangles of all parts in the frames of their parts (`part_transforms`)."""
 

@@ -1,22 +1,20 @@
 """How a hand moves between two frames: a pose driven by a velocity that is damped and pushed at random."""
 
 import math
-from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.marginal import MixedDynamics
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE
+from jaxfilters.particle.rao_blackwell import MixedDynamics
 
 PER_COORDINATE = (3, 3, 15)
 """Tangent coordinates of wrist position, wrist rotation and joint angles."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree_dataclass
 class HandMotion:
     """Pose and velocity as the nonlinear and the linear state of a Rao-Blackwellized filter.
 

@@ -1,14 +1,14 @@
 """What a depth camera says about a hand: the part of the frame that is compared, and the log-likelihood of a pose."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple, no_type_check
+from dataclasses import field, replace
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.lie import quaternion_normalize, quaternion_to_matrix
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed, rendered_cost, union_cost
 from jaxfilters.models.hand.limits import limit_log_likelihood
@@ -86,9 +86,7 @@ def rendered(terms: DepthTerms, image: HandImage, max_error: float) -> Float[Arr
     return rendered_cost(terms, max_error)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class HandLikelihood:
     """Log-likelihood of a pose given a `HandImage`: a depth cost in Gibbs form, and soft joint limits."""
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import RigidTransform, quaternion_multiply, quaternion_normalize
+from jaxfilters.math.lie import RigidTransform, quaternion_multiply, quaternion_normalize
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, phalanx_angles
 
 

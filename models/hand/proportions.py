@@ -1,14 +1,15 @@
 """One person's hand: an average hand, its lengths and radii multiplied, and what depth images of it say of these."""
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, no_type_check
+from dataclasses import field, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters import fit
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.limits import limit_log_likelihood
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, retract
@@ -53,9 +54,7 @@ class HandStills(NamedTuple):
     """From the pose where each image's search began, in the tangent space there, in units of `pose_spread`."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class StillsDensity:
     r"""Log posterior of `HandStills`, through the renderer.
 

@@ -13,15 +13,14 @@ palm points to the thumb side of a right hand, +y to the forearm, +z to the back
 brings a tip towards the palm side (-z), positive spread towards the thumb side. Angles mean the same for a left hand.
 """
 
-from dataclasses import dataclass, replace
-from typing import no_type_check
+from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import quaternion_normalize, quaternion_to_matrix, so3_local, so3_retract
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix, so3_local, so3_retract
 from jaxfilters.models.rendering.geometry import Capsules
 
 POSE_SIZE = 22
@@ -43,9 +42,7 @@ ANGLE_LIMITS = np.deg2rad([(-20, 60), (-5, 55), (-30, 30), *(_FINGER_LIMITS * 4)
 
 
 # Field shapes are those of one hand; under `vmap` the leaves carry one axis more, so they are not checked at run time.
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class HandGeometry:
     """Sizes of one hand in metres, in the palm frame of a right hand; `side` mirrors it."""
 
@@ -75,9 +72,7 @@ class HandGeometry:
         )
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class HandKinematics:
     """A posed hand in the camera frame, metres."""
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import quaternion_multiply, quaternion_to_matrix, so3_exp
+from jaxfilters.math.lie import quaternion_multiply, quaternion_to_matrix, so3_exp
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.motion import per_coordinate
 from jaxfilters.models.hand.observation import REACH, HandLikelihood, hand_image

@@ -1,11 +1,11 @@
 """What a hand is rendered as: capsules, or convex triangle parts. Either is compared with depth in the same way."""
 
-from dataclasses import dataclass, replace
-from typing import Protocol, no_type_check
+from dataclasses import replace
+from typing import Protocol
 
-import jax
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.mesh import hand_mesh, part_meshes
 from jaxfilters.models.hand.parts import part_transforms
@@ -30,9 +30,7 @@ class HandSurface(Protocol):
         """Depth terms of the posed hand against an image of `camera`, metres; see `compare_capsules`."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class CapsuleHand:
     """One capsule for each part: exact, and the fastest."""
 
@@ -45,9 +43,7 @@ class CapsuleHand:
         return compare_capsules(camera, forward_kinematics(pose, self.geometry).capsules, observed, max_error)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # JAX rebuilds pytrees from leaves of any kind
+@pytree_dataclass
 class MeshHand:
     """One convex polyhedron for each part, moved with its bone: any shape, e.g. cut from a scanned hand."""
 

@@ -4,22 +4,21 @@ Source: H. Kato, A. Nakazawa, S. Inokuchi, "Realtime human tracking using ellips
 dual form of its equation [4]. Lengths in metres, pixels (u, v), projection matrices in canonical scale (`FloorCamera`).
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._struct import pytree_dataclass
+
 VISIBLE, INSIDE, BEHIND, CROSSING = 0, 1, 2, 3
 """Codes of an outline: an ellipse; the camera is inside the body and sees nothing else; the body lies wholly behind the
 camera; the body crosses the camera's plane, and its outline is no ellipse."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Ellipsoid:
     """An ellipsoid with axes along those of the world."""
 

@@ -10,7 +10,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.folding import nearest_inverse, pull_back, winning_pieces
 from jaxfilters.models.rendering.geometry import Capsules, ConvexParts, Ellipsoids, Mesh

@@ -8,7 +8,7 @@ import jax
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.folding import nearest_inverse, smooth_inverse, winning_pieces
 from jaxfilters.models.rendering.geometry import Capsules, ConvexParts, Ellipsoids, Mesh

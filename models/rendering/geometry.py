@@ -5,8 +5,7 @@ checked at run time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import no_type_check
+from dataclasses import field, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +13,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.lie import RigidTransform, quaternion_multiply
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.lie import RigidTransform, quaternion_multiply
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class Capsules:
     """A union of k capsules: all points within `radius` of a segment; a segment of length 0 makes a sphere."""
 
@@ -35,9 +33,7 @@ class Capsules:
         return Capsules(T_target_source.apply(self.start), T_target_source.apply(self.end), self.radius)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class Ellipsoids:
     """A union of k ellipsoids."""
 
@@ -54,9 +50,7 @@ class Ellipsoids:
         return Ellipsoids(T_target_source.apply(self.center), rotation, self.radii)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class ConvexParts:
     """Rigid convex polyhedra, each in its own frame; padded to equal numbers by repetition."""
 
@@ -68,9 +62,7 @@ class ConvexParts:
     """Metres."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class Mesh:
     """Any triangles. Rendering is fast when successive faces are neighbours, as `mesh_from_trimesh` arranges them."""
 

@@ -1,19 +1,17 @@
 """Parts of an object as functions of the pixel: what every kind of shape must provide to be rendered."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # under `vmap` every leaf carries one axis more
+@pytree_dataclass
 class Parts:
     """What the pixels need to know of k parts seen by one camera."""
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.geometry import ConvexParts
 from jaxfilters.models.rendering.parts import Parts, Surface, anchor_of

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxfilters.lie import quaternion_to_matrix
+from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.geometry import Capsules, Ellipsoids
 from jaxfilters.models.rendering.parts import Parts, Surface, anchor_of

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.geometry import Capsules
 from jaxfilters.models.rendering.rays import Vector, components, dot, minus, scale

@@ -4,12 +4,12 @@ Every part takes the smallest window of a ladder that holds its visible pixels. 
 parts in a size replace one program for every part and size; parts out of sight are not drawn at all.
 """
 
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from jaxfilters._struct import pytree_dataclass
 
 Window = tuple[int, int]
 
@@ -20,9 +20,7 @@ COARSE = ((16, 16), (32, 32), (64, 64), (128, 128))
 _COUNTED_PARTS = 64
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # under `vmap` every leaf carries one axis more
+@pytree_dataclass
 class Plan:
     """Where and in which order k parts are drawn."""
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.lie import quaternion_multiply, so3_exp
+from jaxfilters.math.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.features import FULL, PAPER_EXPERIMENT, FeatureSet
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout

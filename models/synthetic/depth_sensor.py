@@ -1,19 +1,15 @@
 """What a real depth sensor makes of a rendered image: noise, flying pixels, dropouts, whole millimetres."""
 
-from dataclasses import dataclass
-from typing import no_type_check
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt16
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.typing import AnyKey
 
 
 # Numbers may be traced, so the fields are not checked at run time.
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check
+@pytree_dataclass
 class DepthSensor:
     """Flaws of a time-of-flight camera; the defaults are Gaussian noise alone."""
 

@@ -4,15 +4,13 @@ Specification of the stereo head tracker, section 4. Millimetres in the model fr
 away from the camera, origin at the centroid of the neutral face.
 """
 
-from dataclasses import dataclass
-from typing import no_type_check
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.landmarks import BROWS, EYES, MEAN_SHAPE, MOUTH, NOSTRILS
 from jaxfilters.typing import AnyKey
 
@@ -27,9 +25,7 @@ _EYES, _OUTER, _MOUTH, _NOSTRILS, _BROWS = (list(group) for group in (EYES, (EYE
 _SIDE = np.sign(MEAN_SHAPE[:, 0])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Identity:
     """A person: the neutral face and how strongly it moves."""
 

@@ -3,14 +3,12 @@
 Specification of the stereo head tracker, section 4. The projection of a landmark is the centre of its patch exactly.
 """
 
-from dataclasses import dataclass
-from typing import no_type_check
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, UInt8
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.pose import place, rotation, turn
 from jaxfilters.models.face.rig import NEAREST, CameraRig
 from jaxfilters.models.synthetic.face_texture import AXES, NORMALS, FaceScene, patch
@@ -26,9 +24,7 @@ WINDOW_PX = 96
 """Side of the square in which a patch is drawn: over three of its standard deviations up to 2.5 pixels a millimetre."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Occluder:
     """An upright grey rectangle before the face."""
 

@@ -4,15 +4,14 @@ Specification of the stereo head tracker, section 4.
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
-from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.landmarks import MIRROR
 from jaxfilters.typing import AnyKey
 
@@ -55,9 +54,7 @@ AXES = _axes()
 """(10, 2, 3) directions of a patch's coordinates in its plane: the model's x laid into it, and the one downwards."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class FaceTexture:
     """Sums of cosines in the coordinates of each patch."""
 
@@ -69,9 +66,7 @@ class FaceTexture:
     """Of every wave of a patch, grey levels."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class FaceScene:
     """All that is seen besides shape and pose."""
 

@@ -6,15 +6,15 @@ variance, and 57 expressions with ARKit's names, all additive:
 here x is to the image's right, y down, z away from the camera.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.typing import AnyKey
 
@@ -22,9 +22,7 @@ _LANDMARKS, _SURFACE = "ict_landmarks68.npz", "ict_face9409.npz"
 _TO_OURS = np.array([10.0, -10.0, -10.0])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class IctModel:
     """V vertices of the skin, of which 68 are landmarks; eyes, teeth and the inner mouth are not part of it."""
 
@@ -42,9 +40,7 @@ class IctModel:
     """Of the expressions."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class IctPerson:
     """The face of one person, without expression."""
 

@@ -1,8 +1,5 @@
 """Pictures of modelled faces: a textured mesh with eyes, mouth and hair, lit from above, seen by C cameras."""
 
-from dataclasses import dataclass
-from typing import no_type_check
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +7,7 @@ import trimesh
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, UInt8
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.pose import place, turn
 from jaxfilters.models.face.rig import CameraRig
@@ -33,9 +31,7 @@ _LIDS = (tuple(range(36, 42)), tuple(range(42, 48)))
 _INNER_LIPS = tuple(range(60, 68))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class IctHead:
     """All surfaces of a head, skin first."""
 

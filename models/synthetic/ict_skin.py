@@ -6,7 +6,6 @@ fields: the ball of an eye, the dark of the mouth, hair.
 """
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import cv2
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.synthetic.ict_face import IctModel
 from jaxfilters.typing import AnyKey
 
@@ -31,9 +31,7 @@ IRIS_MM, PUPIL_MM = 6.2, 2.6
 _LOWEST_HAIR_MM = 45.0
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Skin:
     """The map of one person."""
 

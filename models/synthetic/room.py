@@ -1,15 +1,15 @@
 """Video of a room that is watched by cameras which stand still: walkers, furniture, shadows, a textured floor."""
 
 import math
-from dataclasses import dataclass, field
-from typing import no_type_check
+from dataclasses import field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxfilters.lie import RigidTransform, quaternion_from_matrix
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.rendering.depth import render_ellipsoids
@@ -28,9 +28,7 @@ LEGS, NECK = 0.5, 0.86
 SKIN = (120.0, 150.0, 200.0)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class RoomCamera:
     """A camera in the room, without lens distortion."""
 

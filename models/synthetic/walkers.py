@@ -1,14 +1,13 @@
 """People who walk on routes over a floor: bodies of jointed ellipsoids, not the one ellipsoid of the trackers."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.rendering.geometry import Ellipsoids
 
 STRIDE_M = 1.4
@@ -21,9 +20,7 @@ MODEL_HEIGHT_M, MODEL_WIDTH_M = 1.66, 0.42
 """Of the body whose parts are given below (articulated as in section 4 of the specification of the people tracker)."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class Walker:
     """A person at one time."""
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from jax.scipy.stats import norm
 
-from jaxfilters.filter import Filter, init, keep_all, loglikelihood, predict, run, step
-from jaxfilters.particle import StandardNormal, bootstrap
+from jaxfilters.filter import Filter, init, keep_all, log_evidence, predict, run, step
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import bootstrap
 
 TRACES = []
 
@@ -69,8 +70,8 @@ def test_scan_equals_a_loop_of_steps():
 
 def test_vmap_over_keys_equals_single_runs():
     pf, keys = make_filter(), jax.random.split(KEY, 3)
-    together = jax.vmap(loglikelihood, in_axes=(None, 0, None))(pf, keys, OBSERVATIONS)
-    alone = [loglikelihood(pf, key, OBSERVATIONS) for key in keys]
+    together = jax.vmap(log_evidence, in_axes=(None, 0, None))(pf, keys, OBSERVATIONS)
+    alone = [log_evidence(pf, key, OBSERVATIONS) for key in keys]
     np.testing.assert_allclose(together, alone, rtol=1e-5)
 
 
@@ -81,7 +82,7 @@ def test_unseen_frames_change_nothing_whatever_they_hold(hidden):
     hidden_there = jnp.where(mask, OBSERVATIONS, hidden)
 
     def evidence(dt, ys):
-        return loglikelihood(pf, KEY, ys, jnp.full(12, dt), mask=mask)
+        return log_evidence(pf, KEY, ys, jnp.full(12, dt), mask=mask)
 
     value, slope = jax.value_and_grad(evidence)(0.1, hidden_there)
     reference, reference_slope = jax.value_and_grad(evidence)(0.1, OBSERVATIONS)

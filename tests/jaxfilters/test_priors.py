@@ -9,8 +9,8 @@ import pytest
 
 import jaxfilters
 from jaxfilters import weights
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.particle import StandardNormal
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.noise import StandardNormal
 from jaxfilters.priors import from_noise, gaussian_prior, sample_ensemble
 
 MEAN = jnp.array([1.0, -2.0, 0.5])

@@ -4,7 +4,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from jaxfilters import fit
-from jaxfilters.extended import Measured
+from jaxfilters.gaussian.extended import Observation
 from jaxfilters.models.moving_points import PointFilter, PointNoise, learn, positions, tracks_of
 
 
@@ -38,7 +38,7 @@ def test_noises_are_learnt_from_tracks_with_gaps():
 def test_the_likelihood_is_that_of_all_readings_at_once():
     times, _, seen = simulated(frames=5)
     tracks, _ = tracks_of(seen, times)
-    y = Measured(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
+    y = Observation(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
     noise = PointNoise(jnp.float32(0.5), jnp.float32(40.0))
     found = fit.over_sequences(jnp.zeros(2, jnp.uint32), PointFilter(tracks.extent), y, tracks.seconds)(noise)
     extent, expected = float(tracks.extent), 0.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from jaxfilters import run
-from jaxfilters.extended import Measured
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.extended import Observation
 from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, drive, localisation, steps_between
 
 BEACONS = jnp.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [40.0, 40.0]])
@@ -42,7 +42,7 @@ def test_a_robot_is_found_where_it_is_among_wild_ranges():
     ranges = 1.5 + 1.05 * true + np.where(wild, 8.0, 0.3) * rng.standard_normal(true.shape)
     heard = np.arange(400)[:, None] % 4 == np.arange(4)
     prior = Gaussian(jnp.array([20.0, 10.0, 0.0]), jnp.diag(jnp.array([1.0, 1.0, 0.1]) ** 2))
-    observations = Measured(jnp.asarray(np.where(heard, ranges, np.nan), jnp.float32), jnp.asarray(heard))
+    observations = Observation(jnp.asarray(np.where(heard, ranges, np.nan), jnp.float32), jnp.asarray(heard))
     _, (beliefs, infos) = run(localisation(ROBOT, BEACONS, prior), jax.random.key(0), observations, steps)
     error = np.asarray(beliefs.mean) - poses
     squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(np.asarray(beliefs.covariance)), error)
@@ -57,7 +57,7 @@ def test_a_robot_is_found_where_it_is_among_wild_ranges():
 def test_a_robot_at_a_beacon_has_finite_numbers():
     prior = Gaussian(jnp.zeros(3), jnp.eye(3))
     step = Step(jnp.zeros((1, 2)), jnp.zeros(1), jnp.zeros(1), jnp.ones(1))
-    observation = Measured(jnp.full((1, 4), 2.0), jnp.ones((1, 4), bool))
+    observation = Observation(jnp.full((1, 4), 2.0), jnp.ones((1, 4), bool))
     final, _ = run(localisation(ROBOT, BEACONS, prior), jax.random.key(0), observation, step)
     assert np.all(np.isfinite(final.covariance))
 

@@ -7,7 +7,7 @@ import pytest
 
 import jaxfilters
 from jaxfilters import Gaussian, StandardNormal
-from jaxfilters.extended import extended
+from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.models.articulated import filters
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.camera import Pinhole
@@ -35,7 +35,7 @@ def articulated(theta):
     prior = Gaussian(sequence.initial_mean, theta["spread"] * sequence.initial_covariance)
     limits = filters.inequalities(limit_rows(synthetic.LAYOUT, table_1()))
     filter = filters.recommended(synthetic.paper_hand(), prior, limits)
-    return jaxfilters.loglikelihood(filter, KEY, looks, jnp.ones(4).at[0].set(0.0))
+    return jaxfilters.log_evidence(filter, KEY, looks, jnp.ones(4).at[0].set(0.0))
 
 
 def depth_hand(theta):
@@ -58,7 +58,7 @@ def depth_hand(theta):
         num_particles=8,
         noise=StandardNormal(21),
     )
-    return jaxfilters.loglikelihood(filter, KEY, jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), image))
+    return jaxfilters.log_evidence(filter, KEY, jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), image))
 
 
 def person(theta):
@@ -79,7 +79,7 @@ def person(theta):
         num_particles=8,
         noise=StandardNormal(2),
     )
-    return jaxfilters.loglikelihood(filter, KEY, jnp.stack([seen] * 2))
+    return jaxfilters.log_evidence(filter, KEY, jnp.stack([seen] * 2))
 
 
 def head(theta):
@@ -92,17 +92,17 @@ def head(theta):
     start = jnp.array([0.0, 0.0, 650.0, 0.1, 0.2, -0.1])
     prior = Gaussian(start, jnp.diag(jnp.array([10.0, 10, 30, 0.2, 0.2, 0.2]) ** 2))
     y = seen(start + jnp.array([3.0, 2, 5, 0.05, 0, 0.05]))
-    filter = extended(
+    filter = extended_kalman(
         prior, lambda x, _: x, theta["step"] ** 2 * jnp.eye(6), seen, theta["noise"] ** 2 * jnp.eye(y.size)
     )
-    return jaxfilters.loglikelihood(filter, KEY, jnp.stack([y] * 2))
+    return jaxfilters.log_evidence(filter, KEY, jnp.stack([y] * 2))
 
 
 def fingertips(theta):
     """Noises of points that move."""
     filter = PointFilter(jnp.float32(50.0))(PointNoise(theta["sensor"], theta["drive"]))
     y = jnp.array([[1.0], [2.5], [jnp.nan], [6.0]])
-    return jaxfilters.loglikelihood(filter, KEY, y, jnp.array([0.0, 0.03, 0.03, 0.04]))
+    return jaxfilters.log_evidence(filter, KEY, y, jnp.array([0.0, 0.03, 0.03, 0.04]))
 
 
 SYSTEMS = [

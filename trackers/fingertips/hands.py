@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32
 
-from jaxfilters import assignment
+from jaxfilters.math import assignment
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles
 from jaxfilters.trackers.fingertips import tracker

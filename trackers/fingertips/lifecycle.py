@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.fingertip import motion
 from jaxfilters.models.fingertip.motion import Motion
 from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.fingertip.motion import STATE
 from jaxfilters.models.fingertip.observation import MAX_TIPS
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture

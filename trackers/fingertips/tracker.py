@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.fingertip import motion
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles, base_angle

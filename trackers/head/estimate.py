@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment, align
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.pose import rotation, turning_axes
@@ -21,6 +20,7 @@ from jaxfilters.models.face.refinement import Refined, displaced, refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head import recent
 from jaxfilters.trackers.head.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.state import NUM_MODES, POSE, HeadState, Recent
@@ -64,7 +64,7 @@ class Estimate(NamedTuple):
     misfit: Float[Array, ""]
 
 
-def around_mode(search: AdaptiveState, state: HeadState, model: FaceModel) -> Estimate:
+def around_mode(search: AdaptiveDiffusionState, state: HeadState, model: FaceModel) -> Estimate:
     """The paper's estimate ([P18], [P19]), which the search has made, with the spread of the particles."""
     belief = spread(search)
     x = belief.mean
@@ -76,7 +76,7 @@ def around_mode(search: AdaptiveState, state: HeadState, model: FaceModel) -> Es
 
 
 def refined(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: HeadState,
     model: FaceModel,
     images: Float[Array, "C rows cols"],

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters import subspace
+from jaxfilters.math import incremental_pca
 from jaxfilters.models.face.landmarks import RIGID_WEIGHTS
 from jaxfilters.models.face.recalculation import patches, recalculate
 from jaxfilters.models.face.rig import CameraRig
@@ -32,7 +32,9 @@ def without_weighted_motion(change: Float[Array, "K 3"], mean: Float[Array, "K 3
 
 def nothing_learnt(shape: Float[Array, "K 3"], windows: Float[Array, "C K T T"]) -> Learner:
     """The learner at registration: the registered shape is the first."""
-    return Learner(subspace.start(shape.size, NUM_MODES), jnp.ones((), jnp.int32), shape, windows, jnp.zeros((), bool))
+    return Learner(
+        incremental_pca.start(shape.size, NUM_MODES), jnp.ones((), jnp.int32), shape, windows, jnp.zeros((), bool)
+    )
 
 
 def measurable(pose: Float[Array, " 6"], score: Float[Array, ""]) -> Bool[Array, ""]:
@@ -83,8 +85,10 @@ def learnt(
     change = jnp.where(usable, change, 0.0)
     count = learner.num_shapes + usable.astype(jnp.int32)
     far = jnp.sqrt(jnp.sum(change**2)) > LEAST_CHANGE
-    modes = jax.lax.cond(far, lambda: subspace.update(learner.subspace, change.ravel()), lambda: learner.subspace)
-    found = subspace.components(modes)
+    modes = jax.lax.cond(
+        far, lambda: incremental_pca.update(learner.subspace, change.ravel()), lambda: learner.subspace
+    )
+    found = incremental_pca.components(modes)
     deviation = jnp.where(found.variances > 0, jnp.maximum(jnp.sqrt(found.variances), LEAST_DEVIATION), 0.0)
     after = Learner(modes, count, jnp.where(usable, shape, learner.shape), windows, usable)
     return after, FaceModel(model.mean + follow / count * change, found.basis, deviation, model.templates)
@@ -92,7 +96,7 @@ def learnt(
 
 def carried(x: Float[Array, "B n"], before: FaceModel, after: FaceModel) -> Float[Array, "B n"]:
     """Mode coefficients of the same shapes, or the nearest, in a model that has changed."""
-    return subspace.transfer(x, before.mean.ravel(), before.basis, after.mean.ravel(), after.basis)
+    return incremental_pca.transfer(x, before.mean.ravel(), before.basis, after.mean.ravel(), after.basis)
 
 
 def turning(before: FaceModel, after: FaceModel) -> Float[Array, "B B"]:
@@ -102,4 +106,4 @@ def turning(before: FaceModel, after: FaceModel) -> Float[Array, "B B"]:
 
 def contribution(learner: Learner) -> Array:
     """Share of the deformation that the modes explain, 0 to 1."""
-    return subspace.contribution(learner.subspace)
+    return incremental_pca.contribution(learner.subspace)

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters import weights
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment, align, relocated
 from jaxfilters.models.face.patches import Patches, Slopes
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.shape_model import FaceModel, shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head import recent
 from jaxfilters.trackers.head.search import KAPPA
 from jaxfilters.trackers.head.state import POSE, Recent
@@ -40,14 +40,16 @@ class Looks(Protocol):
     def misfit(self) -> Array: ...
 
 
-def spread(search: AdaptiveState) -> Gaussian:
+def spread(search: AdaptiveDiffusionState) -> Gaussian:
     """The mean around the particles' mode, with the spread of the particles."""
     x = search.estimate
     apart = jnp.where(jnp.isfinite(search.log_weights), search.particles - x[:, None], 0.0)
     return Gaussian(x, jnp.matmul(apart * weights.linear(search.log_weights), apart.T, precision="highest"))
 
 
-def predicted(search: AdaptiveState, before: Gaussian, model: FaceModel, moved: Float[Array, " 6"]) -> Gaussian:
+def predicted(
+    search: AdaptiveDiffusionState, before: Gaussian, model: FaceModel, moved: Float[Array, " 6"]
+) -> Gaussian:
     """Of this frame before its images: the last belief, moved on, and no deformation too large.
 
     Args:

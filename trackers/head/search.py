@@ -1,25 +1,27 @@
 """The particle filter that finds the head again in every frame, near where it was headed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jaxfilters import diffusion, weights
-from jaxfilters.adaptive import AdaptiveState, adaptive_particle_filter
-from jaxfilters.diffusion import DiffusionFit
+from jaxfilters import weights
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.layered import Layers, consecutive
+from jaxfilters.math import diffusion
+from jaxfilters.math.diffusion import DiffusionFit
 from jaxfilters.models.face.correlation import score_points
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.likelihood import log_weights, scores
 from jaxfilters.models.face.patches import SIZE
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState, adaptive_diffusion
+from jaxfilters.particle.partitioned import Partitions, consecutive
 from jaxfilters.trackers.head.state import NUM_MODES, POSE, UNITS, HeadOptions
 from jaxfilters.typing import AnyKey
 
@@ -34,9 +36,7 @@ MODE_SCALE = 5.0
 """Millimetres and degrees that count as one in the distance to the heaviest particle."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class FaceLikelihood:
     """How well particles of pose and mode coefficients explain images ([P16], [P17])."""
 
@@ -71,7 +71,7 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
     templates = jnp.zeros((rig.num_cameras, NUM_LANDMARKS, SIZE, SIZE))
     nobody = rigid(jnp.zeros((NUM_LANDMARKS, 3)), templates, num_modes=NUM_MODES)
     build = partial(
-        adaptive_particle_filter,
+        adaptive_diffusion,
         _no_prior,
         FaceLikelihood(nobody, templates, rig),
         first_diffusion(options),
@@ -82,7 +82,7 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
         high=jnp.asarray(HIGH, float),
         learn=diffusion.update if options.diffusion == "learnt" else diffusion.keep,
     )
-    return Searches(build(), build(layers=Layers(consecutive(POSE, NUM_MODES))))
+    return Searches(build(), build(partitions=Partitions(consecutive(POSE, NUM_MODES))))
 
 
 def first_diffusion(options: HeadOptions) -> DiffusionFit:
@@ -111,13 +111,13 @@ def at(filter: Filter, model: FaceModel, templates: Array, deviation: Array) -> 
     )
 
 
-def gathered(search: AdaptiveState, x: Float[Array, " d"]) -> AdaptiveState:
+def gathered(search: AdaptiveDiffusionState, x: Float[Array, " d"]) -> AdaptiveDiffusionState:
     """All particles at one place."""
     particles = jnp.broadcast_to(x[:, None], search.particles.shape)
     return search._replace(particles=particles, log_weights=weights.uniform(particles.shape[1], particles.dtype))
 
 
-def start(x: Float[Array, " d"], options: HeadOptions, fit: DiffusionFit | None = None) -> AdaptiveState:
+def start(x: Float[Array, " d"], options: HeadOptions, fit: DiffusionFit | None = None) -> AdaptiveDiffusionState:
     """The state at registration: the place is known, and counts as the first estimate.
 
     Args:
@@ -126,7 +126,7 @@ def start(x: Float[Array, " d"], options: HeadOptions, fit: DiffusionFit | None 
         fit: The diffusion; that of the options if none.
     """
     n = options.num_particles
-    return AdaptiveState(
+    return AdaptiveDiffusionState(
         particles=jnp.broadcast_to(x[:, None], (x.size, n)),
         log_weights=weights.uniform(n, x.dtype),
         ancestors=jnp.arange(n, dtype=jnp.int32),

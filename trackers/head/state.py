@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.math.incremental_pca import IncrementalPCA
 from jaxfilters.models.face.patches import Patches, Slopes
 from jaxfilters.models.face.shape_model import FaceModel
-from jaxfilters.subspace import Subspace
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 
 HEAD_STATUS = ("initialising", "rigid", "deformable", "lost")
 """Words for the integers in `HeadTrack.status`."""
@@ -83,7 +83,7 @@ def compiled(options: HeadOptions) -> HeadOptions:
 class Learner(NamedTuple):
     """The deformation model while it is learnt."""
 
-    subspace: Subspace
+    subspace: IncrementalPCA
     num_shapes: Int[Array, ""]
     """Shapes in the mean."""
     shape: Float[Array, "K 3"]
@@ -132,7 +132,7 @@ class Recent(NamedTuple):
 class HeadState(NamedTuple):
     """Everything the next frame needs."""
 
-    search: AdaptiveState
+    search: AdaptiveDiffusionState
     """Particles of pose and mode coefficients."""
     belief: Gaussian
     """Of the last estimate."""

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.diffusion import DiffusionFit
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.math.diffusion import DiffusionFit
 from jaxfilters.models.face.patches import SKIN_NORMALS, Slopes, patches, unknown_slopes
 from jaxfilters.models.face.pose import rotation
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.shape_model import FaceModel, rigid
-from jaxfilters.particle import ParticleInfo
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.particle.bootstrap import ParticleInfo
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.estimate import Estimate, around_mode
 from jaxfilters.trackers.head.recent import nothing_changed
@@ -141,7 +141,7 @@ def _step(
     moved = state.search.velocity * steps
     templates, looks = way.templates(state, model, rig, moved)
 
-    def run(filter: Filter, deviation: Array) -> tuple[AdaptiveState, ParticleInfo]:
+    def run(filter: Filter, deviation: Array) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
         filter = at(filter, model, looks, deviation)
         predict_key, update_key = jax.random.split(search_key)
         search = filter.predict(filter.params, predict_key, state.search, steps)
@@ -201,7 +201,7 @@ def _usable(state: HeadState, deforms: Array) -> FaceModel:
     return jax.tree.map(lambda a, b: jnp.where(deforms, a, b), state.model, face)
 
 
-def _held(estimate: Estimate, search: AdaptiveState, model: FaceModel, state: HeadState) -> Gaussian:
+def _held(estimate: Estimate, search: AdaptiveDiffusionState, model: FaceModel, state: HeadState) -> Gaussian:
     """What is believed: the estimate, or where nothing was found the particles."""
     particles = around_mode(search, state, model).belief
     return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, particles)
@@ -211,7 +211,7 @@ def _learnt(
     way: Way,
     state: HeadState,
     usable: FaceModel,
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     belief: Gaussian,
     estimate: Estimate,
     score: Array,
@@ -244,8 +244,8 @@ def _learnt(
 
 
 def _carried(
-    search: AdaptiveState, belief: Gaussian, before: FaceModel, after: FaceModel
-) -> tuple[AdaptiveState, Gaussian]:
+    search: AdaptiveDiffusionState, belief: Gaussian, before: FaceModel, after: FaceModel
+) -> tuple[AdaptiveDiffusionState, Gaussian]:
     """Particles and belief in the modes of a model that has changed."""
     carry = lambda a: learning.carried(a, before, after)
     turning = learning.turning(before, after)

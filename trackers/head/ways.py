@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxfilters import diffusion
-from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.filter import Filter
+from jaxfilters.math import diffusion
 from jaxfilters.models.face.alignment import facing
 from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian
 from jaxfilters.models.face.rigid import remove_motion
 from jaxfilters.models.face.shape_model import FaceModel, shape
-from jaxfilters.particle import ParticleInfo
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.particle.bootstrap import ParticleInfo
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.estimate import Estimate, around_mode, refined
 from jaxfilters.trackers.head.recent import latest_templates
@@ -32,9 +32,11 @@ class Way(NamedTuple):
 
     templates: Callable[[HeadState, FaceModel, CameraRig, Array], Templates]
     """`(state, model, rig, predicted motion)`; templates are flat where a landmark is turned away."""
-    search: Callable[[Callable[[Filter, Array], tuple[AdaptiveState, ParticleInfo]], Searches, FaceModel], tuple]
+    search: Callable[
+        [Callable[[Filter, Array], tuple[AdaptiveDiffusionState, ParticleInfo]], Searches, FaceModel], tuple
+    ]
     """`(run, searches, model)`: one of the searches, run with a diffusion of the mode coefficients."""
-    estimate: Callable[..., tuple[Estimate, AdaptiveState]]
+    estimate: Callable[..., tuple[Estimate, AdaptiveDiffusionState]]
     """`(search, state, model, images, rig, predicted motion, frame times, options)`, and the search after it."""
     measured: Callable[..., Templates]
     """`(state, estimate, images, rig, whether it is measured)`: the shape that is learnt, the windows about it."""
@@ -67,11 +69,11 @@ def _flat_templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: A
     return model.templates, model.templates
 
 
-def _rigid_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveState, ParticleInfo]:
+def _rigid_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     return run(searches.rigid, jnp.zeros_like(model.deviation))
 
 
-def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveState, ParticleInfo]:
+def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     """Particles deform where the model does."""
     learnt = jnp.any(model.deviation > 0)
     return jax.lax.cond(
@@ -80,7 +82,7 @@ def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tupl
 
 
 def _refined(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: HeadState,
     model: FaceModel,
     images: Array,
@@ -88,7 +90,7 @@ def _refined(
     moved: Array,
     steps: Array,
     options: HeadOptions,
-) -> tuple[Estimate, AdaptiveState]:
+) -> tuple[Estimate, AdaptiveDiffusionState]:
     """The fit; particles, velocity and diffusion follow it."""
     estimate = refined(search, state, model, images, rig, moved)
     before, x = state.search, estimate.belief.mean
@@ -101,7 +103,7 @@ def _refined(
 
 
 def _around_mode(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: HeadState,
     model: FaceModel,
     images: Array,
@@ -109,7 +111,7 @@ def _around_mode(
     moved: Array,
     steps: Array,
     options: HeadOptions,
-) -> tuple[Estimate, AdaptiveState]:
+) -> tuple[Estimate, AdaptiveDiffusionState]:
     """What the search itself has made."""
     del images, rig, moved, steps, options
     return around_mode(search, state, model), search

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.least_squares import cauchy, huber
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face import person_prior
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Views, adjust, square
 from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
@@ -17,6 +16,7 @@ from jaxfilters.models.face.past import joined
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.optimize.least_squares import cauchy, huber
 from jaxfilters.trackers.head.state import POSE
 from jaxfilters.trackers.head_mono.past import left_behind, seen_by, units
 from jaxfilters.trackers.head_mono.person import Modes, model_of

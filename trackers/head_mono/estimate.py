@@ -5,8 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import align
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.patches import Slopes, learn_slopes
@@ -14,6 +13,7 @@ from jaxfilters.models.face.point_recalculation import point_windows, recalculat
 from jaxfilters.models.face.refinement import LEAST_SCORE, PIXEL_FLOOR, refine
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head import recent
 from jaxfilters.trackers.head.estimate import FEWEST_SEEN, LOOSENESS, MEMORY, MISFIT
 from jaxfilters.trackers.head.near_mode import anywhere, looked_for, predicted, spread
@@ -50,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 def aligned(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: MonoState,
     images: Float[Array, "1 rows cols"],
     rig: CameraRig,
@@ -96,7 +96,7 @@ def aligned(
 
 
 def recalculated(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: MonoState,
     images: Float[Array, "1 rows cols"],
     rig: CameraRig,
@@ -114,7 +114,7 @@ def recalculated(
 
 
 def projected(
-    search: AdaptiveState,
+    search: AdaptiveDiffusionState,
     state: MonoState,
     images: Float[Array, "1 rows cols"],
     rig: CameraRig,

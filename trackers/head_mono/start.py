@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.multilinear import MultilinearFace

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters.adaptive import AdaptiveState
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.bundle import Bundle, Reach, Views
 from jaxfilters.models.face.patches import Patches, Slopes
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.state import Recent
 from jaxfilters.trackers.head_mono.person import Modes
 
@@ -138,7 +138,7 @@ class Registered(NamedTuple):
 class MonoState(NamedTuple):
     """Everything the next frame needs."""
 
-    search: AdaptiveState
+    search: AdaptiveDiffusionState
     """Particles of pose and mode coefficients."""
     belief: Gaussian
     """Of the last estimate, for the person as believed."""

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfilters.adaptive import AdaptiveState
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import facing
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
-from jaxfilters.particle import ParticleInfo
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.particle.bootstrap import ParticleInfo
 from jaxfilters.trackers.head.near_mode import spread
 from jaxfilters.trackers.head.recent import latest_templates
 from jaxfilters.trackers.head.search import KAPPA, Searches, at, gathered, score_at
@@ -130,10 +130,10 @@ def _searched(
     images: Array,
     steps: Array,
     options: MonoOptions,
-) -> tuple[AdaptiveState, ParticleInfo]:
+) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     """Particles after this frame; where they make the estimate, half of them move in the expression."""
 
-    def run(filter: Filter, deviation: Array) -> tuple[AdaptiveState, ParticleInfo]:
+    def run(filter: Filter, deviation: Array) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
         filter = at(filter, state.model, templates, deviation)
         predict_key, update_key = jax.random.split(key)
         search = filter.predict(filter.params, predict_key, state.search, steps)
@@ -144,7 +144,9 @@ def _searched(
     return run(searches.layered, PUBLISHED_KAPPA / KAPPA * state.model.deviation)
 
 
-def _followed(search: AdaptiveState, state: MonoState, estimate: Estimate, steps: Array) -> AdaptiveState:
+def _followed(
+    search: AdaptiveDiffusionState, state: MonoState, estimate: Estimate, steps: Array
+) -> AdaptiveDiffusionState:
     """The search after the fit has said where the head is: particles and velocity follow the fit."""
     before, x = state.search, estimate.belief.mean
     elapsed = before.elapsed + steps
@@ -155,7 +157,9 @@ def _followed(search: AdaptiveState, state: MonoState, estimate: Estimate, steps
     return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), followed, search)
 
 
-def _after(state: MonoState, search: AdaptiveState, belief: Gaussian, estimate: Estimate, missed: Array) -> MonoState:
+def _after(
+    state: MonoState, search: AdaptiveDiffusionState, belief: Gaussian, estimate: Estimate, missed: Array
+) -> MonoState:
     """The state after a frame but for the person, and for what counts frames."""
     found = ~missed
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(found, a, b), new, old)

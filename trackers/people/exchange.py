@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.appearance import dissimilarity
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, Meetings, People
 

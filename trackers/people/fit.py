@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people.silhouettes import (

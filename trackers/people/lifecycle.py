@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.scene import walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity
 from jaxfilters.trackers.people.exchange import is_meeting

@@ -5,7 +5,7 @@ Section numbers are those of Kato, Nakazawa, Inokuchi, "Realtime human tracking 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import (
     INSIDE,
@@ -141,9 +142,7 @@ class PaperConfig:
             )
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class PaperScene:
     """What the tracker knows of a place; `paper_scene` makes checked ones."""
 

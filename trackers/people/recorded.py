@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import joseph
+from jaxfilters.gaussian.arithmetic import joseph
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
 from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, Report

@@ -1,14 +1,15 @@
 """What the people tracker is told, what it remembers from frame to frame, and what it says of each."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, Num, UInt8
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 
 FREE, TENTATIVE, TRACKED, DORMANT = range(4)
@@ -82,9 +83,7 @@ class PeopleConfig:
             raise ValueError(f"dropped must be negative log odds; got {self.dropped!r}.")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-@no_type_check  # leaves of a pytree are batched, or no arrays at all, while a transformation is at work
+@pytree_dataclass
 class PeopleScene:
     """Cameras, furniture and floor: one entry a camera, in the order of the images."""
 

@@ -8,8 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.kalman import joseph
+from jaxfilters.gaussian.arithmetic import joseph
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.consider import consider
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.trackers.people import lifecycle
@@ -33,7 +34,6 @@ from jaxfilters.trackers.people.state import (
     chosen,
     nobody,
 )
-from jaxfilters.views import consider
 
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters.math.multilinear import numerical_ranks
 from jaxfilters.models.face import remembered
 from jaxfilters.models.face.landmarks import EYES, FROM_68, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs
@@ -22,7 +23,6 @@ from jaxfilters.models.face.multilinear_fit import leave_one_out
 from jaxfilters.models.face.people_alignment import aligned_people
 from jaxfilters.models.synthetic.face_training import generator_shapes, ict_shapes, people_of
 from jaxfilters.models.synthetic.ict_face import read_ict
-from jaxfilters.multilinear import numerical_ranks
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.face_model_files import FaceModelFile, save_face_model
 from jaxfilters.trackers.shell.landmark_sets import NAMES_68, LandmarkSets, read_landmark_sets, ten_of

@@ -5,10 +5,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from jaxfilters import fit
-from jaxfilters.extended import Measured, extended
-from jaxfilters.filter import loglikelihood
-from jaxfilters.gaussian import Gaussian
-from jaxfilters.particle import StandardNormal, bootstrap
+from jaxfilters.filter import log_evidence
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.extended import Observation, extended_kalman
+from jaxfilters.noise import StandardNormal
+from jaxfilters.particle.bootstrap import bootstrap
 
 KEY = jax.random.key(2)
 RNG = np.random.default_rng(8)
@@ -29,7 +30,7 @@ def see(x):
 def filter_of(theta):
     prior = Gaussian(jnp.zeros(1), jnp.eye(1))
     transition = jax.tree_util.Partial(move, theta["rate"])
-    return extended(prior, transition, theta["drift"] ** 2 * jnp.eye(1), see, theta["noise"] ** 2 * jnp.eye(1))
+    return extended_kalman(prior, transition, theta["drift"] ** 2 * jnp.eye(1), see, theta["noise"] ** 2 * jnp.eye(1))
 
 
 def simulate(rng, shape, rate, drift, noise):
@@ -69,10 +70,10 @@ def test_nan_that_nothing_declares_is_named():
     with pytest.raises(ValueError, match=r"observations\['y'\] must not be NaN.*frame 3"):
         fit.log_evidence(KEY, filter_of, {"y": ys, "count": np.ones(5, int)})
     fit.check_observations({"y": ys}, mask=np.arange(5) != 3)
-    fit.check_observations(Measured(ys, ~np.isnan(ys)))
+    fit.check_observations(Observation(ys, ~np.isnan(ys)))
     fit.check_observations(ys[:, None], mask=~np.isnan(ys))
     with pytest.raises(ValueError, match="frame 3"):
-        fit.check_observations(Measured(ys))
+        fit.check_observations(Observation(ys))
     with pytest.raises(ValueError, match="frame 3"):
         fit.check_observations(ys, mask=np.arange(5) != 2)
 
@@ -102,7 +103,7 @@ def test_a_particle_filter_draws_what_it_is_told(draws):
     density = fit.log_evidence(KEY, particle_filter_of, ys, draws=draws)
     for step in (0, 3):
         key = KEY if draws is fit.common_random_numbers else jax.random.fold_in(KEY, step)
-        expected = loglikelihood(particle_filter_of(THETA), key, ys)
+        expected = log_evidence(particle_filter_of(THETA), key, ys)
         found = density(THETA) if draws is fit.common_random_numbers else density.at(jnp.asarray(step), THETA)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 

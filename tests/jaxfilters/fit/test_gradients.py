@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters import fit, kalman
-from jaxfilters.extended import extended
-from jaxfilters.gaussian import Gaussian, GaussianRoot
-from jaxfilters.linearize import taylor, unscented
+from jaxfilters import fit
+from jaxfilters.gaussian import arithmetic as arithmetics
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.linearize import taylor, unscented
 
 RNG = np.random.default_rng(9)
 T = 3
@@ -28,12 +29,12 @@ def see(bend, x):
     return H @ x + bend * jnp.sin(x[:1] * x[1:])
 
 
-def filter_of(theta, bend=0.0, arithmetic=kalman.joseph, **options):
-    root = arithmetic is kalman.square_root
+def filter_of(theta, bend=0.0, arithmetic=arithmetics.joseph, **options):
+    root = arithmetic is arithmetics.square_root
     form = GaussianRoot if root else Gaussian
     P, Q = (ROOT_P, ROOT_Q) if root else (ROOT_P @ ROOT_P.T, ROOT_Q @ ROOT_Q.T)
     power = 1 if root else 2
-    return extended(
+    return extended_kalman(
         form(jnp.ones(2), jnp.asarray(P)),
         jax.tree_util.Partial(move, theta["rate"]),
         theta["drift"] ** power * jnp.asarray(Q),
@@ -62,8 +63,8 @@ def exact(theta):
 
 
 LINEAR = {
-    "square_root": dict(arithmetic=kalman.square_root),
-    "unscented": dict(linearize=unscented(), arithmetic=kalman.square_root),
+    "square_root": dict(arithmetic=arithmetics.square_root),
+    "unscented": dict(linearize=unscented(), arithmetic=arithmetics.square_root),
 }
 
 
@@ -83,9 +84,9 @@ def test_the_gradient_is_that_of_the_joint_gaussian(x64, expected, options):
 
 
 CURVED = {
-    "taylor": dict(linearize=taylor, arithmetic=kalman.fast),
+    "taylor": dict(linearize=taylor, arithmetic=arithmetics.fast),
     "iterated": dict(linearize=taylor, iterations=3),
-    "unscented": dict(linearize=unscented(), arithmetic=kalman.square_root),
+    "unscented": dict(linearize=unscented(), arithmetic=arithmetics.square_root),
 }
 
 

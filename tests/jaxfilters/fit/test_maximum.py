@@ -9,7 +9,7 @@ from jax.scipy.stats import norm
 from scipy.spatial.transform import Rotation
 
 from jaxfilters import fit
-from jaxfilters.lie import quaternion_to_matrix
+from jaxfilters.math.lie import quaternion_to_matrix
 
 RNG = np.random.default_rng(5)
 YS = 2.0 + 0.7 * RNG.normal(size=60)

@@ -39,7 +39,7 @@ def test_a_code_that_does_not_exist_is_impossible_and_has_no_derivative():
     for unknown in (-1, 2):
         assert np.all(codes.log_likelihood(jnp.array(unknown)) == -np.inf)
         model = hmm.from_probabilities([0.5, 0.5], np.full((2, 2), 0.5), codes)
-        total = lambda model, y: hmm.log_likelihood(model, model.log_likelihoods(y))
+        total = lambda model, y: hmm.log_evidence(model, model.log_likelihoods(y))
         gradient = jax.grad(total)(model, jnp.array([0, unknown, 1]))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 

@@ -85,10 +85,10 @@ def test_the_threshold_is_between_the_right_symbol_and_the_wrong_ones():
     np.testing.assert_allclose(np.exp(null.log_initial), 1 / 9, rtol=1e-5)
     for label, codes in WORDS.items():
         y = jnp.repeat(jnp.array(codes), 4)
-        bar = hmm.log_likelihood(null, null.log_likelihoods(y))
+        bar = hmm.log_evidence(null, null.log_likelihoods(y))
         for other in WORDS:
             own = symbol(WORDS[other])
-            score = hmm.log_likelihood(own, own.log_likelihoods(y))
+            score = hmm.log_evidence(own, own.log_likelihoods(y))
             assert (score > bar) == (other == label)
     one = hmm.threshold(hmm.side_by_side([symbol((0,))]))
     np.testing.assert_array_equal(one.log_transition, 0)

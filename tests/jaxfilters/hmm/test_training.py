@@ -112,7 +112,7 @@ def test_the_model_that_drew_the_data_is_found_again():
     np.testing.assert_allclose(np.exp(learnt.log_transition)[np.ix_(order, order)], [[0.9, 0.1], [0.2, 0.8]], atol=0.04)
     assert trained.converged
     assert trained.num_iterations < 30
-    likelihood = lambda model: hmm.log_likelihood(model, jax.vmap(model.log_likelihoods, -1, -1)(y)).sum()
+    likelihood = lambda model: hmm.log_evidence(model, jax.vmap(model.log_likelihoods, -1, -1)(y)).sum()
     assert likelihood(learnt) >= likelihood(truth) - 1
 
 

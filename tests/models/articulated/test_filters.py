@@ -11,14 +11,15 @@ import pytest
 from scipy import stats
 
 import jaxfilters
-from jaxfilters import Gaussian, mixture
-from jaxfilters.extended import condition
-from jaxfilters.linearize import second_order, taylor
+from jaxfilters import Gaussian
+from jaxfilters.gaussian import gaussian_sum
+from jaxfilters.gaussian.constraints import expectation_propagation, linear_constraints
+from jaxfilters.gaussian.extended import condition
+from jaxfilters.gaussian.linearize import second_order_covariance_only, taylor
 from jaxfilters.models.articulated import filters
 from jaxfilters.models.articulated.ambiguity import separated_points
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.synthetic import articulated as synthetic
-from jaxfilters.truncation import expectation_propagation, linear_constraints
 
 LAYOUT = synthetic.LAYOUT
 LENGTHS = slice(28, 34)
@@ -192,7 +193,7 @@ def test_a_limit_on_the_length_narrows_the_angle(x64):
     for longest in (math.inf, 70.0):
         link = synthetic.one_link(longest)
         prior, noise = Gaussian(link.mean, link.covariance), jnp.diag(link.noise_std**2)
-        belief, _ = condition(prior, link.y, synthetic.one_link_length, noise, linearize=second_order)
+        belief, _ = condition(prior, link.y, synthetic.one_link_length, noise, linearize=second_order_covariance_only)
         rows = linear_constraints(np.eye(2), link.lower, link.upper)
         cut, _, info = expectation_propagation.truncate(belief, rows)
         assert info.converged
@@ -240,7 +241,10 @@ def test_two_estimates_at_the_critical_pose_of_which_limits_leave_one_two_frames
     angles = means[:, own]
     assert int(info.num_hypotheses) == estimates
     # Branches 1 and 2 are made linear on the two sides of the image plane.
-    assert list(info.fates[0, 1:3]) == [mixture.KEPT, mixture.KEPT if estimates == 2 else mixture.REJECTED]
+    assert list(info.fates[0, 1:3]) == [
+        gaussian_sum.KEPT,
+        gaussian_sum.KEPT if estimates == 2 else gaussian_sum.REJECTED,
+    ]
     if estimates == 2:
         below, above = np.sort(np.rad2deg(angles - x[own]))
         assert below < -4
@@ -278,7 +282,7 @@ def test_hypotheses_are_more_before_the_critical_pose_and_one_after_it():
 
 def _keep_counts(state, info):
     del state
-    return info.num_hypotheses, jnp.sum(info.fates[:, 1:3] != mixture.UNUSED)
+    return info.num_hypotheses, jnp.sum(info.fates[:, 1:3] != gaussian_sum.UNUSED)
 
 
 def test_a_feature_far_from_its_prediction_is_left_out(hand, limits):

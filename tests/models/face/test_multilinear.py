@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.math.multilinear import compose, hooi, hosvd, mode_product, numerical_ranks
 from jaxfilters.models.face import multilinear
 from jaxfilters.models.face.landmarks import FROM_68, MIRROR
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, mirror_map, mirrored, symmetrised
 from jaxfilters.models.face.multilinear import EXPRESSION_MODE, PEOPLE_MODE, learn, of_tensor, shape_tensor
 from jaxfilters.models.face.multilinear_fit import fitted, fitted_up_to_size, leave_one_out
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
-from jaxfilters.multilinear import compose, hooi, hosvd, mode_product, numerical_ranks
 
 RANKS = {PEOPLE_MODE: 10, EXPRESSION_MODE: 5}
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import multivariate_normal, multivariate_t
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face import refinement as module
 from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.landmarks import MEAN_SHAPE

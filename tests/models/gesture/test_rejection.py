@@ -21,7 +21,7 @@ def test_it_is_the_threshold_model_of_the_symbols_side_by_side():
     codes = jnp.asarray(rng.integers(5, size=(30, 7)))
     lengths = jnp.array([30, 29, 1, 0, 12, 30, 5])
     whole = hmm.threshold(hmm.side_by_side(ones, leaving=LEAVING))
-    expected = hmm.log_likelihood(whole, jax.vmap(whole.log_likelihoods, -1, -1)(codes), lengths)
+    expected = hmm.log_evidence(whole, jax.vmap(whole.log_likelihoods, -1, -1)(codes), lengths)
     seen = jax.vmap(lambda model: jax.vmap(model.log_likelihoods, -1, -1)(codes))(models)
     np.testing.assert_allclose(threshold_log_likelihood(models, seen, lengths), expected, rtol=1e-5, atol=1e-4)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxfilters.lie import quaternion_to_matrix
+from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.models.hand.mesh import capsule_mesh, hand_mesh, part_meshes, pose_vertices, posed_trimesh
 from jaxfilters.models.hand.parts import part_transforms
 from jaxfilters.models.hand.skeleton import PART_NAMES, forward_kinematics, hand_geometry, mirrored, open_palm

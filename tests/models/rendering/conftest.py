@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxfilters.lie import RigidTransform, quaternion_normalize
+from jaxfilters.math.lie import RigidTransform, quaternion_normalize
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.comparison import (
     compare_capsules,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxfilters.lie import RigidTransform
+from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.rendering.geometry import convex_parts, mesh_from_trimesh
 
 STEP = 1e-7

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxfilters.lie import RigidTransform, quaternion_to_matrix
+from jaxfilters.math.lie import RigidTransform, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.rendering.depth import render_mesh
 from jaxfilters.models.rendering.geometry import mesh_from_trimesh

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.lie import quaternion_to_matrix
+from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.models.rendering.depth import render_capsules, render_ellipsoids
 from jaxfilters.models.rendering.geometry import Capsules, Ellipsoids
 

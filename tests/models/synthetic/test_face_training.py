@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.math.multilinear import numerical_ranks
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.models.face.mirroring import PAIRS_68
 from jaxfilters.models.face.multilinear import learn
@@ -18,7 +19,6 @@ from jaxfilters.models.synthetic.face_training import (
     people_of,
 )
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
-from jaxfilters.multilinear import numerical_ranks
 
 NAMES = tuple(sorted({name for mixed in ICT_EXPRESSIONS for name in mixed} | {"jawLeft"}))
 

@@ -191,8 +191,8 @@ def test_the_filter_is_fitted_to_the_model_of_the_day(face):
     np.testing.assert_array_equal(filter.params.log_likelihood.model.mean, face.model.mean)
     np.testing.assert_allclose(filter.params.mode_scale[POSE:], [6, 4, 2.5, 1.6, LEAST_DEVIATION], rtol=1e-6)
     np.testing.assert_array_equal(filter.params.mode_scale[:POSE], filters.rigid.params.mode_scale[:POSE])
-    assert filters.rigid.params.layers is None
-    assert filters.layered.params.layers is not None
+    assert filters.rigid.params.partitions is None
+    assert filters.layered.params.partitions is not None
 
 
 def test_one_frame_finds_a_head_that_has_moved_a_little(face):

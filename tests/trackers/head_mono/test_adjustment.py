@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.bundle import Adjustment, Bundle, projected
 from jaxfilters.models.face.multilinear import expression_basis, shape
 from jaxfilters.models.face.person_prior import Person

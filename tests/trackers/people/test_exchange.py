@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.exchange import CLOSE_M, LONGEST_S, after_meetings, is_meeting
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, WIDTH, PeopleConfig, nobody
 

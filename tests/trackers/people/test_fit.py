@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people.fit import Fit, _nearest_first, as_measurement, fit_people
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig

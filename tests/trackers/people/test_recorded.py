@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.gaussian import Gaussian
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed, spreads
 from jaxfilters.trackers.people.state import FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody

@@ -1,0 +1,35 @@
+"""What names of version 0.1 are called now. Kept for the releases 0.2.x, so that old code fails with an answer."""
+
+_CURRENT = {
+    "TemperToShare": "jf.AdaptiveTempering",
+    "adaptive": "jf.adaptive_diffusion (a function)",
+    "assignment": "jf.math.assignment",
+    "contaminated": "jf.robust (a function)",
+    "diffusion": "jf.math.diffusion",
+    "ensemble": "jf.ensemble_kalman (a function)",
+    "extended": "jf.extended_kalman (a function)",
+    "fixed_lag": "jf.smoothing.fixed_lag",
+    "last_axis": "private (jf._xla.last_axis)",
+    "materialize": "private (jf._xla.materialize)",
+    "layered": "jf.Partitions",
+    "least_squares": "jf.optimize",
+    "lie": "jf.math.lie",
+    "linalg": "jf.math.linalg",
+    "loglikelihood": "jf.log_evidence",
+    "marginal": "jf.rao_blackwell (a function)",
+    "mixture": "jf.gaussian_sum (a function)",
+    "multilinear": "jf.math.multilinear",
+    "parallel_in_time": "jf.smoothing",
+    "particle_smoothing": "jf.smoothing",
+    "shared_least_squares": "jf.optimize",
+    "subspace": "jf.math.incremental_pca",
+    "tensor_completion": "jf.math.tensor_completion",
+    "truncation": "jf.constraints",
+    "views": "jf.schmidt_kalman (a function)",
+}
+"""Old public name one dot below `jaxfilters` -> how to reach the same thing."""
+
+
+def current_name(name: str) -> str | None:
+    """What a public name of version 0.1 is called now, or None where it was none."""
+    return _CURRENT.get(name)

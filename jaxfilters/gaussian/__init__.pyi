@@ -1,0 +1,14 @@
+from . import arithmetic as arithmetic
+from . import belief as belief
+from . import consider as consider
+from . import constraints as constraints
+from . import ensemble as ensemble
+from . import extended as extended
+from . import gaussian_sum as gaussian_sum
+from . import linear as linear
+from . import linearize as linearize
+from . import manifold as manifold
+from . import parallel_in_time as parallel_in_time
+from . import robust as robust
+from . import sigma_point as sigma_point
+from . import smoothing as smoothing

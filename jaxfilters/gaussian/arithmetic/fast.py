@@ -1,0 +1,48 @@
+"""Kalman filter atoms on covariances, with the shortest update: one triangular inverse and one subtraction.
+
+Two thirds of the time of `joseph` at 30 states. The subtraction loses the covariance where a measurement is much
+sharper than the prediction: in float32, a million times in variance. The diagnostics then say so by a log evidence of
+`-inf`, and the measurement is left out.
+"""
+
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.gaussian.arithmetic import covariance, factor, info
+from jaxfilters.gaussian.arithmetic.covariance import noise_root as noise_root
+from jaxfilters.gaussian.arithmetic.covariance import predict as predict
+from jaxfilters.gaussian.belief import Gaussian
+
+Belief = Gaussian
+
+
+def update(
+    belief: Gaussian,
+    y: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    R: Float[Array, "m m"],
+    y_hat: Float[Array, " m"] | None = None,
+    mask: Bool[Array, " m"] | None = None,
+    lost: Float[Array, "m _"] | None = None,
+) -> tuple[Gaussian, info.KalmanInfo]:
+    """Belief after seeing `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics; as `joseph.update`.
+
+    The covariance is `P - W W^T` with `W = P H^T S^-1/2`.
+    """
+    return covariance.update(_form, belief, y, H, R, y_hat, mask, lost)
+
+
+def rts(
+    belief: Gaussian,
+    following: Gaussian,
+    F: Float[Array, "k n"],
+    Q: Float[Array, "k k"],
+    b: Float[Array, " k"] | float = 0.0,
+    lost: Float[Array, "k _"] | None = None,
+) -> Gaussian:
+    """Belief given the future too, from `following`, that of the next step given the same; as `joseph.rts`."""
+    return covariance.rts(_form, belief, following, F, Q, b, lost)
+
+
+def _form(P, H, R, gain, W):
+    del H, R, gain
+    return P - factor.outer(W, W)

@@ -1,0 +1,107 @@
+"""What a Kalman update reports, and which components of a measurement count."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.materialize import materialized
+from jaxfilters.gaussian.arithmetic import factor
+
+
+@pytree_dataclass
+class KalmanInfo:
+    """Diagnostics of one update. Nothing in it, nor in the belief beside it, is NaN unless the belief before was."""
+
+    innovation: Float[Array, "..."]
+    """(m,): `y - y_hat`; 0 for components left out: masked, certain before they were seen, dependent or invalid."""
+    innovation_root: Float[Array, "..."]
+    """(m, m), lower L with `L L^T` the covariance of the innovation; zeros for components left out."""
+    log_evidence: Float[Array, "..."]
+    """Log density of the components of y that count, given all before them. `-inf` where the model or the belief is
+    broken: a prediction or a noise that is not finite, an innovation covariance that is not positive semidefinite."""
+    nis: Float[Array, "..."]
+    """Normalised innovation squared: chi-squared with `rank` degrees of freedom."""
+    rank: Int[Array, "..."]
+    """How many components of y count: the rank of the innovation covariance over those that were seen."""
+    deficiency: Int[Array, "..."]
+    """How many components were seen and add nothing: certain beforehand, or given by those before them to rounding.
+    There the innovation covariance loses rank, and they are left out."""
+    num_invalid: Int[Array, "..."]
+    """How many components, not masked, were NaN or infinite, or had such a prediction or noise; they are left out."""
+
+
+class Rows(NamedTuple):
+    """Which rows of a measurement count, and what they say."""
+
+    deviation: Float[Array, " m"]
+    """`y - y_hat`, 0 in rows that do not count."""
+    seen: Bool[Array, " m"]
+    """Neither masked nor invalid."""
+    num_invalid: Int[Array, ""]
+    impossible: Bool[Array, ""]
+    """Whether a prediction or a noise, not the reading itself, is what is invalid."""
+
+
+def rows(
+    mean: Float[Array, " n"],
+    y: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    noise: Float[Array, "m _"],
+    y_hat: Float[Array, " m"] | None,
+    mask: Bool[Array, " m"] | None,
+) -> Rows:
+    """What of `y = y_hat + H (x - mean) + noise` can be used; `y_hat` is `H mean` unless given.
+
+    `noise` is finite in rows that are not masked, or says that they are invalid; a mean that is not finite makes all of
+    them so.
+    """
+    read = jnp.isfinite(y) if mask is None else jnp.isfinite(y) & mask
+    y_hat = factor.apply(H, mean) if y_hat is None else y_hat
+    # Products show NaN and infinity, in a fraction of the time that testing all elements takes.
+    ones = jnp.where(jnp.isfinite(mean), jnp.ones_like(mean), jnp.nan)
+    shown = factor.apply(H, ones) + factor.apply(noise, jnp.ones(noise.shape[1], noise.dtype)) + y_hat
+    seen = materialized(read & jnp.isfinite(shown))
+    wanted = jnp.ones(y.shape, bool) if mask is None else mask
+    return Rows(jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen))
+
+
+def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Any:
+    """The rows, zero where masked; all of them without a mask, none of none."""
+    if mask is None or rows is None:
+        return rows
+    return jnp.where(mask.reshape(mask.shape + (1,) * (rows.ndim - 1)), rows, 0.0)
+
+
+class Evidence(NamedTuple):
+    """What the whitened innovation says."""
+
+    log_density: Float[Array, ""]
+    nis: Float[Array, ""]
+
+
+def evidence(diagonal: Float[Array, " m"], counts: Bool[Array, " m"], whitened: Float[Array, " m"]) -> Evidence:
+    """Log density and squared length of an innovation over the components that count.
+
+    `diagonal` is that of the innovation's root, 1 for the other components; their part of `whitened` is 0.
+    """
+    nis = jnp.sum(whitened * whitened)
+    log_scale = jnp.sum(jnp.log(diagonal)) + 0.5 * math.log(2 * math.pi) * jnp.sum(counts)
+    return Evidence(-0.5 * nis - log_scale, nis)
+
+
+def report(usable: Rows, root: Float[Array, "m m"], found: Evidence) -> KalmanInfo:
+    """Diagnostics of an update, given the lower root of the innovation covariance, zero where nothing counts."""
+    counts = factor.diagonal(root) > 0
+    rank = jnp.sum(counts, dtype=jnp.int32)
+    return KalmanInfo(
+        innovation=observed(counts, usable.deviation),
+        innovation_root=root,
+        log_evidence=jnp.where(usable.impossible, -jnp.inf, found.log_density),
+        nis=found.nis,
+        rank=rank,
+        deficiency=jnp.sum(usable.seen, dtype=jnp.int32) - rank,
+        num_invalid=usable.num_invalid,
+    )

@@ -1,0 +1,157 @@
+"""Kalman filter atoms on roots of covariances: orthogonal transformations only, no subtraction anywhere.
+
+Roots may have any width: `root root^T` is the covariance.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.gaussian.arithmetic import factor, info
+from jaxfilters.gaussian.belief import GaussianRoot
+from jaxfilters.math import linalg
+
+Belief = GaussianRoot
+
+
+def predict(
+    belief: GaussianRoot,
+    F: Float[Array, "k n"],
+    root_Q: Float[Array, "k _"],
+    b: Float[Array, " k"] | float = 0.0,
+    lost: Float[Array, "k _"] | None = None,
+) -> GaussianRoot:
+    """Belief in `x' = F x + b + root_Q q`, q ~ N(0, I); `lost` is a root of more noise."""
+    parts = [linalg.matmul(F, belief.root), root_Q, *([] if lost is None else [lost])]
+    return GaussianRoot(factor.apply(F, belief.mean) + b, linalg.tria(jnp.hstack(parts)))
+
+
+def update(
+    belief: GaussianRoot,
+    y: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    root_R: Float[Array, "m _"],
+    y_hat: Float[Array, " m"] | None = None,
+    mask: Bool[Array, " m"] | None = None,
+    lost: Float[Array, "m _"] | None = None,
+) -> tuple[GaussianRoot, info.KalmanInfo]:
+    """Belief after seeing `y = y_hat + H (x - mean) + root_R r`, r ~ N(0, I), and its diagnostics.
+
+    `y_hat` is `H mean` unless given: for a nonlinear observation it is the predicted one, and H its Jacobian. `lost` is
+    a root of more noise. Components where `mask` is False are as if they were not there, whatever `y`, `y_hat` and the
+    rows of `H`, `root_R` and `lost` hold, NaN included; so are those that the diagnostics call invalid or deficient.
+    The array algorithm of T. Kailath, A. Sayed, B. Hassibi, "Linear Estimation", 2000, section 12.3. The root is not
+    triangular; it is as wide as that of `belief`, or square if that is wider.
+    """
+    noise = info.observed(mask, root_R if lost is None else jnp.hstack([root_R, lost]))
+    usable = info.rows(belief.mean, y, H, noise, y_hat, mask)
+    noise = info.observed(usable.seen, noise)
+    seen = linalg.matmul(info.observed(usable.seen, H), belief.root)
+    root, cross, posterior = _conditioned(seen, noise, belief.root)
+    # Rows are finite: what is not is the belief.
+    sound = jnp.all(jnp.isfinite(root))
+    root = jnp.where(sound, root, 0.0)
+    whitened = linalg.solve_triangular(root, usable.deviation)
+    posterior = GaussianRoot(belief.mean + factor.apply(cross, whitened), posterior)
+    counts = factor.diagonal(root) > 0
+    log_density, nis = info.evidence(jnp.where(counts, factor.diagonal(root), 1.0), counts, whitened)
+    found = info.Evidence(jnp.where(sound, log_density, -jnp.inf), nis)
+    return posterior, info.report(usable, root, found)
+
+
+def rts(
+    belief: GaussianRoot,
+    following: GaussianRoot,
+    F: Float[Array, "k n"],
+    root_Q: Float[Array, "k _"],
+    b: Float[Array, " k"] | float = 0.0,
+    lost: Float[Array, "k _"] | None = None,
+) -> GaussianRoot:
+    """Belief given the future too, from `following`, that of the next step given the same.
+
+    The next step is `x' = F x + b + root_Q q`, q ~ N(0, I). Once x' is known, x has the covariance of an update that
+    measured x'; what is not known of x' comes on top (H. Rauch, F. Tung, C. Striebel, "Maximum likelihood estimates of
+    linear dynamic systems", AIAA J. 3(8), 1965).
+    """
+    noise = root_Q if lost is None else jnp.hstack([root_Q, lost])
+    root, cross, known = _conditioned(linalg.matmul(F, belief.root), noise, belief.root)
+    gain = linalg.solve_triangular(root, cross.T, transpose=True).T
+    mean = belief.mean + factor.apply(gain, following.mean - factor.apply(F, belief.mean) - b)
+    return GaussianRoot(mean, linalg.tria(jnp.hstack([known, linalg.matmul(gain, following.root)])))
+
+
+def noise_root(
+    root_R: Float[Array, "m _"], mask: Bool[Array, " m"] | None = None, lost: Float[Array, "m _"] | None = None
+) -> Float[Array, "m m"]:
+    """Lower root of the noise and of what is lost beside it, zero where masked."""
+    return linalg.tria(info.observed(mask, root_R if lost is None else jnp.hstack([root_R, lost])))
+
+
+def _conditioned(seen, noise, state):
+    """Lower root of the innovation covariance, cross-covariance over it, root of the posterior.
+
+    `seen` and `state` are the measurement's and the state's share in the same random numbers. A row of the measurement
+    that depends on those before it gets zeros in the innovation's root.
+    """
+    m, n = seen.shape[0], state.shape[0]
+    if noise.shape[1] != m:
+        noise = linalg.tria(noise)
+    state = jnp.pad(state, ((0, 0), (0, max(0, n - state.shape[1]))))
+    seen = jnp.pad(seen, ((0, 0), (0, state.shape[1] - seen.shape[1])))
+    V, G = jnp.hstack([seen, noise]), jnp.pad(state, ((0, 0), (0, m)))
+
+    def sound(_V, _G, root, cross, posterior):
+        return root, cross, posterior
+
+    def deficient(V, G, *_):
+        # A reflection was spent on a row that needs none, and hid a direction of the state.
+        root, cross, posterior = _ordered(V, G)
+        return root, cross, jnp.pad(posterior, ((0, 0), (0, state.shape[1] - n)))
+
+    found = _reflected(V, G)[:3]
+    return jax.lax.cond(jnp.all(_independent(found[0])), sound, deficient, V, G, *found)
+
+
+def _independent(root):
+    tolerance = 4 * root.shape[0] * float(jnp.finfo(root.dtype).eps)
+    return jnp.diagonal(root) > tolerance * linalg.safe_norm(root)
+
+
+def _ordered(V, G):
+    m = V.shape[0]
+    keep = _independent(linalg.tria(V))
+    joint = linalg.tria(jnp.vstack([info.observed(keep, V), G]))
+    return joint[:m, :m], joint[m:, :m], joint[m:, m:]
+
+
+@jax.custom_jvp
+def _reflected(V, G):
+    # One reflection a row of V, and none for the state: its root need not be triangular.
+    m, width = V.shape
+    packed, scales = jnp.linalg.qr(V.T, mode="raw")
+    packed = packed.T
+    sign = jnp.where(jnp.diagonal(packed) < 0, -1.0, 1.0).astype(V.dtype)
+    turned = jax.lax.linalg.ormqr(packed, scales, G.T, transpose=True)
+    rest = jax.lax.linalg.ormqr(packed, scales, jnp.eye(width, dtype=V.dtype)[:, m:])
+    return jnp.tril(packed[:m].T * sign), turned[:m].T * sign, turned[m:].T, rest
+
+
+@_reflected.defjvp
+def _reflected_jvp(primals, tangents):
+    # With Q = [first rest], [V; G] Q = [L 0; C D]. For every skew W, dQ = Q W gives a change of the right side with the
+    # right outer product; the W taken keeps L lower and the zero block zero.
+    (V, G), (dV, dG) = primals, tangents
+    L, C, D, rest = _reflected(V, G)
+    independent = jnp.where(_independent(L)[:, None], L, jnp.eye(L.shape[0], dtype=L.dtype))
+    solve = lambda b, trans=0: lapack_solve_triangular(independent, b, lower=True, trans=trans)
+    first = solve(V).T
+    turned = linalg.matmul(dV, first)
+    upper = jnp.triu(solve(turned), 1)
+    skew = upper.T - upper
+    dL = jnp.tril(turned + linalg.matmul(L, skew))
+    unseen = G - factor.outer(C, first)
+    dC = linalg.matmul(dG, first) + linalg.matmul(C, skew) + solve(factor.outer(dV, unseen)).T
+    hidden = solve(linalg.matmul(dV, rest))
+    dD = linalg.matmul(dG, rest) - linalg.matmul(C, hidden)
+    return (L, C, D, rest), (dL, dC, dD, -linalg.matmul(first, hidden))

@@ -1,0 +1,10 @@
+from .least_squares import BoxAdjoint as BoxAdjoint
+from .least_squares import BoxLevenbergMarquardt as BoxLevenbergMarquardt
+from .least_squares import bounds_of as bounds_of
+from .least_squares import cauchy as cauchy
+from .least_squares import covariance as covariance
+from .least_squares import huber as huber
+from .shared_least_squares import SharedSolution as SharedSolution
+from .shared_least_squares import Split as Split
+from .shared_least_squares import schur as schur
+from .shared_least_squares import solve_shared as solve_shared

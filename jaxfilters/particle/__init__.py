@@ -1,0 +1,5 @@
+"""Filters whose belief is a set of weighted particles."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,11 @@
+from . import adaptive as adaptive
+from . import bootstrap as bootstrap
+from . import differentiable_resampling as differentiable_resampling
+from . import fixed_lag as fixed_lag
+from . import guided as guided
+from . import partitioned as partitioned
+from . import proposals as proposals
+from . import rao_blackwell as rao_blackwell
+from . import resampling as resampling
+from . import sharding as sharding
+from . import smoothing as smoothing

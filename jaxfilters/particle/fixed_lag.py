@@ -1,0 +1,197 @@
+"""Smoothing while frames arrive: beliefs about the state some frames ago, given everything until now.
+
+Both wrap a filter and are filters, with the infos of the inner one. In the first frames, when the state of so many
+frames ago does not exist, the belief is about the state before the first observation.
+"""
+
+from dataclasses import field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
+from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
+from jaxfilters.particle.differentiable_resampling import Transport
+from jaxfilters.typing import AnyKey
+
+
+class LineageState(NamedTuple):
+    """A particle filter's state, and where its particles have been."""
+
+    inner: Any
+    window: PyTree
+    """Leaves `(lag + 1, ..., n)`: the lineages of the particles, the oldest frame first, the newest last."""
+
+    @property
+    def delayed(self) -> PyTree:
+        """Particles `lag` frames ago, leaves `(..., n)`; their weights are those of the particles now."""
+        return jax.tree.map(lambda leaf: leaf[0], self.window)
+
+
+class GaussianLagState(NamedTuple):
+    """A Gaussian filter's belief, and those before it."""
+
+    belief: Belief
+    window: Belief
+    """Beliefs of the last `lag + 1` frames, each given the past, the oldest first."""
+    controls: PyTree
+    """Of the same frames."""
+    frames: Int[Array, ""]
+    """How many there were."""
+    delayed: Belief
+    """The state `lag` frames ago, given everything until now."""
+
+
+@pytree_dataclass
+class FixedLag:
+    """Parameters of a fixed-lag smoother."""
+
+    inner: Filter
+    control: PyTree
+    lag: int = field(metadata={"static": True})
+
+
+def fixed_lag(inner: Filter, lag: int) -> Filter:
+    """Fixed-lag smoother by lineages of any particle filter whose state has `particles`, `log_weights` and `ancestors`.
+
+    So have those of `bootstrap`, `rao_blackwell` and `adaptive_particle_filter`; of `guided`, the state's `ensemble`
+    has them. The shorter the lag, the more different particles are left; five to fifty frames are usual (G. Kitagawa,
+    "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models", 1996, section 4). The state is a
+    `LineageState`.
+
+    Raises:
+        ValueError: If `lag < 1`; if `inner` resamples by transport, whose particles are averages and have no ancestors;
+            or, when it runs, if the state of `inner` is another one.
+    """
+    _check(lag)
+    if any(isinstance(leaf, Transport) for leaf in _schemes(inner.params)):
+        raise ValueError("inner must choose ancestors when it resamples; particles moved by transport have none.")
+    return Filter(FixedLag(inner, None, lag), _begin_lineages, _predict_lineages, _update_lineages)
+
+
+def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
+    """Fixed-lag Rauch-Tung-Striebel smoother of a filter made by `extended`; the state is a `GaussianLagState`.
+
+    Args:
+        inner: The filter.
+        lag: How many frames the smoothed belief is behind, at least 1; each frame costs that many steps back.
+        control: Any control, where predictions have them: its shapes are needed before the first one arrives.
+
+    Raises:
+        ValueError: If `inner` is another kind of filter, or `lag < 1`.
+    """
+    _check(lag)
+    if not isinstance(inner.params, ExtendedKalman):
+        raise ValueError(f"inner must be made by extended; its parameters are {type(inner.params).__name__}.")
+    return Filter(FixedLag(inner, control, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
+
+
+def _check(lag: int) -> None:
+    if not isinstance(lag, int) or lag < 1:
+        raise ValueError(f"lag must be an integer of at least 1; got {lag!r}.")
+
+
+def _begin_lineages(model: FixedLag, key: AnyKey) -> LineageState:
+    inner = model.inner.init(model.inner.params, key)
+    return LineageState(inner, _repeated(_ensemble(inner).particles, model.lag + 1))
+
+
+def _predict_lineages(model: FixedLag, key: AnyKey, state: LineageState, control: PyTree) -> LineageState:
+    inner = model.inner.predict(model.inner.params, key, state.inner, control)
+    ensemble = _ensemble(inner)
+    return LineageState(inner, _pushed(_followed(state.window, ensemble.ancestors), ensemble.particles))
+
+
+def _update_lineages(
+    model: FixedLag, key: AnyKey, state: LineageState, observation: PyTree
+) -> tuple[LineageState, PyTree]:
+    before = _ensemble(state.inner).ancestors
+    inner, info = model.inner.update(model.inner.params, key, state.inner, observation)
+    ensemble = _ensemble(inner)
+
+    def children_of_the_same() -> PyTree:
+        # Layered filters resample in their update, too: any sibling has the same past.
+        child = jnp.zeros_like(before).at[before].set(jnp.arange(before.size, dtype=before.dtype))
+        return _followed(state.window, child[ensemble.ancestors])
+
+    stayed = jnp.all(ensemble.ancestors == before)
+    window = jax.lax.cond(stayed, lambda: state.window, children_of_the_same)
+    return LineageState(inner, _renewed(window, ensemble.particles)), info
+
+
+def _ensemble(state: Any) -> Any:
+    """What holds the particles of a filter's state."""
+    ensemble = getattr(state, "ensemble", state)
+    if not all(hasattr(ensemble, name) for name in ("particles", "log_weights", "ancestors")):
+        raise ValueError(f"inner must have particles, log_weights and ancestors in its state; got {type(state)}.")
+    return ensemble
+
+
+def _schemes(params: Any) -> list:
+    """How a filter resamples, or the one inside it."""
+    return [getattr(part, "scheme", None) for part in (params, getattr(params, "marginal", None))]
+
+
+def _followed(window: PyTree, ancestors: Int[Array, " n"]) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), window)
+
+
+def _begin_beliefs(model: FixedLag, key: AnyKey) -> GaussianLagState:
+    belief = model.inner.init(model.inner.params, key)
+    window, controls = (
+        _repeated(belief, model.lag + 1),
+        _repeated(jax.tree.map(jnp.asarray, model.control), model.lag + 1),
+    )
+    return GaussianLagState(belief, window, controls, jnp.zeros((), jnp.int32), belief)
+
+
+def _predict_beliefs(model: FixedLag, key: AnyKey, state: GaussianLagState, control: PyTree) -> GaussianLagState:
+    got, wanted = (str(jax.tree.structure(tree)) for tree in (model.control, control))
+    if got != wanted:
+        raise ValueError(f"control of fixed_lag_rts must be like those of the predictions, {wanted}; got {got}.")
+    belief = model.inner.predict(model.inner.params, key, state.belief, control)
+    window, controls = _pushed(state.window, belief), _pushed(state.controls, control)
+    return _smoothed(model, GaussianLagState(belief, window, controls, state.frames + 1, state.delayed))
+
+
+def _update_beliefs(
+    model: FixedLag, key: AnyKey, state: GaussianLagState, observation: PyTree
+) -> tuple[GaussianLagState, PyTree]:
+    belief, info = model.inner.update(model.inner.params, key, state.belief, observation)
+    return _smoothed(model, state._replace(belief=belief, window=_renewed(state.window, belief))), info
+
+
+def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
+    extended = model.inner.params
+    # Before the first frame there are only copies of the prior, which nothing moved.
+    exists = jnp.arange(model.lag) >= model.lag - state.frames
+
+    def step(following: Belief, inputs: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
+        belief, control, exists = inputs
+        origin, ahead = linear_transition(extended, belief, control)
+        known = to_tangent(extended.manifold, origin, following)
+        noise = noise_of_step(extended, control)
+        delta = extended.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        smoothed = retract_belief(extended.manifold, belief.mean, delta)
+        return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
+
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], state.window)
+    controls = jax.tree.map(lambda leaf: leaf[1:], state.controls)
+    delayed, _ = jax.lax.scan(step, state.belief, (earlier, controls, exists), reverse=True)
+    return state._replace(delayed=delayed)
+
+
+def _repeated(tree: PyTree, count: int) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), tree)
+
+
+def _pushed(window: PyTree, newest: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf, new: jnp.concatenate([leaf[1:], new[None]]), window, newest)
+
+
+def _renewed(window: PyTree, newest: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf, new: leaf.at[-1].set(new), window, newest)
