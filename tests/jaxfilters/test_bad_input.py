@@ -25,9 +25,10 @@ class Case(NamedTuple):
 
 # Gaussian filters.
 PRIOR = jf.Gaussian(jnp.zeros(2), jnp.eye(2))
+Q, R = 0.1 * jnp.eye(2), jnp.eye(1)
 
 
-def extended(transition=lambda x, u: x, Q=0.1 * jnp.eye(2), observe=lambda x: x[:1], R=jnp.eye(1), **options):
+def extended(transition=lambda x, u: x, Q=Q, observe=lambda x: x[:1], R=R, **options):
     return jf.extended_kalman(PRIOR, transition, Q, observe, R, **options)
 
 
