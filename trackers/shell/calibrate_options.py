@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_number
+
 Pair = tuple[int, int]
 
 
@@ -64,8 +66,8 @@ def _add_stereo(sources: Any, pair: Callable[[str], Pair]) -> None:
 
 def _add_board(parser: argparse.ArgumentParser, pair: Callable[[str], Pair]) -> None:
     parser.add_argument("--squares", type=pair, required=True, metavar="COLUMNSxROWS", help="of the board, as in 7x5")
-    parser.add_argument("--square-m", type=float, required=True, metavar="METRES", help="side of a square")
-    parser.add_argument("--marker-m", type=float, required=True, metavar="METRES", help="side of a marker")
+    parser.add_argument("--square-m", type=positive_number, required=True, metavar="METRES", help="side of a square")
+    parser.add_argument("--marker-m", type=positive_number, required=True, metavar="METRES", help="side of a marker")
     parser.add_argument(
         "--dictionary", default="DICT_4X4_50", metavar="NAME", help="of the markers (default: %(default)s)"
     )

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import image_size, positive_number, seed
 from jaxfilters.trackers.shell.calibrate_options import add_calibrate
 from jaxfilters.trackers.shell.compiled import keep_compiled_programs
 from jaxfilters.trackers.shell.devices import use_all_cores
@@ -130,34 +131,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_articulated_options(articulated)
 
-    add_people(what, _seed)
-    add_head(what, _seed)
-    add_mono(what, _seed)
-    add_fingertips(what, _seed)
+    add_people(what, seed)
+    add_head(what, seed)
+    add_mono(what, seed)
+    add_fingertips(what, seed)
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
     demo.set_defaults(input=None, resume=False, overwrite=True)
     _add_filter_options(demo)
 
-    add_calibrate(commands, _image_size)
-    add_fit(commands, _seed)
-    add_recognise(commands, _seed)
+    add_calibrate(commands, image_size)
+    add_fit(commands, seed)
+    add_recognise(commands, seed)
     commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
     return parser
-
-
-def _seed(text: str) -> int:
-    if not -(2**63) <= int(text) < 2**63:
-        raise argparse.ArgumentTypeError(f"a seed must fit into 64 bits; got {text}")
-    return int(text)
-
-
-def _image_size(text: str) -> tuple[int, int]:
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 640x480; got {text}")
-    return int(width), int(height)
 
 
 def _add_recording(parser: argparse.ArgumentParser, what: str) -> None:
@@ -171,7 +159,7 @@ def _add_recording(parser: argparse.ArgumentParser, what: str) -> None:
 
 def _add_common_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
-    parser.add_argument("--seed", type=_seed, metavar="SEED", help="random seed")
+    parser.add_argument("--seed", type=seed, metavar="SEED", help="random seed")
     parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
 
 
@@ -187,16 +175,19 @@ def _add_articulated_options(parser: argparse.ArgumentParser) -> None:
         "--gate", type=float, metavar="SIGMAS", help="leave out features that are farther off (default: 5; 0: never)"
     )
     parser.add_argument(
-        "--image-size", type=_image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
+        "--image-size", type=image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
     )
     parser.add_argument(
         "--noise",
-        type=float,
+        type=positive_number,
         metavar="PIXELS",
         help="standard deviation of a keypoint's coordinate (default: 3 percent of the hand's diagonal)",
     )
     parser.add_argument(
-        "--fps", type=float, metavar="FPS", help="frames per second of a recording without times (default: 30)"
+        "--fps",
+        type=positive_number,
+        metavar="FPS",
+        help="frames per second of a recording without times (default: 30)",
     )
     _add_common_options(parser)
 
@@ -207,7 +198,7 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--particles", type=int, dest="num_particles", metavar="N", help="number of particles")
     parser.add_argument("--stride", type=int, metavar="PIXELS", help="compare every PIXELS-th row and column")
     parser.add_argument(
-        "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
+        "--scale", type=positive_number, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
     )
     parser.add_argument(
         "--surface", choices=("capsules", "mesh"), help="what particles are rendered as (default: capsules)"

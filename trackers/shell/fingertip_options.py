@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_number
+
 
 def add_fingertips(what: Any, seed: Callable[[str], int]) -> None:
     """Add the command to the parser's `what`; `seed` reads random seeds."""
@@ -34,6 +36,6 @@ def add_fingertips(what: Any, seed: Callable[[str], int]) -> None:
         help="the symbols; `jaxfilters fit gestures` makes such a file (default: twelve shapes)",
     )
     tips.add_argument("--seed", type=seed, default=0, metavar="SEED", help="of the synthetic hand")
-    tips.add_argument("--fps", type=float, metavar="FPS", help="of the recording, in place of what it says")
-    tips.add_argument("--seconds", type=float, metavar="S", help="stop after so long, as with live cameras")
+    tips.add_argument("--fps", type=positive_number, metavar="FPS", help="of the recording, in place of what it says")
+    tips.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")
     tips.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")

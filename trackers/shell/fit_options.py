@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_number
 from jaxfilters.trackers.shell.gesture_options import add_fit_gestures
 
 IDENTITIES, EXPRESSIONS, PEOPLE = 15, 5, 200
@@ -62,7 +63,9 @@ def _add_noise(what: Any, seed: Callable[[str], int]) -> None:
         help=".npz with points (frames, points, coordinates), or CSV with id, frame or time_s, and x, y (z), as the "
         "trackers write it; without it, synthetic tracks",
     )
-    noise.add_argument("--fps", type=float, default=30.0, help="frames a second, without times (default: %(default)s)")
+    noise.add_argument(
+        "--fps", type=positive_number, default=30.0, help="frames a second, without times (default: %(default)s)"
+    )
     noise.add_argument("--out", type=Path, metavar="NOISE.json", help="a file to write")
     noise.add_argument(
         "--seed", type=seed, default=0, metavar="SEED", help="of synthetic tracks (default: %(default)s)"

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_integer, positive_number
+
 
 def add_head(what: Any, seed: Callable[[str], int]) -> None:
     """Add the command to the parser's `what`; `seed` reads random seeds.
@@ -46,8 +48,8 @@ def add_head(what: Any, seed: Callable[[str], int]) -> None:
         choices=("cascades", "mediapipe"),
         help="what finds the landmarks at the start: OpenCV's cascades (default) or MediaPipe's face mesh",
     )
-    head.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 1000)")
+    head.add_argument("--num-particles", type=positive_integer, metavar="N", help="number of particles (default: 1000)")
     head.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
-    head.add_argument("--fps", type=float, metavar="FPS", help="of the recordings, in place of what they say")
-    head.add_argument("--seconds", type=float, metavar="S", help="stop after so long, as with live cameras")
+    head.add_argument("--fps", type=positive_number, metavar="FPS", help="of the recordings, in place of what they say")
+    head.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")
     head.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")

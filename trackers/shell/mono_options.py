@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_integer, positive_number
+
 
 def add_mono(what: Any, seed: Callable[[str], int]) -> None:
     """Add the command to the parser's `what`; `seed` reads random seeds.
@@ -51,7 +53,7 @@ def add_mono(what: Any, seed: Callable[[str], int]) -> None:
     )
     mono.add_argument(
         "--eyes-apart-mm",
-        type=float,
+        type=positive_number,
         metavar="MM",
         help="distance between the pupils, if it is known: without it, size and distance are known to some 3 %%",
     )
@@ -67,8 +69,8 @@ def add_mono(what: Any, seed: Callable[[str], int]) -> None:
 
 def _add_run(mono: argparse.ArgumentParser, seed: Callable[[str], int]) -> None:
     """What is not about the face."""
-    mono.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 750)")
+    mono.add_argument("--num-particles", type=positive_integer, metavar="N", help="number of particles (default: 750)")
     mono.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
-    mono.add_argument("--fps", type=float, metavar="FPS", help="of the recording, in place of what it says")
-    mono.add_argument("--seconds", type=float, metavar="S", help="stop after so long, as with live cameras")
+    mono.add_argument("--fps", type=positive_number, metavar="FPS", help="of the recording, in place of what it says")
+    mono.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")
     mono.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.shell.argument_types import positive_integer, positive_number
+
 
 def add_people(what: Any, seed: Callable[[str], int]) -> None:
     """Add the command to the parser's `what`; `seed` reads random seeds."""
@@ -31,15 +33,13 @@ def add_people(what: Any, seed: Callable[[str], int]) -> None:
         default="median",
         help="how people are told from the room (default: %(default)s)",
     )
-    people.add_argument("--capacity", type=_positive, metavar="N", help="people at a time, at most (default: 32)")
-    people.add_argument("--fps", type=float, metavar="FPS", help="of the recordings, in place of what they say")
-    people.add_argument("--seconds", type=float, metavar="S", help="stop after so long, as with live cameras")
+    people.add_argument(
+        "--capacity", type=positive_integer, metavar="N", help="people at a time, at most (default: 32)"
+    )
+    people.add_argument(
+        "--fps", type=positive_number, metavar="FPS", help="of the recordings, in place of what they say"
+    )
+    people.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")
     people.add_argument("--mot", action="store_true", help="write tracks_mot.txt as well (MOT challenge)")
     people.add_argument("--seed", type=seed, metavar="SEED", help="of the synthetic room")
     people.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a positive number; got {text}")
-    return int(text)

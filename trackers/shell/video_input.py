@@ -1,5 +1,6 @@
 """Where images come from: video files, folders of images, and live cameras; several of them on one clock."""
 
+import math
 import re
 import threading
 import time
@@ -50,8 +51,10 @@ def open_video(place: str, *, fps: float | None = None) -> VideoSource:
         fps: Frames per second of a recording, in place of what it says of itself.
 
     Raises:
-        InputError: nothing there, or nothing that OpenCV can read.
+        InputError: nothing there, nothing that OpenCV can read, or a rate that is not finite and positive.
     """
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise InputError(f"fps must be finite and above 0; got {fps}.")
     if place.isdecimal():
         return LiveCamera(int(place))
     path = Path(place)
@@ -69,7 +72,7 @@ class VideoFile:
         self.name, self._path, self._is_stamped = str(path), path, fps is None
         capture = self._open()
         self.image_size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-        self.fps = fps or float(capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self.fps = fps or _rate(float(capture.get(cv2.CAP_PROP_FPS)))
         self.frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
         self._trouble: str | None = None
@@ -105,6 +108,11 @@ class VideoFile:
 
     def trouble(self) -> str | None:
         return self._trouble
+
+
+def _rate(claimed: float) -> float:
+    """Frames per second as a file claims them, or the usual ones where it claims none or nonsense."""
+    return claimed if math.isfinite(claimed) and claimed > 0 else DEFAULT_FPS
 
 
 class _Stamps:
