@@ -15,13 +15,14 @@ from jaxfilters.models.synthetic.strokes import drawn, tracked
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.gesture_files import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
 from jaxfilters.trackers.shell.gesture_options import TRIALS, WRITERS
+from jaxfilters.trackers.shell.head_run import warn
 from jaxfilters.trackers.shell.results import OutputError
 from jaxfilters.trackers.shell.stroke_files import StrokeSet, read_strokes
 from jaxfilters.trackers.shell.track_command import refusing
 
 COLUMNS = ("stroke", "symbol", "confidence", "lead_nats", "label")
 """Of a table: the symbol is empty where a stroke is rejected; the label is what the data call it."""
-_MOST_ROWS = 40
+_MOST_ROWS, _MOST_WARNINGS = 40, 5
 _SHOWN_TRIALS = 2
 
 
@@ -81,7 +82,7 @@ def recognise(options: argparse.Namespace) -> str:
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
-    strokes = read_strokes(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
+    strokes = _read(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
     found = refusing(lambda: _judged(file, strokes, options.margin))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
@@ -96,9 +97,18 @@ def recognise(options: argparse.Namespace) -> str:
     return "\n".join([*lines, _summary(rows), *([f"table in {options.out}"] if options.out else [])])
 
 
+def _read(path: Path) -> StrokeSet:
+    strokes = read_strokes(path)
+    for text in strokes.warnings[:_MOST_WARNINGS]:
+        warn(text)
+    if len(strokes.warnings) > _MOST_WARNINGS:
+        warn(f"{path}: {len(strokes.warnings) - _MOST_WARNINGS} more such segments")
+    return strokes
+
+
 def _examples(options: argparse.Namespace) -> tuple[StrokeSet, str]:
     if options.data:
-        return read_strokes(options.data), options.data.name
+        return _read(options.data), options.data.name
     return _drawn(WRITERS, TRIALS, options.seed), "symbols drawn by the generator"
 
 

@@ -50,6 +50,8 @@ class StrokeSet(NamedTuple):
     people: tuple[str, ...]
     """Who drew each; empty where it is not known."""
     dimensions: int
+    warnings: tuple[str, ...] = ()
+    """What was left out, a sentence each."""
 
     @property
     def pieces(self) -> int:
@@ -70,10 +72,12 @@ def read_strokes(path: Path) -> StrokeSet:
     if path.suffix.lower() == ".npz":
         return _of_npz(path)
     if path.suffix.lower() in SUFFIXES:
-        found = read_unipen(path)
+        found, warnings = read_unipen(path)
+        if not found:
+            raise InputError(f"{path}: no segment holds any points.")
         ids = tuple(f"{path.stem} {i}" for i in range(len(found)))
         strokes = tuple((pieces, 1) for pieces, _ in found)
-        return StrokeSet(strokes, ids, tuple(label for _, label in found), ("",) * len(found), 2)
+        return StrokeSet(strokes, ids, tuple(label for _, label in found), ("",) * len(found), 2, tuple(warnings))
     return _of_rows(_rows(path, ("stroke",)), path)
 
 

@@ -160,10 +160,66 @@ UNIPEN = """.VERSION 1.0
 .PEN_DOWN
 2 2 5
 3 3 6
-.SEGMENT PAGE 0-3 ? "all"
-.SEGMENT DIGIT 0-2 GOOD "4"
-.SEGMENT DIGIT 3:0-3:1 ? "7"
+.SEGMENT PAGE 0-2 ? "all"
+.SEGMENT DIGIT 0-1 GOOD "4"
+.SEGMENT DIGIT 2:0-2:1 ? "7"
 """
+
+
+def test_segments_of_parts_and_without_points(tmp_path):
+    """Pen-downs without points have no number; pen-ups have none either."""
+    file = tmp_path / "parts.dat"
+    points = ".PEN_DOWN\n0 0\n1 0\n2 0\n.PEN_UP\n.PEN_DOWN\n.PEN_UP\n7 7\n.PEN_DOWN\n5 5\n6 6\n"
+    file.write_text(points + '.SEGMENT S 0:1-1:0 OK "a \\"b\\""\n.SEGMENT S 1:1 OK "c"\n.SEGMENT S 0:7-0:9 OK "none"\n')
+    found = read_strokes(file)
+    assert found.labels == ('a "b"', "c")
+    first, second = (pieces for pieces, _ in found.strokes)
+    np.testing.assert_array_equal(first[0], [(1, 0), (2, 0)])
+    np.testing.assert_array_equal(first[1], [(5, -5)])
+    np.testing.assert_array_equal(second[0], [(6, -6)])
+    assert len(found.warnings) == 1
+    assert "line 14: the segment holds no points" in found.warnings[0]
+
+
+def test_included_files_are_found_as_in_the_distribution(tmp_path):
+    (tmp_path / "data" / "1a" / "gmd").mkdir(parents=True)
+    (tmp_path / "include" / "gmd").mkdir(parents=True)
+    file = tmp_path / "data" / "1a" / "gmd" / "a.dat"
+    file.write_text('.INCLUDE gmd/a.dat\n.SEGMENT S 1 OK "2"\n')
+    (tmp_path / "include" / "gmd" / "a.dat").write_text(".PEN_DOWN\n0 0\n.PEN_UP\n.PEN_DOWN\n3 4\n5 6\n.PEN_UP\n")
+    ((pieces, label),) = read_unipen(file).strokes
+    assert label == "2"
+    np.testing.assert_array_equal(pieces[0], [(3, -4), (5, -6)])
+    (tmp_path / "include" / "gmd" / "a.dat").write_text(".INCLUDE gmd/a.dat\n")
+    with pytest.raises(InputError, match="neither beside the file nor"):
+        read_unipen(file)
+    (tmp_path / "data" / "1a" / "gmd" / "b.dat").write_text(".INCLUDE a.dat\n")
+    file.write_text(".INCLUDE b.dat\n")
+    with pytest.raises(InputError, match="includes itself"):
+        read_unipen(file)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("donor", ["art", "gmd"])
+def test_files_of_the_distribution_give_the_strokes_that_others_read_from_them(data_dir, donor):
+    """Those of a separate parser, point for point, in the order of the file."""
+    with np.load(data_dir / "unipen_digits" / "unipen_1a_digits.npz") as parsed:
+        arrays = dict(parsed)
+    ends = np.cumsum(arrays["stroke_len"])
+    pieces = np.split(arrays["xy"], ends[:-1])
+    firsts = np.cumsum(arrays["n_strokes"]) - arrays["n_strokes"]
+    checked = 0
+    for file in sorted((data_dir / "unipen_files" / "data" / "1a" / donor).glob("*.dat")):
+        found = read_unipen(file).strokes
+        own = np.flatnonzero((arrays["donor"] == donor) & (arrays["srcfile"] == f"{donor}/{file.name}"))
+        assert [label for _, label in found] == [str(arrays["label"][i]) for i in own]
+        for (strokes, _), i in zip(found, own, strict=True):
+            expected = pieces[firsts[i] : firsts[i] + arrays["n_strokes"][i]]
+            assert len(strokes) == len(expected)
+            for stroke, other in zip(strokes, expected, strict=True):
+                np.testing.assert_array_equal(stroke * [1, -1], other)
+            checked += 1
+    assert checked > 100
 
 
 def test_segments_of_unipen_become_strokes_with_y_down(tmp_path):
@@ -174,11 +230,16 @@ def test_segments_of_unipen_become_strokes_with_y_down(tmp_path):
     np.testing.assert_array_equal(found.strokes[0][0][0], [(0, 0), (5, -7)])
     np.testing.assert_array_equal(found.strokes[1][0][0], [(2, -2), (3, -3)])
     file.write_text(UNIPEN.partition(".SEGMENT")[0])
-    ((pieces, label),) = read_unipen(file)
+    ((pieces, label),) = read_unipen(file).strokes
     assert (len(pieces), label) == (3, "")
     for text, word in (
-        (UNIPEN + '.SEGMENT DIGIT 9 ? "1"\n', "line 17: expected components from 0 to 3"),
-        (UNIPEN + ".INCLUDE other.dat\n", "another file"),
+        (UNIPEN + '.SEGMENT DIGIT 9 ? "1"\n', "line 17: expected components from 0 to 2"),
+        (UNIPEN + '.SEGMENT DIGIT 0-999999999 ? "1"\n', "line 17: expected components from 0 to 2"),
+        (UNIPEN + '.SEGMENT DIGIT 0-99999999999999 ? "1"\n', "line 17: expected components from 0 to 2"),
+        (UNIPEN + '.SEGMENT DIGIT 2-1 ? "1"\n', "line 17: expected components from 0 to 2"),
+        (UNIPEN + ".INCLUDE other.dat\n", "line 17: other.dat is neither beside the file nor in a folder"),
+        (UNIPEN + ".INCLUDE ../other.dat\n", "must be named below its folder"),
+        (UNIPEN.replace("5 7 2", "5 nan 2"), "line 6: expected 3 numbers"),
         (UNIPEN.replace("5 7 2", "5 x"), "line 6: expected 3 numbers"),
         (".COORD X T\n", "X and Y"),
         ("hello\n", "without .PEN_DOWN"),
