@@ -198,7 +198,7 @@ def _add_filter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--particles", type=int, dest="num_particles", metavar="N", help="number of particles")
     parser.add_argument("--stride", type=int, metavar="PIXELS", help="compare every PIXELS-th row and column")
     parser.add_argument(
-        "--scale", type=positive_number, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
+        "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
     )
     parser.add_argument(
         "--surface", choices=("capsules", "mesh"), help="what particles are rendered as (default: capsules)"

@@ -1,6 +1,6 @@
 """Depth recordings on disk: folders of PNG images and `.npz` files, read one frame at a time."""
 
-import json
+import math
 import zipfile
 import zlib
 from pathlib import Path
@@ -11,7 +11,9 @@ import numpy as np
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.depth_sequence import DepthSequence
+from jaxfilters.trackers.io.npz import names_in_npz, read_array_header, read_npz
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.json_files import read_json, refuse_unknown
 
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "K", "depth_scale", "timestamps_us", "fps"}
 _SHORTEST_STEP_US = 1000
@@ -76,14 +78,8 @@ def _read_camera_json(file: Path) -> dict[str, Any]:
     wanted = 'expected {"fx", "fy", "cx", "cy"} or {"K"}, in pixels'
     if not file.exists():
         raise InputError(f"{file}: missing; {wanted}.")
-    try:
-        settings = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not JSON ({error}); {wanted}.") from None
-    if not isinstance(settings, dict):
-        raise InputError(f"{file}: {wanted}; got a {type(settings).__name__}.")
-    if unknown := set(settings) - _CAMERA_KEYS:
-        raise InputError(f"{file}: unknown entries {sorted(unknown)}; known are {sorted(_CAMERA_KEYS)}.")
+    settings = read_json(file, wanted)
+    refuse_unknown(settings, _CAMERA_KEYS, file)
     return settings
 
 
@@ -135,14 +131,10 @@ def _read_png(file: Path, shape: tuple[int, int] | None) -> np.ndarray:
 
 
 def _open_npz(file: Path, fps: float) -> DepthSequence:
-    try:
-        with file.open("rb") as content, np.load(content, allow_pickle=False) as arrays:
-            small = {name: arrays[name] for name in ("K", "t_us", "joints_mm") if name in arrays.files}
-            missing = {"depth_mm", "K"} - set(arrays.files)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: not a complete .npz file ({error}).") from None
-    if missing:
-        raise InputError(f"{file}: {sorted(missing)} missing; expected depth_mm (T, H, W) uint16 and K (3, 3).")
+    wanted = "expected depth_mm (T, H, W) uint16 and K (3, 3)"
+    if missing := {"depth_mm", "K"} - set(names_in_npz(file, wanted)):
+        raise InputError(f"{file}: {sorted(missing)} missing; {wanted}.")
+    small = read_npz(file, wanted, ("K", "t_us", "joints_mm"))
     depth = _NpzFrames(file)
     frames, rows, cols = depth.shape
     times_s = _from_microseconds(small["t_us"], frames, f"{file}: t_us") if "t_us" in small else np.arange(frames) / fps
@@ -159,17 +151,19 @@ class _NpzFrames:
 
     def __init__(self, file: Path):
         self._file = file
-        self._stream = zipfile.ZipFile(file).open("depth_mm.npy")  # noqa: SIM115 - open as long as the recording is
+        archive = zipfile.ZipFile(file)
+        size = archive.getinfo("depth_mm.npy").file_size
+        self._stream = archive.open("depth_mm.npy")
         try:
-            version = np.lib.format.read_magic(self._stream)
-            header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-            self.shape, fortran_order, dtype = header(self._stream)
-        except (ValueError, KeyError, EOFError) as error:
+            self.shape, fortran_order, dtype = read_array_header(self._stream)
+        except (ValueError, EOFError) as error:
             raise InputError(f"{file}: depth_mm is not a NumPy array ({error}).") from None
         if len(self.shape) != 3 or dtype != np.uint16 or fortran_order:
             order = " in Fortran order" if fortran_order else ""
             raise InputError(f"{file}: depth_mm must be (T, H, W) uint16; got {self.shape} {dtype}{order}.")
         self._dtype, self._first_byte = dtype, self._stream.tell()
+        if self._first_byte + 2 * math.prod(self.shape) != size:
+            raise InputError(f"{file}: depth_mm claims shape {self.shape}, and holds {size} bytes.")
 
     def read(self, index: int) -> np.ndarray:
         size = self.shape[1] * self.shape[2] * self._dtype.itemsize

@@ -18,9 +18,10 @@ import numpy as np
 
 from jaxfilters.models.face.mirroring import Pairs, mirror_map
 from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays, read_header
+from jaxfilters.trackers.shell.npz_files import read_header
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters face model", 1
@@ -100,7 +101,7 @@ def default_face_model() -> FaceModelFile:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = read_arrays(path, _WANTED)
+    arrays = read_npz(path, _WANTED)
     if missing := [name for name in (*_ARRAYS, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
     return arrays, read_header(arrays, path, FORMAT, VERSION)

@@ -1,7 +1,5 @@
 """Recordings of features on disk: `.npz` files of features or keypoints; what detectors of hands write is passed on."""
 
-import zipfile
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxfilters.trackers.feature_sequence import FeatureSequence, Start, features_named, from_keypoints
+from jaxfilters.trackers.io.npz import names_in_npz, read_npz
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell import keypoint_files
 
@@ -128,16 +127,8 @@ def _features(
 
 def _read(file: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """The arrays that mean something here, and the names of all."""
-    try:
-        with file.open("rb") as content:
-            archive = np.load(content, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{file}: not a complete .npz file (a single array).")
-            return {name: archive[name] for name in _NAMES if name in archive.files}, list(archive.files)
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{file}: not a complete .npz file ({error}).") from None
+    wanted = "expected an .npz with keypoints (T, 21, 2) or features (T, rows)"
+    return read_npz(file, wanted, _NAMES), names_in_npz(file, wanted)
 
 
 def _numbers(file: Path, arrays: dict[str, np.ndarray], name: str) -> np.ndarray:

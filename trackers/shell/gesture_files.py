@@ -21,9 +21,10 @@ from jaxfilters import hmm
 from jaxfilters.hmm import HiddenMarkovModel
 from jaxfilters.models.gesture.codes import MOST_TIPS, STILL
 from jaxfilters.models.gesture.symbols import Symbols
+from jaxfilters.trackers.io.json_text import parse_json
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters symbols", 1
@@ -131,11 +132,8 @@ def default_symbols() -> SymbolsFile:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = read_arrays(path, _WANTED)
-    try:
-        header = json.loads(str(arrays["header"]))
-    except (KeyError, json.JSONDecodeError):
-        raise InputError(f"{path}: without a header in JSON; {_WANTED}.") from None
+    arrays = read_npz(path, _WANTED)
+    header = parse_json(str(arrays.get("header", "")), f"{path}: header", _WANTED)
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f'{path}: header must say format "{FORMAT}"; {_WANTED}.')
     if header.get("version") != VERSION:

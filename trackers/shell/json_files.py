@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfilters.trackers.io.json_text import read_json_text
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.results import OutputError
 
@@ -16,12 +17,7 @@ def read_json(path: Path, wanted: str) -> dict[str, Any]:
     Raises:
         InputError: an unreadable file, no JSON, or no object.
     """
-    try:
-        settings = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {wanted}.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not JSON ({error}); {wanted}.") from None
+    settings = read_json_text(path, wanted)
     if not isinstance(settings, dict):
         raise InputError(f"{path}: {wanted}; got a {type(settings).__name__}.")
     return settings
@@ -56,7 +52,8 @@ def numbers_of(settings: dict[str, Any], entry: str, shape: tuple[int, ...], pla
     try:
         value = np.asarray(settings[entry], float)
     except (TypeError, ValueError):
-        raise InputError(f"{place}: {entry} must be numbers of shape {shape}; got {settings[entry]!r}.") from None
+        got = repr(settings[entry])[:80]
+        raise InputError(f"{place}: {entry} must be numbers of shape {shape}; got {got}.") from None
     if value.shape != shape or not np.isfinite(value).all():
         raise InputError(f"{place}: {entry} must be finite numbers of shape {shape}; got shape {value.shape}.")
     return value

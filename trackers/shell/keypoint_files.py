@@ -8,7 +8,6 @@ wrist, thumb 1-4, index, middle, ring, little finger, base to tip.
 """
 
 import csv
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfilters.trackers.feature_sequence import NUM_KEYPOINTS
+from jaxfilters.trackers.io.json_text import read_json_text
 from jaxfilters.trackers.recording import InputError
 
 _SHORTEST_STEP_US = 1000
@@ -262,12 +262,7 @@ def _times_of(numbers: np.ndarray, fps: float) -> np.ndarray:
 
 
 def _json(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text())
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}).") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not complete JSON ({error}).") from None
+    return read_json_text(file, "expected landmarks of a hand")
 
 
 def _array(name: Any, what: str, numbers: Any) -> np.ndarray:

@@ -20,8 +20,8 @@ import numpy as np
 
 from jaxfilters.models.face.landmarks import FROM_68, NAMES
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs, mirror_map
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.npz_files import read_arrays
 
 _COLUMNS = ["expression", "name", "x_mm", "y_mm", "z_mm"]
 NAMES_68 = tuple(str(k) for k in range(68))
@@ -81,7 +81,7 @@ def ten_of(sets: LandmarkSets) -> LandmarkSets:
 
 
 def _of_npz(path: Path) -> LandmarkSets:
-    arrays = read_arrays(path, _WANTED_NPZ)
+    arrays = read_npz(path, _WANTED_NPZ)
     shapes = arrays.get("shapes", np.zeros(0))
     if shapes.ndim != 4 or shapes.shape[3] != 3 or shapes.dtype.kind not in "fiu" or 0 in shapes.shape:
         raise InputError(f"{path}: {_WANTED_NPZ}; got {shapes.shape} {shapes.dtype}.")

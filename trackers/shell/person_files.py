@@ -20,9 +20,10 @@ import numpy as np
 
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.remembered import Remembered, joined
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays, read_header
+from jaxfilters.trackers.shell.npz_files import read_header
 from jaxfilters.trackers.shell.results import OutputError
 
 FORMAT, VERSION = "jaxfilters people", 1
@@ -85,7 +86,7 @@ def fingerprint(face: MultilinearFace) -> str:
 
 
 def _read(path: Path, face: MultilinearFace) -> People:
-    arrays = read_arrays(path, _WANTED)
+    arrays = read_npz(path, _WANTED)
     if missing := [name for name in (*Remembered._fields, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
     header = read_header(arrays, path, FORMAT, VERSION)

@@ -22,8 +22,8 @@ import numpy as np
 from jaxfilters.models.gesture.coded import voted
 from jaxfilters.models.gesture.codes import MOST_TIPS
 from jaxfilters.models.gesture.stroke import Drawn
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.npz_files import read_arrays
 from jaxfilters.trackers.shell.unipen_files import SUFFIXES, read_unipen
 
 ARRAYS = {
@@ -83,7 +83,7 @@ def read_strokes(path: Path) -> StrokeSet:
 
 def _of_npz(path: Path) -> StrokeSet:
     known = [name for names in ARRAYS.values() for name in names]
-    held = read_arrays(path, _WANTED_NPZ, known)
+    held = read_npz(path, _WANTED_NPZ, known)
     arrays = {wanted: held[name] for wanted, names in ARRAYS.items() for name in names if name in held}
     points, lengths = arrays.get("points", np.zeros(0)), arrays.get("length", np.zeros(0))
     if points.ndim != 2 or points.shape[1] not in (2, 3) or points.dtype.kind not in "fiu":

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.npz_files import read_arrays
 
 _WANTED = "expected .npz with points (frames, points, coordinates), or CSV with id, frame or time_s, and coordinates"
 _AXES = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("x_mm", "y_mm", "z_mm"), ("u", "v"))
@@ -29,7 +29,7 @@ def read_points(path: Path, fps: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _from_arrays(path: Path, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    arrays = read_arrays(path, _WANTED, ("points", "t_s"))
+    arrays = read_npz(path, _WANTED, ("points", "t_s"))
     points = arrays.get("points", np.zeros(0))
     times = arrays.get("t_s", np.arange(len(points)) / fps)
     if points.ndim != 3 or times.shape != points.shape[:1] or points.dtype.kind not in "fiu":

@@ -110,7 +110,7 @@ WRONG_FEATURES = {
     "one frame alone": ({"features": np.zeros(ROWS)}, r"features must be \(T, rows\) .*; got \(29,\) and \(29,\)"),
     "a name too few": ({"names": NAMES[1:]}, r"names \(rows,\); got \(4, 29\) and \(28,\)"),
     "an unknown name": ({"names": np.where(NAMES == "wrist_x", "wirst_x", NAMES)}, "no feature: wirst_x; expected"),
-    "names that are objects": ({"names": NAMES.astype(object)}, "not a complete .npz file .*Object arrays"),
+    "names that are objects": ({"names": NAMES.astype(object)}, "not a complete .npz file .*objects, not numbers"),
     "features in words": ({"features": np.full((FRAMES, ROWS), "x")}, "features must be numbers; got <U1"),
     "a mask of another size": ({"mask": np.ones((FRAMES, 2), bool)}, r"mask must be \(4, 29\) bool; got \(4, 2\) bool"),
     "a mask of numbers": ({"mask": np.ones((FRAMES, ROWS))}, r"mask must be \(4, 29\) bool; got \(4, 29\) float64"),

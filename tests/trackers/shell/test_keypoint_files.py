@@ -110,8 +110,8 @@ WRONG_FRAMES = {
     "another file": ({"bodies": []}, r'expected {"people": \[...\]} as OpenPose writes it'),
     "a list": ([1, 2], r'expected {"people": \[...\]}'),
     "people that are numbers": ({"people": [1]}, r'expected {"people": \[...\]}'),
-    "a truncated file": (json.dumps(openpose_frame(([], HAND)))[:300], "not complete JSON"),
-    "an empty file": ("", "not complete JSON"),
+    "a truncated file": (json.dumps(openpose_frame(([], HAND)))[:300], "not JSON"),
+    "an empty file": ("", "not JSON"),
 }
 
 
@@ -221,8 +221,8 @@ def test_wrong_mediapipe_frames_are_named(mediapipe, what):
     [
         ({"frames": []}, "expected a list with 21 landmarks for each frame; got a dict"),
         (openpose_frame(), "one frame of OpenPose; give the folder that holds it"),
-        (json.dumps([LANDMARKS])[:-20], "not complete JSON"),
-        ("", "not complete JSON"),
+        (json.dumps([LANDMARKS])[:-20], "not JSON"),
+        ("", "not JSON"),
         ([], "expected at least one frame|no keypoint"),
         ([[], None], "no keypoint has a confidence of 0.2 or more in any frame"),
     ],

@@ -1,0 +1,1 @@
+"""Files that people hand over: one safe reader for each format."""
