@@ -13,6 +13,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.depth_sequence import DepthSequence
 from jaxfilters.trackers.io.npz import names_in_npz, read_array_header, read_npz
 from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.shell.image_files import check_pixels
 from jaxfilters.trackers.shell.json_files import read_json, refuse_unknown
 
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "K", "depth_scale", "timestamps_us", "fps"}
@@ -120,6 +121,7 @@ def _read_png(file: Path, shape: tuple[int, int] | None) -> np.ndarray:
         encoded = np.fromfile(file, np.uint8)
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}).") from None
+    check_pixels(encoded, file)
     image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size else None
     if image is None:
         raise InputError(f"{file}: not a complete PNG image (truncated or damaged).")
