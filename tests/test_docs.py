@@ -1,12 +1,14 @@
 """The pages in docs/ run as they stand, block after block; their links and commands hold."""
 
 import argparse
+import importlib
 import re
 import shlex
 from pathlib import Path
 
 import pytest
 
+import jaxfilters
 from jaxfilters.trackers.shell import cli
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +62,21 @@ def subcommands(parser, words=()):
     return [leaf for name, child in inner[0].choices.items() for leaf in subcommands(child, (*words, name))]
 
 
+def exists(name):
+    """Whether a dotted name that begins with `jf` or `jaxfilters` is an attribute or a module."""
+    path, found = "jaxfilters", jaxfilters
+    for part in name.split(".")[1:]:
+        path = f"{path}.{part}"
+        try:
+            found = getattr(found, part)
+        except AttributeError:
+            try:
+                found = importlib.import_module(path)
+            except ModuleNotFoundError:
+                return False
+    return True
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_the_code_of_a_page_runs(page):
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
@@ -86,6 +103,15 @@ def test_every_page_can_be_reached_from_the_index():
         reached.add(page)
         waiting += [path for path, _ in links(page) if path in PAGES and path not in reached]
     assert not set(PAGES) - reached
+
+
+def test_names_in_pages_exist():
+    new_names = re.sub(r"^\| [^|]* \|", "|", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    texts = [page.read_text() for page in [ROOT / "README.md", *PAGES]] + [new_names.partition("#### Running")[2]]
+    names = {name for text in texts for name in re.findall(r"`(?:[^`\n]*[ (=])?(jf(?:\.\w+)+)", text)}
+    names |= set(re.findall(r"`(jaxfilters(?:\.\w+)+)[`(]", "".join(texts)))
+    assert len(names) > 60
+    assert not sorted(name for name in names if not exists(name))
 
 
 def test_every_command_has_a_manual_with_all_its_options():
