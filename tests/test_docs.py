@@ -114,7 +114,7 @@ def test_names_in_pages_exist():
     assert not sorted(name for name in names if not exists(name))
 
 
-def test_every_command_has_a_manual_with_all_its_options():
+def test_every_command_has_a_manual_with_all_its_options_and_choices():
     missing = []
     for words, parser in subcommands(cli._parser()):
         if words in ("demo", "bench"):  # the former has the options of `track hand-depth`, the latter another parser
@@ -122,6 +122,8 @@ def test_every_command_has_a_manual_with_all_its_options():
         manual = (DOCS / MANUALS[words]).read_text()
         options = [max(action.option_strings, key=len) for action in parser._actions if action.option_strings]
         missing += [f"{words} {option}" for option in options if option != "--help" and f"`{option}" not in manual]
+        choices = [str(choice) for action in parser._actions for choice in action.choices or ()]
+        missing += [f"{words} {choice}" for choice in choices if not re.search(rf"`[^`]*\b{choice}\b[^`]*`", manual)]
     assert not missing
 
 
