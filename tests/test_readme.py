@@ -1,3 +1,4 @@
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -5,6 +6,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -23,9 +25,9 @@ def test_the_example_runs_and_finds_the_point():
     truth = jnp.stack([5 + 3 * jnp.cos(angles), 5 + 3 * jnp.sin(angles)], axis=-1)
     distances = jnp.linalg.norm(truth[:, None] - example["BEACONS"], axis=-1)
     noisy = distances + 0.1 * jax.random.normal(jax.random.key(1), distances.shape)
-    means, log_evidence = example["follow"](jax.random.key(2), noisy, dts)
+    means, log_evidence = example["track"](jax.random.key(2), noisy, dts)
     # Least squares over the three distances of one moment, of standard deviation 0.1 each, has the error `single`;
-    # a filter that also uses the past stays below it.
+    # a filter that also uses earlier distances stays below it.
     directions = (truth[:, None] - example["BEACONS"]) / distances[..., None]
     single = 0.1 * jnp.sqrt(jnp.trace(jnp.linalg.inv(jnp.einsum("tbi,tbj->tij", directions, directions)), 0, 1, 2))
     error = jnp.linalg.norm(means[:, :2] - truth, axis=-1)
@@ -47,10 +49,23 @@ def test_the_page_opens_with_the_demo_and_the_tests():
     assert all(command.count("\n") == 1 for command in commands[:2])
 
 
-def test_links_lead_somewhere():
-    targets = [target for target in re.findall(r"\]\(([^)]+)\)", README) if not target.startswith("http")]
+def test_links_and_pictures_lead_somewhere():
+    found = re.findall(r"\]\(([^)]+)\)", README) + re.findall(r'<img src="([^"]+)"', README)
+    targets = [target.partition("#")[0] for target in found if not target.startswith("http")]
     assert targets
     assert not [target for target in targets if not (ROOT / target).exists()]
+
+
+def test_the_page_is_short():
+    assert len(README.splitlines()) <= 160
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/benchmarks.md"])
+def test_measured_results_are_those_of_the_baseline(page):
+    baseline = json.loads((ROOT / "benchmarks" / "baseline.json").read_text())["filters"]
+    rows = re.findall(r"\| ([\d.]+) \| `(\w+)` \|$", (ROOT / page).read_text(), re.MULTILINE)
+    assert rows
+    assert {name: float(value) for value, name in rows} == {name: baseline[name]["value"] for _, name in rows}
 
 
 def test_every_folder_has_its_row():
