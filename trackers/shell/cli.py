@@ -181,7 +181,7 @@ def _add_articulated_options(parser: argparse.ArgumentParser) -> None:
         "--noise",
         type=positive_number,
         metavar="PIXELS",
-        help="standard deviation of a keypoint's coordinate (default: 3 percent of the hand's diagonal)",
+        help="standard deviation of a keypoint's coordinate (default: 5 percent of the hand's diagonal)",
     )
     parser.add_argument(
         "--fps",
