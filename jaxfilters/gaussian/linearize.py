@@ -26,7 +26,7 @@ class Linearization(NamedTuple):
     value: Float[Array, " k"]
     """Where the mean goes."""
     F: Float[Array, "k n"]
-    lost_root: Float[Array, "k w"]
+    residual_root: Float[Array, "k w"]
     """Root, of any width, of the covariance of the function that F does not explain; width 0 where it is ignored."""
 
 

@@ -52,7 +52,7 @@ def _backward(model: ExtendedKalman, beliefs: Belief, controls: PyTree) -> Belie
         origin, ahead = linear_transition(model, belief, control)
         known = to_tangent(model.manifold, origin, following)
         noise = noise_of_step(model, control)
-        delta = model.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        delta = model.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed
 

@@ -175,7 +175,7 @@ def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
         origin, ahead = linear_transition(extended, belief, control)
         known = to_tangent(extended.manifold, origin, following)
         noise = noise_of_step(extended, control)
-        delta = extended.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        delta = extended.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(extended.manifold, belief.mean, delta)
         return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
 
