@@ -203,3 +203,30 @@ def residual_of(residual: Callable) -> Callable:
         return difference
 
     return checked
+
+
+def probability(name: str, value: Any) -> None:
+    """Raise an error unless `value` is one number in (0, 1)."""
+    if jnp.shape(value) != ():
+        raise ValueError(f"{name} must be one number in (0, 1); got the shape {jnp.shape(value)}.")
+    known = concrete(value)
+    if known is not None and not 0 < known < 1:
+        raise ValueError(f"{name} must be in (0, 1); got {value}.")
+
+
+def beliefs(name: str, value: Any, prior: Gaussian | GaussianRoot) -> int:
+    """The number of frames of beliefs with time first, each of the kind and the shapes of a filter's prior."""
+    if type(value) is not type(prior):
+        raise TypeError(
+            f"{name} must be a {type(prior).__name__} with time first, as the prior of the filter is; "
+            f"got a {type(value).__name__}."
+        )
+    (got, part), wanted = _spread(value), _spread(prior)[0]
+    length = value.mean.shape[:1]
+    fits = value.mean.shape == (*length, *prior.mean.shape) and got.ndim == 3 and length != (0,)
+    if not fits or got.shape[:2] != (*length, wanted.shape[0]):
+        raise ValueError(
+            f"{name} must have time first and then the shapes of the prior, {prior.mean.shape} and {wanted.shape}; "
+            f"its mean has the shape {value.mean.shape}, its {part} {got.shape}."
+        )
+    return length[0]

@@ -125,9 +125,10 @@ def extended_kalman(
         The filter, for `jf.run`, `jf.log_evidence`, `jf.step`, `jf.smoothing.rts` and the wrappers of filters.
 
     Raises:
-        ValueError: If shapes do not fit one another; if `prior` is for another arithmetic; if a covariance is not symmetric or not positive semidefinite
-            (unless under `jit`, where values are unknown); if `iterations < 1`, or `iterate_to` is another word. Shapes
-            of the results of functions, and of observations, are compared when the filter is traced.
+        ValueError: If shapes do not fit one another; if `prior` is for another arithmetic; if a covariance is not
+            symmetric or not positive semidefinite (unless under `jit`, where values are unknown); if
+            `iterations < 1`, or `iterate_to` is another word. Shapes of the results of functions, and of
+            observations, are compared when the filter is traced.
         TypeError: If an argument is of another kind, e.g. an array of integers.
 
     Example:
