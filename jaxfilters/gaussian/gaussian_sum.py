@@ -178,7 +178,8 @@ def _check_start(inner, start, capacity):
     if log_weights is not None and not np.isfinite(np.max(log_weights)):
         raise ValueError(f"start.log_weights must have a finite maximum; got {np.max(log_weights)}.")
     one = jax.eval_shape(inner.init, inner.params, jax.random.key(0))
-    wanted, got = jax.tree.structure(one), jax.tree.structure(start.components)
+    # As text: structures compare as equal where two classes have the same number of fields.
+    wanted, got = str(jax.tree.structure(one)), str(jax.tree.structure(start.components))
     if wanted != got:
         raise ValueError(f"start.components must be states of inner, {wanted}, stacked; got {got}.")
     leaves = zip(jax.tree_util.tree_leaves_with_path(start.components), jax.tree.leaves(one), strict=True)
