@@ -1,7 +1,7 @@
-"""What a filter is, and how it runs.
+"""The type of all filters, and the functions that run them over a sequence.
 
-Time convention: `init` is the belief *before* the first observation. Each step predicts, then updates. A frame that was
-not seen is a prediction without an update.
+Time convention: `init` is the belief *before* the first observation. Each step predicts, then updates. A frame without
+an observation is a prediction without an update.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,14 @@ from jaxfilters.typing import AnyKey, Collect, Init, Predict, Update
 class Filter:
     """A recursive Bayesian filter: static pure functions and traced parameters.
 
-    It is a pytree, hence a legal argument of `jit`, `vmap` and `grad`: `jax.grad(loss)(filter)` differentiates its
-    parameters.
+    It is a pytree, and therefore an argument of `jit`, `vmap` and `grad`: `jax.grad(loss)(filter)` differentiates with
+    respect to its parameters. Builders such as `extended_kalman` and `bootstrap` return filters.
     """
 
     params: PyTree
-    """Whatever the functions need: noise scales, geometry, cameras, the user's own model."""
+    """Arrays that the functions need: noise scales, geometry, cameras, the user's own model."""
     init: Init = field(metadata={"static": True})
-    """`(params, key) -> state`."""
+    """`(params, key) -> state`, the belief before the first observation."""
     predict: Predict = field(metadata={"static": True})
     """`(params, key, state, control) -> state`, one step ahead."""
     update: Update = field(metadata={"static": True})
@@ -47,20 +47,48 @@ def keep_info(state: PyTree, info: PyTree) -> PyTree:
 
 @jax.jit
 def init(filter: Filter, key: AnyKey) -> PyTree:
-    """Belief before the first observation."""
+    """State of a filter before the first observation.
+
+    Args:
+        filter: The filter.
+        key: Random key; deterministic filters ignore it.
+
+    Returns:
+        The state.
+    """
     # Weakly typed leaves (from Python numbers) would change type in the first step and compile it twice.
     return jax.tree.map(_strongly_typed, filter.init(filter.params, key))
 
 
 @jax.jit
 def predict(filter: Filter, key: AnyKey, state: PyTree, control: PyTree = None) -> PyTree:
-    """One time step ahead."""
+    """State one time step ahead, before the next observation.
+
+    Args:
+        filter: The filter.
+        key: Random key; deterministic filters ignore it.
+        state: State after the last observation.
+        control: Known inputs of the step, or `None`.
+
+    Returns:
+        The predicted state.
+    """
     return filter.predict(filter.params, key, state, control)
 
 
 @jax.jit
 def update(filter: Filter, key: AnyKey, state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
-    """Condition on an observation."""
+    """State given one more observation, and the diagnostics of the update.
+
+    Args:
+        filter: The filter.
+        key: Random key; deterministic filters ignore it.
+        state: Predicted state.
+        observation: One observation, without a time axis.
+
+    Returns:
+        The state, and the info of the filter, whose `log_evidence` is log p(y_t | y_1:t-1).
+    """
     return filter.update(filter.params, key, state, observation)
 
 
@@ -68,7 +96,18 @@ def update(filter: Filter, key: AnyKey, state: PyTree, observation: PyTree) -> t
 def step(
     filter: Filter, key: AnyKey, state: PyTree, observation: PyTree, control: PyTree = None
 ) -> tuple[PyTree, PyTree]:
-    """Predict, then update: the belief after `observation`, and its diagnostics."""
+    """State after one prediction and one update, and the diagnostics: for observations that arrive one by one.
+
+    Args:
+        filter: The filter.
+        key: Random key, a new one for every step; deterministic filters ignore it.
+        state: State after the last observation; `init` gives the first.
+        observation: One observation, without a time axis.
+        control: Known inputs of the step, or `None`.
+
+    Returns:
+        The state, and the info of the filter.
+    """
     predict_key, update_key = jax.random.split(key)
     state = filter.predict(filter.params, predict_key, state, control)
     return filter.update(filter.params, update_key, state, observation)
@@ -91,17 +130,31 @@ def run(
         key: Random key; deterministic filters ignore it.
         observations: Pytree whose leaves have time as their first axis.
         controls: Pytree of known inputs, time first; `None` passes `None` to every prediction.
-        mask: `False` where a frame was not seen: the filter predicts only, and the info of that frame is all zeros.
-            What the observations hold there, NaN included, has no effect on values or gradients.
-        state: Belief to start from, e.g. the first result of an earlier `run`; `None` starts from `filter.init`.
-        collect: `(state, info) -> what to keep of each step`. Compared by identity: pass a module-level function.
+        mask: Booleans (t,), `False` for frames without an observation: there the filter only predicts, and the info is
+            all zeros. The observations of such a frame, NaN included, have no effect on values or gradients.
+        state: State to start from, e.g. the first result of an earlier `run`; `None` starts from `filter.init`.
+        collect: `(state, info) -> pytree` to keep of each step, such as `keep_all` and `keep_info`. It is compared by
+            identity: pass a module-level function, or each call compiles anew.
 
     Returns:
-        The last state, and what `collect` kept, stacked along time.
+        The last state, and the results of `collect`, stacked along time: `(states, infos)` by default.
 
     Raises:
-        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length.
+        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length, or `mask` is not of
+            shape (t,).
+        TypeError: If `filter` is no `Filter`, or `mask` no boolean array.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> last, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)))
+        >>> beliefs.mean.shape
+        (5, 1)
     """
+    _check_run(filter, mask)
     _check_lengths(observations, controls, mask)
     init_key, scan_key = jax.random.split(key)
     if state is None:
@@ -117,9 +170,23 @@ def log_evidence(
     *,
     mask: Bool[Array, " t"] | None = None,
 ) -> Float[Array, ""]:
-    """Log evidence log p(y_1:T) of a sequence, differentiable in `filter`.
+    """Marginal log-likelihood log p(y_1:T) of a sequence (its log evidence), differentiable in `filter`.
 
     For a particle filter this is the logarithm of an unbiased estimate.
+
+    Args:
+        filter: The filter.
+        key: Random key; deterministic filters ignore it.
+        observations: Pytree whose leaves have time as their first axis.
+        controls: Pytree of known inputs, time first, or `None`.
+        mask: Booleans (t,), `False` for frames without an observation; these add nothing.
+
+    Returns:
+        The sum of the log evidences of all frames, in nats.
+
+    Raises:
+        ValueError: As for `run`.
+        TypeError: As for `run`.
     """
     _, log_evidence = run(filter, key, observations, controls, mask=mask, collect=_keep_log_evidence)
     return log_evidence.sum()
@@ -141,27 +208,33 @@ def _scan(
     collect: Collect,
 ) -> tuple[PyTree, PyTree]:
     def body(state: PyTree, inputs: tuple) -> tuple[PyTree, PyTree]:
-        step_key, observation, control, seen = inputs
+        step_key, observation, control, is_observed = inputs
         predict_key, update_key = jax.random.split(step_key)
         state = filter.predict(filter.params, predict_key, state, control)
         update = partial(filter.update, filter.params, update_key)
-        state, info = update(state, observation) if seen is None else _update_if(seen, update, state, observation)
+        if is_observed is None:
+            state, info = update(state, observation)
+        else:
+            state, info = _update_if(is_observed, update, state, observation)
         return state, collect(state, info)
 
     keys = jax.random.split(key, _length(observations))
     return jax.lax.scan(body, state, (keys, observations, controls, mask))
 
 
-def _update_if(seen: Bool[Array, ""], update: Callable, state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
-    # An unseen frame often holds NaN; under `vmap` both branches run, and NaN times zero would poison gradients.
-    observation = jax.tree.map(lambda y: jnp.where(seen, y, jnp.zeros_like(y)), observation)
+def _update_if(
+    is_observed: Bool[Array, ""], update: Callable, state: PyTree, observation: PyTree
+) -> tuple[PyTree, PyTree]:
+    # A frame without an observation often holds NaN; under `vmap` both branches run, and NaN times zero would poison
+    # gradients.
+    observation = jax.tree.map(lambda y: jnp.where(is_observed, y, jnp.zeros_like(y)), observation)
     _, info = jax.eval_shape(update, state, observation)
 
     def skip(state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
         del observation
         return state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), info)
 
-    return jax.lax.cond(seen, update, skip, state, observation)
+    return jax.lax.cond(is_observed, update, skip, state, observation)
 
 
 def _strongly_typed(leaf: Array) -> Array:
@@ -170,6 +243,20 @@ def _strongly_typed(leaf: Array) -> Array:
 
 def _length(observations: PyTree) -> int:
     return jax.tree.leaves(observations)[0].shape[0]
+
+
+def _check_run(filter: Filter, mask: PyTree) -> None:
+    if not isinstance(filter, Filter):
+        raise TypeError(f"filter must be a Filter, as the builders return; got a {type(filter).__name__}.")
+    if mask is None:
+        return
+    if not jnp.issubdtype(getattr(mask, "dtype", float), jnp.bool_):
+        raise TypeError(f"mask must be a boolean array; got {getattr(mask, 'dtype', type(mask).__name__)}.")
+    if mask.ndim != 1:
+        raise ValueError(
+            f"mask must have the shape (t,), one boolean a frame; got {mask.shape}. "
+            "Components of Gaussian observations are masked by Observation(y, mask)."
+        )
 
 
 def _check_lengths(observations: PyTree, controls: PyTree, mask: PyTree) -> None:

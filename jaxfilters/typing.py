@@ -1,6 +1,6 @@
-r"""What a user writes: the callbacks of every filter, with their mathematics.
+r"""Types of the functions that a user passes to the builders of filters, with their mathematics.
 
-All of them are *unbatched*: they see one particle, one hypothesis, one state. The core maps them over the
+All of them are *unbatched*: their arguments are one particle, one hypothesis, one state. The filters map them over the
 ensemble, whose axis is the last one. A callback is a plain function, a method of a frozen pytree dataclass (its
 arrays then become parameters of the filter, traced and differentiable) or any other callable pytree such as
 `jax.tree_util.Partial`.
@@ -53,7 +53,7 @@ class LogLikelihood(Protocol):
 
 @runtime_checkable
 class DrawNoise(Protocol):
-    """Draw what moves a whole ensemble one step: leaves with the ensemble axis last."""
+    """Draw the random inputs of one transition for a whole ensemble: leaves with the ensemble axis last."""
 
     def __call__(self, key: AnyKey, num_particles: int, /) -> PyTree: ...
 
@@ -67,7 +67,7 @@ class ResamplingScheme(Protocol):
 
 @runtime_checkable
 class Temper(Protocol):
-    """Flatten log-likelihoods against the weights they are about to change."""
+    """Flatten the log-likelihoods of an update, given the log weights before it."""
 
     def __call__(
         self, log_likelihood: Float[Array, " n"], log_weights: Float[Array, " n"], /
@@ -82,11 +82,17 @@ Mask = Bool[Array, " t"]
 
 
 def as_pytree(callback: Callable) -> Callable:
-    """Make a callback a pytree whose leaves are its parameters.
+    """Turn a callback into a pytree whose leaves are its parameters.
 
     A method of a pytree dataclass becomes a `Partial` of the function over the instance: its arrays are traced, and
     two filters built from the same class compile once. A plain function has no leaves and is compared by identity, so
-    a function that is made anew on every call compiles anew.
+    a function that is created anew for every call compiles anew.
+
+    Args:
+        callback: Function, method of a pytree, or callable pytree.
+
+    Returns:
+        A callable pytree.
     """
     if isinstance(callback, MethodType) and not jax.tree_util.all_leaves([callback.__self__]):
         return jax.tree_util.Partial(callback.__func__, callback.__self__)

@@ -1,7 +1,7 @@
-"""Gaussian beliefs, by covariance and by a root of it, with the same verbs.
+"""Gaussian beliefs, by covariance and by a root of it, with the same methods.
 
-`indices` choose components and are static: a list or tuple of numbers. The shapes on the fields are those of one
-belief; stacked over time or an ensemble the leaves have more axes, and the methods are for `vmap`.
+`indices` choose components and are static: a list or tuple of integers. The shapes of the fields are those of one
+belief; beliefs that are stacked over time or an ensemble have more axes, and need `jax.vmap` for the methods.
 """
 
 import math
@@ -20,28 +20,36 @@ Key = PRNGKeyArray | Array
 
 @pytree_dataclass
 class Gaussian:
-    """A Gaussian by mean and covariance."""
+    """A Gaussian by mean and covariance.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([0.0, 1.0]), jnp.array([[1.0, 0.5], [0.5, 2.0]]))
+        >>> belief.condition([0], jnp.array([1.0])).mean.tolist()
+        [1.5]
+    """
 
     mean: Float[Array, "..."]
-    """(n,)."""
+    """Mean, (n,); on a manifold, a point of it."""
     covariance: Float[Array, "..."]
-    """(n, n), symmetric, positive semidefinite: a zero variance says that the component is known."""
+    """Covariance, (n, n), symmetric and positive semidefinite; a component of variance zero is known."""
 
     def logpdf(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        """Log density at `x`, over the directions that have any variance."""
+        """Log density at `x`, (n,), over the directions of positive variance."""
         return logpdf(x - self.mean, linalg.cholesky(self.covariance))
 
     def sample(self, key: Key, count: int) -> Float[Array, "n count"]:
-        """Independent draws, one a column."""
+        """Independent draws, (n, count): one per column."""
         return GaussianRoot(self.mean, linalg.cholesky(self.covariance)).sample(key, count)
 
     def marginal(self, indices: Sequence[int]) -> "Gaussian":
-        """Belief in the chosen components, in that order."""
+        """Belief about the chosen components, in that order."""
         chosen = np.asarray(indices)
         return Gaussian(self.mean[chosen], self.covariance[np.ix_(chosen, chosen)])
 
     def condition(self, indices: Sequence[int], values: Float[Array, " k"]) -> "Gaussian":
-        """Belief in the other components, in their order, once the chosen ones are known to have these values."""
+        """Belief about the other components, in their order, given the values (k,) of the chosen ones."""
         known, rest = _split(indices, self.mean.size)
         L = linalg.cholesky(self.covariance[np.ix_(known, known)])
         gain_root = linalg.solve_triangular(L, self.covariance[np.ix_(known, rest)])
@@ -53,29 +61,37 @@ class Gaussian:
 
 @pytree_dataclass
 class GaussianRoot:
-    """A Gaussian by mean and any root of its covariance."""
+    """A Gaussian by mean and any root of its covariance, for `jf.arithmetic.square_root`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> belief = jf.GaussianRoot(jnp.array([0.0, 1.0]), jnp.array([[1.0, 0.0], [0.5, 1.0]]))
+        >>> belief.condition([0], jnp.array([1.0])).mean.tolist()
+        [1.5]
+    """
 
     mean: Float[Array, "..."]
-    """(n,)."""
+    """Mean, (n,); on a manifold, a point of it."""
     root: Float[Array, "..."]
-    """(n, m): `root root^T` is the covariance. Any width does; what this library returns is lower with n columns."""
+    """Root of the covariance, (n, m) of any width m: `root @ root.T` is the covariance. It need not be triangular."""
 
     def logpdf(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        """Log density at `x`, over the directions that have any variance."""
+        """Log density at `x`, (n,), over the directions of positive variance."""
         return logpdf(x - self.mean, linalg.tria(self.root))
 
     def sample(self, key: Key, count: int) -> Float[Array, "n count"]:
-        """Independent draws, one a column."""
+        """Independent draws, (n, count): one per column."""
         noise = jax.random.normal(key, (self.root.shape[1], count), self.mean.dtype)
         return self.mean[:, None] + jnp.matmul(self.root, noise, precision="highest")
 
     def marginal(self, indices: Sequence[int]) -> "GaussianRoot":
-        """Belief in the chosen components, in that order; the root keeps its width."""
+        """Belief about the chosen components, in that order; the root keeps its width."""
         chosen = np.asarray(indices)
         return GaussianRoot(self.mean[chosen], self.root[chosen])
 
     def condition(self, indices: Sequence[int], values: Float[Array, " k"]) -> "GaussianRoot":
-        """Belief in the other components, in their order, once the chosen ones are known to have these values."""
+        """Belief about the other components, in their order, given the values (k,) of the chosen ones."""
         known, rest = _split(indices, self.mean.size)
         k = known.size
         L = linalg.tria(self.root[np.concatenate([known, rest])])
@@ -84,9 +100,9 @@ class GaussianRoot:
 
 
 def logpdf(deviation: Float[Array, " n"], root: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Log density of a deviation from the mean, given a lower root.
+    """Log density of a deviation from the mean, given a lower root of the covariance.
 
-    Taken over the components whose diagonal element is not zero: one that is certain adds nothing.
+    It is taken over the components whose diagonal element is not zero: one that is certain adds nothing.
     """
     whitened = linalg.solve_triangular(root, deviation)
     diagonal = jnp.diagonal(root)

@@ -1,11 +1,12 @@
-"""Each view counts once: what is constant in time is learnt from new views only.
+"""The Schmidt-Kalman filter with a novelty gate: constant quantities are updated by new views only.
 
-A Gaussian filter of a nonlinear observation errs in the same way each time that it sees the same thing. Taken for
-fresh noise, the error averages out on paper, and the covariance of constant quantities shrinks without evidence: after
-hundreds of like frames the filter is certain of a wrong answer. Here a frame that shows nothing new still corrects
-what moves, but the constant quantities are only *considered*: their mean and covariance stay (S. F. Schmidt,
-"Application of state-space methods to navigation problems", 1966), and so does what was known of the constraints on
-them. Repeating a view therefore teaches nothing, whatever the linearisation does.
+A Gaussian filter of a nonlinear observation makes the same linearisation error each time that it observes the same
+scene. Treated as independent noise, the error seems to average out, and the covariance of constant quantities shrinks
+without evidence: after hundreds of similar frames the filter is certain of a wrong value. Here a frame that shows
+nothing new still corrects what moves, but the constant quantities are only *considered*: their mean and covariance
+stay (S. F. Schmidt, "Application of state-space methods to navigation problems", in "Advances in Control Systems" 3,
+1966), and so does the memory of constraints on them. A repeated view therefore adds no information about them,
+whatever the linearisation.
 """
 
 from collections.abc import Callable
@@ -18,24 +19,25 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.constraints.constrained import ConstrainedState
 from jaxfilters.typing import AnyKey, as_pytree
 
 
-class Views(NamedTuple):
-    """The views that have been learnt from, in a ring."""
+class ViewMemory(NamedTuple):
+    """Signatures of the views that have updated the constant quantities, in a ring buffer."""
 
     signatures: Float[Array, "k d"]
     num_views: Int32[Array, ""]
-    """How many there have been; the last k of them are held."""
+    """Number of such views; the last k of them are in the buffer."""
 
 
 class SchmidtState(NamedTuple):
-    """A state of the inner filter, and what it has seen."""
+    """State of the inner filter, and the views that have updated it."""
 
     inner: PyTree
-    views: Views
+    views: ViewMemory
 
 
 class SchmidtInfo(NamedTuple):
@@ -47,12 +49,12 @@ class SchmidtInfo(NamedTuple):
     is_new: Bool[Array, ""]
     """Whether constant quantities were updated."""
     num_views: Int32[Array, ""]
-    """So far."""
+    """Number of views so far that updated them."""
 
 
 @pytree_dataclass
 class SchmidtKalman:
-    """Parameters of a filter that learns from new views only."""
+    """Parameters of a filter made by `schmidt_kalman`; its arguments describe them."""
 
     inner: Filter
     signature: Callable
@@ -69,22 +71,49 @@ def schmidt_kalman(
     *,
     capacity: int = 64,
 ) -> Filter:
-    """The filter `inner` whose constant quantities are updated only by views that it has not learnt from before.
+    """Schmidt-Kalman filter: `inner`, with constant quantities that only new views update.
 
-    A view is new where its signature differs from all that are held by more than `tolerance` in some component.
+    A view is new if its signature differs from all in the memory by more than `tolerance` in some component. The state
+    is a `SchmidtState`, the info a `SchmidtInfo`.
 
     Args:
-        inner: A filter with a `Gaussian` for its state, or `constrained` of one; it updates everything. What it
-            remembers of its constraints stays where the constant quantities do.
-        signature: `mean -> what is seen` of a state, e.g. noise-free features, less what says nothing about the
-            constant quantities, such as the place in the image.
-        constant: True for components of the state that never change.
-        tolerance: In the unit of the signature; a few standard deviations of the noise.
-        capacity: How many views are held; the oldest gives way.
+        inner: Filter with a `Gaussian` for its state, or `constrained` of one; it updates everything. Where the
+            constant quantities stay, so does its memory of constraints.
+        signature: `mean -> signature`, (n,) to (d,): a description of what the state looks like, e.g. noise-free
+            features without what says nothing about the constant quantities, such as the place in the image.
+        constant: True for components of the state that never change, (n,).
+        tolerance: Least difference of a new view, in the unit of the signature; a few standard deviations of the noise.
+        capacity: Number of views in the memory, at least 1; a new one replaces the oldest.
+
+    Returns:
+        The filter.
 
     Raises:
-        ValueError: If `capacity < 1` or `tolerance <= 0`.
+        ValueError: If `capacity < 1` or `tolerance <= 0`; when the filter is traced, if `constant` has another length
+            than the mean of the state, or `signature` returns no array of one axis.
+        TypeError: If `inner` is no filter, `constant` no boolean array, or, when the filter is traced, if the state of
+            `inner` is not a `Gaussian`.
+
+    Example:
+        A bar of unknown length that turns: its projection tells the length only while the angle changes.
+
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.array([0.5, 60.0]), jnp.diag(jnp.array([0.04, 100.0])))
+        >>> observe = lambda x: x[1:] * jnp.cos(x[:1])
+        >>> Q, R = jnp.diag(jnp.array([1e-4, 0.0])), 0.04 * jnp.eye(1)
+        >>> inner = jf.extended_kalman(prior, lambda x, control: x, Q, observe, R)
+        >>> filter = jf.schmidt_kalman(inner, lambda mean: mean[:1], jnp.array([False, True]), tolerance=0.5)
+        >>> _, (states, infos) = jf.run(filter, jax.random.key(0), jnp.full((5, 1), 50.0))
+        >>> infos.is_new.tolist()
+        [True, False, False, False, False]
     """
+    checks.is_filter("inner", inner)
+    checks.function("signature", signature)
+    if jnp.ndim(constant) != 1:
+        raise ValueError(f"constant must have the shape (n,), that of the mean; got {jnp.shape(constant)}.")
+    checks.boolean("constant", constant, jnp.shape(constant))
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity must be an integer of at least 1; got {capacity!r}.")
     if not isinstance(tolerance, jax.core.Tracer) and not tolerance > 0:
@@ -94,10 +123,10 @@ def schmidt_kalman(
 
 
 def consider(before: Gaussian, after: Gaussian, constant: Bool[Array, " n"]) -> Gaussian:
-    """The belief after an update whose gain is made zero for the constant components.
+    """Belief after an update whose gain is set to zero for the constant components.
 
-    With P - P' = K S K^T for the optimal gain K, a gain without these rows leaves their own block of the covariance
-    as it was, and gives all others the optimal one.
+    With P - P' = K S K^T for the optimal gain K, a gain with zeros in these rows leaves their own block of the
+    covariance as it was, and gives all others the optimal one.
     """
     block = constant[:, None] & constant
     return Gaussian(jnp.where(constant, before.mean, after.mean), jnp.where(block, before.covariance, after.covariance))
@@ -105,8 +134,15 @@ def consider(before: Gaussian, after: Gaussian, constant: Bool[Array, " n"]) -> 
 
 def _init(model: SchmidtKalman, key: AnyKey) -> SchmidtState:
     state = model.inner.init(model.inner.params, key)
-    shape = jax.eval_shape(model.signature, _belief(state).mean)
-    return SchmidtState(state, Views(jnp.zeros((model.capacity, shape.size), shape.dtype), jnp.zeros((), jnp.int32)))
+    belief = _belief(state)
+    checks.belief("the state of inner", belief, Gaussian)
+    checks.boolean("constant", model.constant, belief.mean.shape, ", that of the mean of the state")
+    shape = jax.eval_shape(model.signature, belief.mean)
+    checks.floating("the result of signature", shape)
+    if shape.ndim != 1:
+        raise ValueError(f"signature must return an array of the shape (d,); got {shape.shape}.")
+    memory = ViewMemory(jnp.zeros((model.capacity, shape.size), shape.dtype), jnp.zeros((), jnp.int32))
+    return SchmidtState(state, memory)
 
 
 def _predict(model: SchmidtKalman, key: AnyKey, state: SchmidtState, control: PyTree) -> SchmidtState:
@@ -122,9 +158,9 @@ def _update(
     considered = consider(_belief(state.inner), _belief(updated), model.constant)
     if isinstance(updated, ConstrainedState):
         considered = state.inner._replace(belief=considered)
-    views = remember(state.views, signature)
-    learnt, kept = SchmidtState(updated, views), SchmidtState(considered, state.views)
-    after = jax.tree.map(lambda yes, no: jnp.where(new, yes, no), learnt, kept)
+    views = with_view(state.views, signature)
+    if_new, if_known = SchmidtState(updated, views), SchmidtState(considered, state.views)
+    after = jax.tree.map(lambda yes, no: jnp.where(new, yes, no), if_new, if_known)
     return after, SchmidtInfo(info.log_evidence, info, new, after.views.num_views)
 
 
@@ -132,14 +168,14 @@ def _belief(state: Gaussian | ConstrainedState) -> Gaussian:
     return state.belief if isinstance(state, ConstrainedState) else state
 
 
-def is_new(views: Views, signature: Float[Array, " d"], tolerance: float | Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a signature differs from all that are held by more than `tolerance` somewhere."""
-    held = jnp.arange(views.signatures.shape[0]) < views.num_views
+def is_new(views: ViewMemory, signature: Float[Array, " d"], tolerance: float | Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a signature differs from all in the memory by more than `tolerance` in some component."""
+    filled = jnp.arange(views.signatures.shape[0]) < views.num_views
     differs = jnp.max(jnp.abs(views.signatures - signature), axis=1) > tolerance
-    return jnp.all(differs | ~held)
+    return jnp.all(differs | ~filled)
 
 
-def remember(views: Views, signature: Float[Array, " d"]) -> Views:
-    """The views with one more, in place of the oldest if need be."""
+def with_view(views: ViewMemory, signature: Float[Array, " d"]) -> ViewMemory:
+    """The memory with one more view, which replaces the oldest once the memory is full."""
     place = views.num_views % views.signatures.shape[0]
-    return Views(views.signatures.at[place].set(signature), views.num_views + 1)
+    return ViewMemory(views.signatures.at[place].set(signature), views.num_views + 1)

@@ -8,9 +8,8 @@ a merge of hypotheses) may change it between the steps.
 
 from collections.abc import Callable
 from dataclasses import field, replace
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -18,7 +17,8 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.last_axis import batch_last
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import arithmetic as arithmetics
-from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor, info
+from jaxfilters.gaussian import checks
+from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.linearize import Linearization, Linearize, taylor
 from jaxfilters.gaussian.manifold import (
@@ -31,26 +31,37 @@ from jaxfilters.gaussian.manifold import (
     retract_belief,
     with_mean,
 )
+from jaxfilters.gaussian.measurement_update import (
+    Measurement,
+    is_difference,
+    iterated_update,
+    linear_update,
+    subtract,
+)
 from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, as_pytree
 
-_HALVINGS = 6
-
 
 class Observation(NamedTuple):
-    """An observation with what is known about it; the filter takes a plain array too."""
+    """An observation with a mask and a noise of its own; Gaussian filters take a plain array `y` too.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> y = jf.Observation(jnp.array([1.0, 2.0]), mask=jnp.array([True, False]))
+    """
 
     y: Float[Array, " m"]
     """NaN where nothing was read: such components are left out, and counted in `info.num_invalid` unless masked."""
     mask: Bool[Array, " m"] | None = None
-    """False for components that were not seen, whatever `y` holds there."""
+    """False for components that are to be left out, whatever `y` holds there; `None` leaves none out."""
     noise: Array | None = None
-    """In place of the filter's observation noise."""
+    """Covariance of the noise of this observation, (m, m), or a root of it, (m, k), in place of the filter's."""
 
 
 @pytree_dataclass
 class ExtendedKalman:
-    """Parameters of an extended filter."""
+    """Parameters of a filter made by `extended_kalman`; its arguments describe them."""
 
     prior: Belief
     transition: Callable
@@ -62,11 +73,7 @@ class ExtendedKalman:
     linearize: Linearize = field(metadata={"static": True})
     arithmetic: Arithmetic = field(metadata={"static": True})
     iterations: int = field(metadata={"static": True})
-
-
-def subtract(y: Float[Array, " m"], y_hat: Float[Array, " m"]) -> Float[Array, " m"]:
-    """The difference of two observations that are vectors."""
-    return y - y_hat
+    iterate_to: Literal["mean", "mode"] = field(metadata={"static": True}, default="mean")
 
 
 def extended_kalman(
@@ -81,30 +88,72 @@ def extended_kalman(
     manifold: Manifold = euclidean,
     residual: Callable[[Array, Array], Array] = subtract,
     iterations: int = 1,
+    iterate_to: Literal["mean", "mode"] = "mean",
 ) -> Filter:
-    """Gaussian filter of a nonlinear model: an extended Kalman filter unless `linearize` says otherwise.
+    r"""Extended Kalman filter: a Gaussian filter of a nonlinear model, linearised at the current mean.
 
-    Observations are arrays `y` or `Measured(y, mask, noise)`. The info is a `KalmanInfo`.
+    Other choices of `linearize` make it a second-order, unscented or cubature filter. An observation is an array `y`
+    of shape (m,), or `Observation(y, mask, noise)`; the state is a belief like `prior`, and the info a `KalmanInfo`.
+    S. Särkkä and L. Svensson, "Bayesian Filtering and Smoothing", 2nd edition, 2023, chapters 7 to 9.
 
     Args:
-        prior: Belief before the first observation: a `Gaussian`, or a `GaussianRoot` for `kalman.square_root`.
-        transition: `(x, control) -> x`, without noise.
-        process_noise: Covariance of the noise in the tangent space of the state (a root of it for
-            `kalman.square_root`), or `control -> covariance`, for steps of different length.
-        observe: `x -> y`, without noise.
-        observation_noise: Covariance (or root) of the noise of y.
-        linearize: `taylor` (extended filter), `second_order`, `second_order_bias`, `cubature` or `unscented(...)` of
-            `jaxfilters.linearize`.
-        arithmetic: `kalman.joseph`, `kalman.square_root` or `kalman.fast`.
-        manifold: What the state lives on; `euclidean` for vectors.
-        residual: `(y, y_hat) -> y - y_hat`, for observations that wrap around.
-        iterations: How often the observation is made linear: 1 is the plain update; more are Gauss-Newton steps to
-            the most probable state, each as long as lowers its cost (for `taylor` and `second_order`).
+        prior: Belief before the first observation, with a mean of shape (n,): a `Gaussian` with a covariance (d, d),
+            or a `GaussianRoot` for `jf.arithmetic.square_root`. On vector spaces d = n.
+        transition: `(x, control) -> x` without noise; (n,) to (n,). `control` is one step of the `controls` of
+            `jf.run`, or `None`.
+        process_noise: Covariance of the process noise, (d, d), in the tangent space of the state (for
+            `jf.arithmetic.square_root` a root of it, (d, any width)); or a function `control -> covariance`, e.g. for
+            steps of unequal length.
+        observe: `x -> y` without noise; (n,) to (m,).
+        observation_noise: Covariance of the observation noise, (m, m), or a root of it, (m, any width).
+        linearize: `jf.linearize.taylor` (the extended filter), `second_order`, `second_order_covariance_only`,
+            `cubature` or `unscented(...)`.
+        arithmetic: `jf.arithmetic.joseph`, `square_root` or `fast`.
+        manifold: Space of the states, for rotations and poses; `jf.manifold.euclidean` for vectors.
+        residual: `(y, y_hat) -> y - y_hat`, (m,), for observations that wrap around, such as angles.
+        iterations: Steps of every measurement update: 1 is the plain update; more are damped Gauss-Newton steps,
+            halved until they lower the cost, for precise measurements that are strongly nonlinear within the prior's
+            spread. Meant for `taylor` and `second_order`; no more than 2 to 10 are usual.
+        iterate_to: The point that more than one iteration approaches. "mean" is the mean of the posterior to the
+            second order of Laplace's expansion, which needs second derivatives of `observe`. "mode" is the most
+            probable state, the classical iterated extended Kalman filter. Do not use "mode" where the posterior is
+            skewed, e.g. for bearings from a single moving observer: there the mode lies nearer to the observer than
+            the mean, frame after frame, and the filter becomes certain of too short a range. It then loses to a single
+            iteration.
+
+    Returns:
+        The filter, for `jf.run`, `jf.log_evidence`, `jf.step`, `jf.smoothing.rts` and the wrappers of filters.
 
     Raises:
-        ValueError: If prior, noises and arithmetic do not fit one another, or `iterations < 1`.
+        ValueError: If shapes do not fit one another; if `prior` is for another arithmetic; if a covariance is not
+            symmetric or not positive semidefinite (unless under `jit`, where values are unknown); if
+            `iterations < 1`, or `iterate_to` is another word. Shapes of the results of functions, and of
+            observations, are compared when the filter is traced.
+        TypeError: If an argument is of another kind, e.g. an array of integers.
+
+    Example:
+        A range to the origin, in metres, from a point that moves at random.
+
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
+        >>> transition = lambda x, control: x
+        >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
+        >>> filter = jf.extended_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> last, (beliefs, infos) = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
+        >>> beliefs.mean.shape, infos.log_evidence.shape
+        ((10, 2), (10,))
     """
-    _check(prior, process_noise, observation_noise, arithmetic, iterations)
+    _check(prior, process_noise, observation_noise, arithmetic, manifold)
+    checks.function("transition", transition)
+    checks.function("observe", observe)
+    checks.function("residual", residual)
+    checks.function("linearize", linearize)
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations must be an integer of at least 1; got {iterations!r}.")
+    if iterate_to not in ("mean", "mode"):
+        raise ValueError(f'iterate_to must be "mean" or "mode"; got {iterate_to!r}.')
     params = ExtendedKalman(
         prior,
         as_pytree(transition),
@@ -116,8 +165,23 @@ def extended_kalman(
         linearize,
         arithmetic,
         iterations,
+        iterate_to,
     )
     return Filter(params, _init, _predict, _update)
+
+
+def _check(prior, process_noise, observation_noise, arithmetic, manifold):
+    if not isinstance(prior, arithmetic.Belief):
+        kind = ValueError if isinstance(prior, Gaussian | GaussianRoot) else TypeError
+        raise kind(
+            f"prior must be a {arithmetic.Belief.__name__} for {arithmetic.__name__}; got a {type(prior).__name__}."
+        )
+    checks.belief("prior", prior, arithmetic.Belief)
+    checks.on_manifold("prior", prior, manifold)
+    is_root = isinstance(prior, GaussianRoot)
+    checks.noise("observation_noise", observation_noise, None, is_root=is_root)
+    if not callable(process_noise):
+        checks.noise("process_noise", process_noise, dimension(prior), is_root=is_root)
 
 
 def _init(model: ExtendedKalman, key: AnyKey) -> Belief:
@@ -130,6 +194,7 @@ def _init(model: ExtendedKalman, key: AnyKey) -> Belief:
 
 def _predict(model: ExtendedKalman, key: AnyKey, belief: Belief, control: PyTree) -> Belief:
     del key
+    checks.state(belief, model.prior)
     ahead = _ahead if dimension(belief) > factor.UNROLLED else batch_last(_ahead)
     return ahead(model, belief, control)
 
@@ -137,20 +202,27 @@ def _predict(model: ExtendedKalman, key: AnyKey, belief: Belief, control: PyTree
 def _ahead(model: ExtendedKalman, belief: Belief, control: PyTree) -> Belief:
     origin, step = linear_transition(model, belief, control)
     noise = noise_of_step(model, control)
-    ahead = model.arithmetic.predict(increments(belief), step.F, noise, step.value, step.lost_root)
+    ahead = model.arithmetic.predict(increments(belief), step.F, noise, step.value, step.residual_root)
     # The mean is that of the step; F times a mean of zeros would be computed.
     return retract_belief(model.manifold, origin, with_mean(ahead, step.value))
 
 
 def _update(model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
     del key
-    y = observation.y if isinstance(observation, Observation) else observation
-    small = max(dimension(belief), jnp.size(y)) <= factor.UNROLLED
-    given = batch_last(_given) if small else _given
-    return given(model, belief, observation)
+    checks.state(belief, model.prior)
+    y = _measured(observation).y
+    small = max(dimension(belief), y.size) <= factor.UNROLLED
+    conditioned = batch_last(_conditioned) if small else _conditioned
+    return conditioned(model, belief, observation)
 
 
-def _given(model: ExtendedKalman, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
+def _measured(observation: Any) -> Observation:
+    measured = observation if isinstance(observation, Observation) else Observation(observation)
+    checks.observation(measured.y, measured.mask)
+    return measured
+
+
+def _conditioned(model: ExtendedKalman, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
     return condition(
         belief,
         observation,
@@ -161,25 +233,32 @@ def _given(model: ExtendedKalman, belief: Belief, observation: PyTree) -> tuple[
         residual=model.residual,
         manifold=model.manifold,
         iterations=model.iterations,
+        iterate_to=model.iterate_to,
     )
 
 
 def linear_transition(model: ExtendedKalman, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
-    """Where the mean goes, and the transition as a linear function of increments, from the mean to there."""
+    """The predicted mean, and the transition as a linear function of increments, from the mean to the predicted one."""
+    transition = lambda x: checks.transitioned(model.transition, x, control)
     if model.manifold.flat:
-        ahead = model.linearize(lambda x: model.transition(x, control), belief)
+        ahead = model.linearize(transition, belief)
         return ahead.value, ahead._replace(value=jnp.zeros_like(ahead.value))
-    origin = model.transition(belief.mean, control)
+    origin = transition(belief.mean)
 
     def step(delta: Array) -> Array:
-        return model.manifold.local(origin, model.transition(model.manifold.retract(belief.mean, delta), control))
+        return model.manifold.local(origin, transition(model.manifold.retract(belief.mean, delta)))
 
     return origin, model.linearize(step, increments(belief))
 
 
 def noise_of_step(model: ExtendedKalman, control: PyTree) -> Array:
-    """The process noise of one step, as the arithmetic wants it."""
-    return model.process_noise(control) if callable(model.process_noise) else model.process_noise
+    """The process noise of one step: a covariance, or a root of it, as the arithmetic needs."""
+    if not callable(model.process_noise):
+        return model.process_noise
+    noise = model.process_noise(control)
+    is_root = isinstance(model.prior, GaussianRoot)
+    checks.noise("the result of process_noise", noise, dimension(model.prior), is_root=is_root)
+    return noise
 
 
 def condition(
@@ -194,155 +273,62 @@ def condition(
     residual: Callable[[Array, Array], Array] = subtract,
     manifold: Manifold = euclidean,
     iterations: int = 1,
+    iterate_to: Literal["mean", "mode"] = "mean",
 ) -> tuple[Gaussian | GaussianRoot, KalmanInfo]:
-    r"""Belief after an observation, made linear at any point, and the diagnostics of the update.
+    r"""Belief after an observation that is linearised at any point, and the diagnostics of the update.
 
     With $H = \partial h / \partial x$ at $\bar x$ and the predicted mean $\tilde x$, the innovation is
-    $(y \ominus h(\bar x)) - H (\tilde x - \bar x)$; it, not the prediction, depends on where h is made linear
-    (N. Shimada et al., "Shape and pose estimation of an articulated object", eq. 19, for $\bar x = \tilde x$).
+    $(y \ominus h(\bar x)) - H (\tilde x - \bar x)$; it, not the prediction, depends on where h is linearised
+    (N. Shimada et al., "Shape and pose estimation of an articulated object", 1997, equation 19, where
+    $\bar x = \tilde x$).
 
     Args:
         belief: The predicted belief.
         measured: The observation.
         observe: `x -> y`, without noise.
-        noise: As the arithmetic wants it, unless the observation has its own.
-        at: The point where h is made linear, the predicted mean by default. Several hypotheses about one prediction
+        noise: Covariance of the observation noise, (m, m), or a root of it, (m, any width), unless `measured` has its
+            own.
+        at: Point at which h is linearised, (n,); `None` is the predicted mean. Several hypotheses about one prediction
             differ in nothing else.
-        linearize: As in `extended`; so are the other arguments.
-        arithmetic: Covariances or roots.
+        linearize: As for `extended_kalman`, like all that follow.
+        arithmetic: Arithmetic of the update.
         residual: `(y, y_hat) -> y - y_hat`.
-        manifold: What the state lives on.
-        iterations: How often h is made linear.
+        manifold: Space of the states.
+        iterations: Steps of the update.
+        iterate_to: The point that they approach.
+
+    Returns:
+        The belief, and a `KalmanInfo`.
+
+    Raises:
+        ValueError: If shapes do not fit one another.
+        TypeError: If an argument is of another kind.
     """
-    y, mask, own_noise = measured if isinstance(measured, Observation) else Observation(measured)
-    noise = noise if own_noise is None else own_noise
+    y, mask, own_noise = _measured(measured)
+    name, noise = ("observation_noise", noise) if own_noise is None else ("Observation.noise", own_noise)
+    is_root = isinstance(belief, GaussianRoot)
+    if at is not None:
+        checks.shaped("at", at, belief.mean.shape, ", that of the mean")
     point = (lambda x: x) if manifold.flat else (lambda delta: manifold.retract(belief.mean, delta))
     start = belief.mean if manifold.flat else jnp.zeros(dimension(belief), belief.mean.dtype)
-    sight = _Sight(belief, start, y, mask, noise, lambda at: observe(point(at)), residual, linearize, arithmetic)
+    measurement = Measurement(
+        belief,
+        start,
+        y,
+        mask,
+        noise,
+        lambda coordinates: checks.predicted(observe(point(coordinates)), y, name, noise, is_root=is_root),
+        residual if is_difference(residual) else checks.residual_of(residual),
+        linearize,
+        arithmetic,
+    )
     offset = None if at is None else manifold.local(belief.mean, at)
-    posterior, report = _look(sight, offset)[:2] if iterations == 1 else _iterate(sight, offset, iterations)
+    if iterations == 1:
+        posterior, report, _ = linear_update(measurement, offset)
+    else:
+        posterior, report = iterated_update(measurement, offset, iterations, iterate_to == "mean")
     if manifold.flat:
         return posterior, report
     # What the arithmetic sees is an increment, which is finite about any mean.
     log_evidence = jnp.where(jnp.all(jnp.isfinite(belief.mean)), report.log_evidence, -jnp.inf)
     return retract_belief(manifold, belief.mean, posterior), replace(report, log_evidence=log_evidence)
-
-
-class _Sight(NamedTuple):
-    """An observation, and how the state would be seen at coordinates about the mean."""
-
-    belief: Belief
-    start: Array
-    """Coordinates of the mean: its numbers where the manifold is flat, else zeros."""
-    y: Array
-    mask: Array | None
-    noise: Array
-    predict: Callable
-    residual: Callable
-    linearize: Linearize
-    arithmetic: Arithmetic
-
-
-def _look(sight, offset):
-    """Belief in the coordinates, made linear at an increment (`None`: none); diagnostics; the linear observation."""
-    at = sight.start if offset is None else sight.start + offset
-    about = with_mean(sight.belief, at)
-    # Where the residual is a difference, that from a reference would only cost time.
-    if getattr(sight.residual, "func", sight.residual) is subtract:
-        seen = sight.linearize(sight.predict, about)
-        y, y_hat = sight.y, seen.value
-    else:
-        reference = sight.predict(at)
-        seen = sight.linearize(lambda x: sight.residual(sight.predict(x), reference), about)
-        read, y = _difference(sight, reference)
-        # A residual that is not finite is the model's fault, unless nothing was read.
-        y_hat = jnp.where(jnp.isfinite(y), seen.value, jnp.nan)
-        y = jnp.where(read, jnp.where(jnp.isfinite(y), y, 0.0), jnp.nan)
-    if offset is not None:
-        y_hat = y_hat - factor.apply(seen.F, offset)
-    prior = with_mean(sight.belief, sight.start)
-    posterior, report = sight.arithmetic.update(prior, y, seen.F, sight.noise, y_hat, sight.mask, seen.lost_root)
-    return posterior, report, seen
-
-
-def _difference(sight, y_hat):
-    """Which components were read, and the residual, 0 for the others."""
-    read = jnp.isfinite(sight.y) if sight.mask is None else jnp.isfinite(sight.y) & sight.mask
-    return read, jnp.where(read, sight.residual(jnp.where(read, sight.y, 0.0), y_hat), 0.0)
-
-
-def _iterate(sight, first, iterations):
-    """Gauss-Newton on the posterior's density (Bell and Cathey 1993), every step as long as lowers the cost.
-
-    An iterate is an increment P g: with g beside it, the cost of leaving the prior is g^T P g / 2, without an inverse
-    of P.
-    """
-
-    def refine(offset, dual):
-        posterior, report, seen = _look(sight, offset)
-        step, dual_step = posterior.mean - sight.start - offset, _dual(report, seen) - dual
-        misfit = _misfit(sight, report, seen)
-
-        def cost(length):
-            reached = offset + length * step
-            return 0.5 * jnp.sum((dual + length * dual_step) * reached) + misfit(reached)
-
-        lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype), 0.0)
-        costs = jax.vmap(cost)(lengths)
-        length = lengths[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
-        return offset + length * step, dual + length * dual_step, posterior, report
-
-    offset = dual = jnp.zeros(sight.start.shape, sight.start.dtype)
-    if first is not None:
-        # No increment P g leads there: what the prior says of it is not known, and the first step is a whole one.
-        posterior, report, seen = _look(sight, first)
-        offset, dual, iterations = posterior.mean - sight.start, _dual(report, seen), iterations - 1
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(refine, offset, dual)[2:])
-    refined = jax.lax.fori_loop(0, iterations, lambda _, found: refine(*found[:2]), (offset, dual, *nothing))
-    offset, _, posterior, report = refined
-    return with_mean(posterior, sight.start + offset), report
-
-
-def _dual(report, seen):
-    whitened = linalg.solve_triangular(report.innovation_root, report.innovation)
-    weights = linalg.solve_triangular(report.innovation_root, whitened, transpose=True)
-    return factor.apply(info.observed(_counts(report), seen.F).T, weights)
-
-
-def _misfit(sight, report, seen):
-    counts = _counts(report)
-    root = sight.arithmetic.noise_root(sight.noise, counts, seen.lost_root)
-
-    def misfit(delta):
-        missed = info.observed(counts, _difference(sight, sight.predict(sight.start + delta))[1])
-        return 0.5 * jnp.sum(linalg.solve_triangular(root, missed) ** 2)
-
-    return misfit
-
-
-def _counts(report):
-    return factor.diagonal(report.innovation_root) > 0
-
-
-def _check(prior, process_noise, observation_noise, arithmetic, iterations):
-    if not isinstance(prior, arithmetic.Belief):
-        raise ValueError(
-            f"prior must be a {arithmetic.Belief.__name__} for {arithmetic.__name__}; got a {type(prior).__name__}."
-        )
-    square = not isinstance(prior, GaussianRoot)
-    shape = jnp.shape(prior.covariance if square else prior.root)
-    if jnp.ndim(prior.mean) != 1 or len(shape) != 2 or (square and shape[0] != shape[1]):
-        raise ValueError(f"prior must be one belief; its mean has shape {jnp.shape(prior.mean)}, the rest {shape}.")
-    _check_noise("observation_noise", observation_noise, None, square)
-    if not callable(process_noise):
-        _check_noise("process_noise", process_noise, shape[0], square)
-    if not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations must be an integer of at least 1; got {iterations!r}.")
-
-
-def _check_noise(name, noise, size, square):
-    shape = jnp.shape(noise)
-    if len(shape) != 2 or (square and shape[0] != shape[1]) or (size is not None and shape[0] != size):
-        rows = "m" if size is None else size
-        form = f"a covariance, ({rows}, {rows})" if square else f"a root, ({rows}, any width)"
-        raise ValueError(f"{name} must be {form}; got shape {shape}.")

@@ -1,4 +1,7 @@
-"""A bank of one filter over hypotheses: branch, reject, weigh, merge and prune in a fixed number of slots.
+"""Gaussian sums: a bank of filters over hypotheses, which branch, merge and are pruned in a fixed number of slots.
+
+D. L. Alspach and H. W. Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Transactions
+on Automatic Control 17(4), 1972.
 
 The hypothesis axis is the *first* axis of every leaf: hypotheses are few and their matrices large, so that they are
 batches of whole-matrix operations rather than of scalars. A slot that is not used has the log weight `-inf`.
@@ -10,24 +13,26 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian import checks
 from jaxfilters.typing import AnyKey, as_pytree
 
 UNUSED, KEPT, REJECTED, MERGED, PRUNED, CROWDED_OUT, INVALID = range(7)
-"""What became of a candidate: never formed; kept; its margin was negative; it equals a heavier one; its weight was too
-small; all slots were taken by heavier ones; its evidence was not finite."""
+"""Fates of a candidate: never formed; kept; its margin was negative; merged into one of larger weight; its weight was
+too small; all slots were taken by candidates of larger weight; its evidence was not finite."""
 
 
 @runtime_checkable
 class Branch(Protocol):
-    """Ways to look at one observation from one hypothesis, e.g. at several points of linearisation.
+    """Interpretations of one observation under one hypothesis, e.g. by several points of linearisation.
 
-    Returns them stacked, leaves `(b, ...)`, each what `inner.update` takes as an observation, and which of them are
-    to be tried. All of them condition the same predicted hypothesis.
+    Returns them stacked, leaves `(b, ...)`, each an observation for `inner.update`, and which of them are to be tried.
+    All of them condition the same predicted hypothesis.
     """
 
     def __call__(self, state: PyTree, observation: PyTree, /) -> tuple[PyTree, Bool[Array, " b"]]: ...
@@ -35,16 +40,16 @@ class Branch(Protocol):
 
 @runtime_checkable
 class Margin(Protocol):
-    """How far an updated hypothesis is from being rejected; a negative one is."""
+    """How far an updated hypothesis is from being rejected: one with a negative margin is."""
 
     def __call__(self, state: PyTree, info: PyTree, /) -> Float[Array, ""]: ...
 
 
 @runtime_checkable
 class Same(Protocol):
-    """Whether two updated hypotheses say the same."""
+    """Whether two updated hypotheses, the one of larger weight first, are to be merged."""
 
-    def __call__(self, heavier: PyTree, lighter: PyTree, /) -> Bool[Array, ""]: ...
+    def __call__(self, larger: PyTree, smaller: PyTree, /) -> Bool[Array, ""]: ...
 
 
 class GaussianSumState(NamedTuple):
@@ -53,7 +58,7 @@ class GaussianSumState(NamedTuple):
     components: PyTree
     """States of the inner filter, leaves `(k, ...)`."""
     log_weights: Float[Array, " k"]
-    """`logsumexp(log_weights) == 0`; after an update in falling order."""
+    """Normalised, `logsumexp(log_weights) == 0`; in descending order after an update."""
 
 
 class GaussianSumInfo(NamedTuple):
@@ -66,18 +71,18 @@ class GaussianSumInfo(NamedTuple):
     parents: Int32[Array, " k"]
     """Slot before the update from which each hypothesis came."""
     branches: Int32[Array, " k"]
-    """Which way of looking at the observation made it: 0 is the first."""
+    """Branch of the observation that each hypothesis was updated with; 0 is the first."""
     num_hypotheses: Int32[Array, ""]
-    """Slots in use."""
+    """Number of slots in use."""
     fates: Int32[Array, "k b"]
-    """Of every candidate, by parent and branch: `UNUSED` ... `INVALID`."""
+    """Fate of every candidate, by parent and branch: `UNUSED` ... `INVALID`."""
     all_rejected: Bool[Array, ""]
     """Whether every candidate had a negative margin, and the one with the largest was kept."""
 
 
 @pytree_dataclass
 class GaussianSum:
-    """Parameters of a bank of filters."""
+    """Parameters of a filter made by `gaussian_sum`; its arguments describe them."""
 
     inner: Filter
     start: GaussianSumState | None
@@ -98,36 +103,60 @@ def gaussian_sum(
     same: Same | None = None,
     log_ratio: float = 12.0,
 ) -> Filter:
-    """A filter over hypotheses, each of them a state of `inner`, in `capacity` slots.
+    """Gaussian sum filter: a weighted bank of hypotheses, each a state of the filter `inner`, in `capacity` slots.
 
-    An update tries every branch of every hypothesis, drops those with a negative margin (unless all have one: then
-    the best stays, and the info says so), weighs them by the `log_evidence` of the inner update, lets the heaviest
-    of those that are the same stand for them, and keeps the heaviest `capacity` of them. Merged hypotheses of
-    different parents add their weights. Two branches of one parent that arrive at the same place have found one mode
-    of its posterior twice, and count once.
+    An update tries every branch of every hypothesis; rejects those with a negative margin (unless all have one: then
+    the one with the largest stays, and the info reports it); weighs them by the `log_evidence` of the inner update;
+    merges those that are the same into the one of largest weight; and keeps the `capacity` largest. Merged hypotheses
+    of different parents add their weights. Two branches of one parent that arrive at the same state have found one
+    mode of its posterior twice, and count once. The state is a `GaussianSumState`, the info a `GaussianSumInfo`.
 
     Args:
         inner: Filter of one hypothesis; its info needs `log_evidence`.
-        capacity: Number of slots.
+        capacity: Number of slots, at least 1.
         start: Hypotheses before the first observation, at most `capacity`; `None` starts with the one of `inner`.
-        branch: Ways to look at an observation; `None` is the observation itself.
-        margin: Rejects where negative; `None` rejects nothing.
-        same: Merges where true; `None` merges nothing.
-        log_ratio: Hypotheses whose log weight is this much below the heaviest one's are dropped.
+        branch: Interpretations of an observation, see `Branch`; `None` is the observation itself.
+        margin: `(state, info) -> margin`; a negative one rejects. `None` rejects nothing.
+        same: `(state, state) -> bool`; merges where true. `None` merges nothing.
+        log_ratio: Hypotheses whose log weight is this much below the largest are dropped; positive.
+
+    Returns:
+        The filter.
 
     Raises:
-        ValueError: If `capacity < 1`, `log_ratio <= 0`, or `start` has more hypotheses than `capacity`.
+        ValueError: If `capacity < 1`, `log_ratio <= 0`, or `start` has more hypotheses than `capacity`, another shape
+            than states of `inner`, or log weights that are not numbers.
+        TypeError: If `inner` is no filter, `start` no `GaussianSumState`, or `branch`, `margin` or `same` no function.
+
+    Example:
+        Two hypotheses about where a robot starts; the second observation tells them apart.
+
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
+        >>> places = jf.Gaussian(jnp.array([[-5.0], [5.0]]), jnp.ones((2, 1, 1)))
+        >>> start = jf.GaussianSumState(places, jnp.log(jnp.array([0.5, 0.5])))
+        >>> filter = jf.gaussian_sum(inner, capacity=4, start=start)
+        >>> last, _ = jf.run(filter, jax.random.key(0), jnp.array([[4.0], [4.5]]))
+        >>> bool(jf.map_component(last).mean[0] > 0)
+        True
     """
+    checks.is_filter("inner", inner)
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity must be an integer of at least 1; got {capacity!r}.")
     if not log_ratio > 0:
         raise ValueError(f"log_ratio must be positive; got {log_ratio!r}.")
-    if start is not None and start.log_weights.shape[0] > capacity:
-        raise ValueError(f"start must have at most capacity = {capacity} hypotheses; got {start.log_weights.shape[0]}.")
+    for name, value in (("branch", branch), ("margin", margin), ("same", same)):
+        if value is not None:
+            checks.function(name, value)
+    if start is not None:
+        _check_start(inner, start, capacity)
     params = GaussianSum(
         inner,
         start,
-        as_pytree(branch or _as_it_is),
+        as_pytree(branch or _unchanged),
         as_pytree(margin or _never_rejected),
         as_pytree(same or _never_the_same),
         float(log_ratio),
@@ -136,13 +165,46 @@ def gaussian_sum(
     return Filter(params, _init, _predict, _update)
 
 
+def _check_start(inner, start, capacity):
+    if not isinstance(start, GaussianSumState):
+        raise TypeError(f"start must be a GaussianSumState; got a {type(start).__name__}.")
+    checks.floating("start.log_weights", start.log_weights)
+    count = start.log_weights.shape
+    if len(count) != 1 or count[0] < 1:
+        raise ValueError(f"start.log_weights must have the shape (k,), k at least 1; got {count}.")
+    if count[0] > capacity:
+        raise ValueError(f"start must have at most capacity = {capacity} hypotheses; got {count[0]}.")
+    log_weights = checks.concrete(start.log_weights)
+    if log_weights is not None and not np.isfinite(np.max(log_weights)):
+        raise ValueError(f"start.log_weights must have a finite maximum; got {np.max(log_weights)}.")
+    one = jax.eval_shape(inner.init, inner.params, jax.random.key(0))
+    # As text: structures compare as equal where two classes have the same number of fields.
+    wanted, got = str(jax.tree.structure(one)), str(jax.tree.structure(start.components))
+    if wanted != got:
+        raise ValueError(f"start.components must be states of inner, {wanted}, stacked; got {got}.")
+    leaves = zip(jax.tree_util.tree_leaves_with_path(start.components), jax.tree.leaves(one), strict=True)
+    for (path, leaf), single in leaves:
+        if jnp.shape(leaf) != (*count, *single.shape):
+            raise ValueError(
+                f"start.components{jax.tree_util.keystr(path)} must have the shape {(*count, *single.shape)}, one "
+                f"state of inner for each of the log weights; got {jnp.shape(leaf)}."
+            )
+
+
 def map_component(state: GaussianSumState) -> PyTree:
-    """The inner state of the hypothesis with the largest weight."""
+    """State of `inner` in the hypothesis with the largest weight.
+
+    Args:
+        state: State of a `gaussian_sum` filter; for states with time first, use `jax.vmap(map_component)`.
+
+    Returns:
+        The state, e.g. a `Gaussian`.
+    """
     best = jnp.argmax(state.log_weights)
     return jax.tree.map(lambda leaf: leaf[best], state.components)
 
 
-def _as_it_is(state, observation):
+def _unchanged(state, observation):
     del state
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], observation), jnp.ones(1, bool)
 
@@ -152,8 +214,8 @@ def _never_rejected(state, info):
     return jnp.full_like(info.log_evidence, jnp.inf)
 
 
-def _never_the_same(heavier, lighter):
-    del heavier, lighter
+def _never_the_same(larger, smaller):
+    del larger, smaller
     return jnp.zeros((), bool)
 
 
@@ -226,27 +288,30 @@ def _usable(candidates: _Candidates) -> Float[Array, " m"]:
 
 def _form(model: GaussianSum, key: AnyKey, state: GaussianSumState, observation: PyTree) -> _Candidates:
     """Update every hypothesis with every branch of the observation that is to be tried."""
-    views, tried = jax.vmap(model.branch, (0, None))(state.components, observation)
+    readings, tried = jax.vmap(model.branch, (0, None))(state.components, observation)
     tried = tried & (state.log_weights > -jnp.inf)[:, None]
     parents, branches = jnp.indices(tried.shape, dtype=jnp.int32)
 
-    def look(key: AnyKey, component: PyTree, view: PyTree) -> tuple[Any, ...]:
-        after, info = model.inner.update(model.inner.params, key, component, view)
-        return after, info, model.margin(after, info)
+    def update(key: AnyKey, component: PyTree, reading: PyTree) -> tuple[Any, ...]:
+        after, info = model.inner.update(model.inner.params, key, component, reading)
+        margin = model.margin(after, info)
+        if jnp.shape(margin) != ():
+            raise ValueError(f"margin must return one number; got the shape {jnp.shape(margin)}.")
+        return after, info, margin
 
-    def pass_over(key: AnyKey, component: PyTree, view: PyTree) -> tuple[Any, ...]:
-        _, info, margin = jax.eval_shape(look, key, component, view)
+    def skip(key: AnyKey, component: PyTree, reading: PyTree) -> tuple[Any, ...]:
+        _, info, margin = jax.eval_shape(update, key, component, reading)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (info, margin))
         return component, *nothing
 
     def candidate(inputs: tuple) -> tuple[Any, ...]:
         is_tried, parent, branch = inputs
         component = jax.tree.map(lambda leaf: leaf[parent], state.components)
-        view = jax.tree.map(lambda leaf: leaf[parent, branch], views)
-        return jax.lax.cond(is_tried, look, pass_over, keys[parent], component, view)
+        reading = jax.tree.map(lambda leaf: leaf[parent, branch], readings)
+        return jax.lax.cond(is_tried, update, skip, keys[parent], component, reading)
 
-    # One after the other: few are tried in most frames, the others then cost nothing, and the factorisations of
-    # large matrices in a batch stand still in jaxlib 0.10 where two of them meet on a machine with two cores.
+    # One after the other: few are tried in most frames, and the others then cost nothing. In a batch, factorisations
+    # of large matrices can deadlock in jaxlib 0.10 where two of them meet on a machine with two cores.
     keys = jax.random.split(key, model.capacity)
     places = (tried.ravel(), parents.ravel(), branches.ravel())
     states, infos, margins = jax.lax.map(candidate, places)
@@ -268,16 +333,19 @@ def _rejected(candidates: _Candidates) -> tuple[_Candidates, Bool[Array, ""]]:
 
 
 def _merged(same: Same, candidates: _Candidates) -> _Candidates:
-    """Let the heaviest stand for all that are the same; candidates come in falling order of weight."""
+    """Merge all that are the same into the one of largest weight; candidates come in descending order of weight."""
+    found = jax.eval_shape(same, *[jax.tree.map(lambda leaf: leaf[0], candidates.states)] * 2)
+    if getattr(found, "shape", None) != ():
+        raise ValueError(f"same must return one boolean; got the shape {getattr(found, 'shape', None)}.")
     alike = jax.vmap(jax.vmap(same, (None, 0)), (0, None))(candidates.states, candidates.states)
     siblings = candidates.parents[:, None] == candidates.parents
     index = jnp.arange(len(candidates.fates))
 
     def absorb(carry: tuple, j: Array) -> tuple[tuple, None]:
         fates, log_weights = carry
-        heavier = (fates == KEPT) & alike[:, j] & (index < j)
-        first = jnp.argmax(heavier)
-        merges = jnp.any(heavier) & (fates[j] == KEPT)
+        larger = (fates == KEPT) & alike[:, j] & (index < j)
+        first = jnp.argmax(larger)
+        merges = jnp.any(larger) & (fates[j] == KEPT)
         adds = merges & ~siblings[first, j]
         gained = jnp.logaddexp(log_weights[first], jnp.where(adds, log_weights[j], -jnp.inf))
         log_weights = log_weights.at[first].set(jnp.where(adds, gained, log_weights[first]))

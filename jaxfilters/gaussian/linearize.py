@@ -1,7 +1,8 @@
-r"""Linear stand-ins for a function of a Gaussian: Taylor polynomials and sigma points.
+r"""Linear approximations of a function of a Gaussian: Taylor polynomials and sigma points.
 
-A strategy takes a function f and the belief about its argument, and answers with
-$f(x) \approx v + F (x - m) + \Lambda^{1/2} e$, e ~ N(0, I): a value, a matrix, and a root of what the matrix loses.
+A strategy takes a function f and the belief $N(m, P)$ about its argument, and returns
+$f(x) \approx v + F (x - m) + \Lambda^{1/2} e$, e ~ N(0, I): a value, a matrix, and a root of the covariance of the
+linearisation error.
 """
 
 import math
@@ -21,58 +22,106 @@ Function = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
 
 class Linearization(NamedTuple):
-    """A function of a Gaussian, as if it were linear."""
+    """A linear approximation of a function of a Gaussian."""
 
     value: Float[Array, " k"]
-    """Where the mean goes."""
+    """Value at the mean of the argument: v."""
     F: Float[Array, "k n"]
-    lost_root: Float[Array, "k w"]
-    """Root, of any width, of the covariance of the function that F does not explain; width 0 where it is ignored."""
+    """Matrix of the linear part, e.g. the Jacobian."""
+    residual_root: Float[Array, "k w"]
+    """Root, of any width w, of the covariance of the linearisation error; width 0 where it is ignored."""
 
 
 @runtime_checkable
 class Linearize(Protocol):
-    """Make a function of a Gaussian linear."""
+    """Approximate a function of a Gaussian by a linear one."""
 
     def __call__(self, f: Function, belief: Gaussian | GaussianRoot, /) -> Linearization: ...
 
 
 def taylor(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
-    """Value and Jacobian at the mean; what is lost is ignored."""
+    """First-order Taylor polynomial at the mean, for the extended Kalman filter; the linearisation error is ignored.
+
+    Args:
+        f: Function, (n,) to (k,).
+        belief: Belief about its argument.
+
+    Returns:
+        Value and Jacobian, with a `residual_root` of width 0.
+    """
     value, F = _value_and_jacobian(f, belief.mean)
     return Linearization(value, F, jnp.zeros((value.size, 0), value.dtype))
 
 
 def second_order_covariance_only(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
-    r"""Value and Jacobian at the mean; what is lost is the covariance of the quadratic term.
+    r"""Value and Jacobian at the mean; the linearisation error has the covariance of the quadratic term.
 
     With Hessians $F_k$ and a covariance $P = L L^T$, $\Lambda_{kl} = \frac12 \operatorname{tr}(F_k P F_l P)
-    = \frac12 \langle L^T F_k L, L^T F_l L \rangle$ (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with
-    Applications to Tracking and Navigation", 2001, section 10.3.2).
+    = \frac12 \langle L^T F_k L, L^T F_l L \rangle$. Unlike in the second-order filter of the textbooks, `second_order`,
+    the value is that at the mean, without the mean of the quadratic term.
+
+    Args:
+        f: Function, (n,) to (k,).
+        belief: Belief about its argument.
+
+    Returns:
+        Value, Jacobian, and a `residual_root` of width n^2 (n the columns of the belief's root).
     """
     return _second_order(f, belief)[0]
 
 
 def second_order(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
-    r"""As `second_order`, with the mean of the quadratic term, $\frac12 \operatorname{tr}(F_k P)$, in the value."""
-    linearization, along = _second_order(f, belief)
-    return linearization._replace(value=linearization.value + 0.5 * jnp.trace(along, axis1=1, axis2=2))
+    r"""Second-order Taylor polynomial at the mean: its mean, its Jacobian, and the covariance of its quadratic term.
+
+    The value is $f(m) + \frac12 [\operatorname{tr}(F_k P)]_k$ with the Hessians $F_k$, the covariance of the
+    linearisation error $\Lambda_{kl} = \frac12 \operatorname{tr}(F_k P F_l P)$ (Y. Bar-Shalom, X. R. Li and T.
+    Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 10.3.2).
+
+    Args:
+        f: Function, (n,) to (k,).
+        belief: Belief about its argument.
+
+    Returns:
+        Mean, Jacobian, and a `residual_root` of width n^2 (n the columns of the belief's root).
+    """
+    linearization, curvature = _second_order(f, belief)
+    return linearization._replace(value=linearization.value + 0.5 * jnp.trace(curvature, axis1=1, axis2=2))
 
 
 def cubature(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
-    """Regression on the 2n points of the third-degree spherical-radial rule (Arasaratnam and Haykin 2009, eq. 32)."""
+    """Regression on the 2 n points of the third-degree spherical-radial rule, for the cubature Kalman filter.
+
+    I. Arasaratnam and S. Haykin, "Cubature Kalman filters", IEEE Transactions on Automatic Control 54(6), 2009,
+    equation 32.
+
+    Args:
+        f: Function, (n,) to (k,).
+        belief: Belief about its argument.
+
+    Returns:
+        Mean, matrix of the regression, and a `residual_root` of width n.
+    """
     return _sigma_points(f, belief, belief.mean.size, -1.0)
 
 
 def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Linearize:
-    r"""Regression on the 2n + 1 points of the scaled unscented transform (Wan and van der Merwe 2000, eq. 15).
+    r"""Regression on the 2 n + 1 points of the scaled unscented transform, for the unscented Kalman filter.
 
-    The points lie $\alpha \sqrt{n + \kappa}$ standard deviations away. The mean is exact for cubic functions; with
-    `beta` 2 the variance is for a quadratic one of a scalar. A small `alpha` loses digits: 1e-3 leaves none of
-    float32's in the curvature.
+    The points lie $\alpha \sqrt{n + \kappa}$ standard deviations from the mean (E. A. Wan and R. van der Merwe, "The
+    unscented Kalman filter for nonlinear estimation", AS-SPCC 2000, equation 15). The mean is exact for cubic
+    functions; with `beta` 2 the variance is exact for a quadratic function of a scalar. A small `alpha` costs digits:
+    with 1e-3 no digit of the curvature is left in float32.
+
+    Args:
+        alpha: Relative distance of the points, positive.
+        beta: Weight of the centre point in the covariance, at least 0.
+        kappa: Addition to the dimension n, at least 0.
+
+    Returns:
+        The strategy, `(f, belief) -> Linearization`; those of equal numbers are equal.
 
     Raises:
-        ValueError: If `alpha` is not positive, `beta` or `kappa` negative: the covariance could be indefinite.
+        ValueError: If `alpha` is not positive, or `beta` or `kappa` is negative: the covariance could be indefinite.
     """
     if not alpha > 0:
         raise ValueError(f"alpha must be positive; got {alpha!r}.")
@@ -93,7 +142,7 @@ class _Unscented:
 
 
 def lower_root(belief: Gaussian | GaussianRoot) -> Float[Array, "n n"]:
-    """Lower root of the covariance; zero diagonal elements where components are certain or dependent."""
+    """Lower root of the covariance of a belief; zero diagonal elements where components are certain or dependent."""
     return factor.root(belief.covariance) if isinstance(belief, Gaussian) else linalg.tria(belief.root)
 
 
@@ -115,14 +164,14 @@ def _second_order(f, belief):
         return jax.vmap(lambda direction: jax.jvp(f, (x,), (direction,))[1], in_axes=-1, out_axes=-1)(root)
 
     value, F = _value_and_jacobian(f, belief.mean)
-    bend = lambda direction: jax.jvp(slopes, (belief.mean,), (direction,))[1]
-    along = jax.vmap(bend, in_axes=-1, out_axes=-1)(root)
-    return Linearization(value, F, along.reshape(value.size, -1) / math.sqrt(2)), along
+    second = lambda direction: jax.jvp(slopes, (belief.mean,), (direction,))[1]
+    curvature = jax.vmap(second, in_axes=-1, out_axes=-1)(root)
+    return Linearization(value, F, curvature.reshape(value.size, -1) / math.sqrt(2)), curvature
 
 
 def _sigma_points(f, belief, spread, excess):
     # The points m +- sqrt(c) L e_i give differences from f(m) with an even part E and an odd part. The odd part is the
-    # regression, F L; the even part is all it loses: E E^T / c + (beta - alpha^2) b b^T, with b = E 1 / c.
+    # regression, F L; the even part is its error: E E^T / c + (beta - alpha^2) b b^T, with b = E 1 / c.
     n = belief.mean.size
     root, scale = lower_root(belief), math.sqrt(spread)
     centre = f(belief.mean)
@@ -135,5 +184,4 @@ def _sigma_points(f, belief, spread, excess):
     F = linalg.solve_triangular(root, odd.T / scale, transpose=True).T
     mean = jnp.mean(even, axis=1)
     share = math.sqrt(1 + excess * n / spread) - 1
-    lost = (even + share * mean[:, None]) / scale
-    return Linearization(centre + n / spread * mean, F, lost)
+    return Linearization(centre + n / spread * mean, F, (even + share * mean[:, None]) / scale)

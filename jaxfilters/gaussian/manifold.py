@@ -1,4 +1,4 @@
-r"""States that are not vectors: points that increments move, with beliefs whose covariance is about the increments.
+r"""Manifolds: states that are not vectors, and beliefs whose covariance is about increments.
 
 A belief on a manifold has its mean there, as an array of numbers, and its covariance in the tangent space at the mean:
 $x = m \boxplus \delta$, $\delta \sim N(0, P)$ (C. Hertzberg et al., "Integrating generic sensor fusion algorithms with
@@ -24,7 +24,7 @@ Belief = Gaussian | GaussianRoot
 
 @pytree_dataclass
 class Manifold:
-    """How increments move points, and which increment leads from one point to another."""
+    """A space of states, by how increments move points and which increment leads from one point to another."""
 
     retract: Callable[[Array, Array], Array]
     """`(x, delta) -> x`; increments have as many components as the tangent space has dimensions."""
@@ -35,7 +35,7 @@ class Manifold:
 
 
 def add(x: Float[Array, " n"], delta: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Move a point of a vector space."""
+    """The point of a vector space that an increment leads to."""
     return x + delta
 
 
@@ -45,39 +45,54 @@ def displacement(x: Float[Array, " n"], other: Float[Array, " n"]) -> Float[Arra
 
 
 euclidean = Manifold(add, displacement, flat=True)
+"""Vector spaces."""
 
 
 class Block(NamedTuple):
-    """A run of numbers in a state that moves on a manifold of its own."""
+    """A part of a state that has a manifold of its own."""
 
     manifold: Manifold
     size: int
-    """How many numbers a point has."""
+    """Number of components of a point."""
     dimension: int
-    """How many an increment has."""
+    """Number of components of an increment."""
 
 
 rotation = Block(Manifold(lie.so3_retract, lie.so3_local), 4, 3)
-"""A unit quaternion `(w, x, y, z)`, turned by rotation vectors in radians about axes that turn with it."""
+"""A unit quaternion `(w, x, y, z)`; increments are rotation vectors in radians about the axes of the rotated frame."""
 
 
 def vector(size: int) -> Block:
-    """Numbers without further structure."""
+    """A part that is a vector of `size` components."""
     return Block(euclidean, size, size)
 
 
 def product(*blocks: Block) -> Manifold:
-    """States that are runs of numbers one behind the other, each on its own manifold.
+    """Manifold of states that are concatenated parts, each with its own manifold.
 
-    A rigid body's pose and velocity: `product(vector(3), rotation, vector(6))`, 13 numbers with 12 dimensions.
+    Args:
+        blocks: The parts, in the order of their components.
+
+    Returns:
+        The manifold. Its functions raise a `ValueError` for points and increments of another size.
 
     Raises:
         ValueError: If there is no block.
+        TypeError: If an argument is no `Block`.
+
+    Example:
+        The pose and velocity of a rigid body: 13 components with 12 dimensions.
+
+        >>> import jaxfilters as jf
+        >>> pose = jf.manifold.product(jf.manifold.vector(3), jf.manifold.rotation, jf.manifold.vector(6))
     """
     if not blocks:
         raise ValueError("product needs at least one block; got none.")
-    both = _Product(blocks)
-    return Manifold(both.retract, both.local, flat=all(block.manifold.flat for block in blocks))
+    for block in blocks:
+        if not isinstance(block, Block):
+            raise TypeError(f"product needs Blocks, such as rotation and vector(3); got a {type(block).__name__}.")
+    whole = _Product(blocks)
+    return Manifold(whole.retract, whole.local, flat=all(block.manifold.flat for block in blocks))
 
 
 @pytree_dataclass
@@ -86,44 +101,46 @@ class _Product:
 
     def retract(self, x: Array, delta: Array) -> Array:
         sizes, dimensions = [block.size for block in self.blocks], [block.dimension for block in self.blocks]
-        parts = zip(self.blocks, _runs(x, sizes), _runs(delta, dimensions), strict=True)
+        parts = zip(self.blocks, _parts("state", x, sizes), _parts("increment", delta, dimensions), strict=True)
         return jnp.concatenate([block.manifold.retract(*pair) for block, *pair in parts])
 
     def local(self, x: Array, other: Array) -> Array:
         sizes = [block.size for block in self.blocks]
-        parts = zip(self.blocks, _runs(x, sizes), _runs(other, sizes), strict=True)
+        parts = zip(self.blocks, _parts("state", x, sizes), _parts("state", other, sizes), strict=True)
         return jnp.concatenate([block.manifold.local(*pair) for block, *pair in parts])
 
 
-def _runs(x, sizes):
+def _parts(name, x, sizes):
+    if jnp.shape(x) != (sum(sizes),):
+        raise ValueError(f"a {name} of this product must have the shape ({sum(sizes)},); got {jnp.shape(x)}.")
     stops = [sum(sizes[: i + 1]) for i in range(len(sizes))]
     return [x[stop - size : stop] for size, stop in zip(sizes, stops, strict=True)]
 
 
 def hashable(manifold: Manifold) -> Manifold:
-    """The manifold with its functions as pytrees: their parameters are leaves."""
+    """The manifold with its functions as pytrees, so that arrays in them are parameters of the filter."""
     return Manifold(as_pytree(manifold.retract), as_pytree(manifold.local), manifold.flat)
 
 
 def increments(belief: Belief) -> Belief:
-    """Belief in the increment from the mean: the same covariance about zero."""
+    """Belief about the increment from the mean: the same covariance about zero."""
     return with_mean(belief, jnp.zeros(dimension(belief), belief.mean.dtype))
 
 
 def dimension(belief: Belief) -> int:
-    """Dimensions of the tangent space."""
+    """Dimension of the tangent space."""
     return (belief.covariance if isinstance(belief, Gaussian) else belief.root).shape[0]
 
 
 def with_mean(belief: Belief, mean: Float[Array, " size"], J: Float[Array, "m n"] | None = None) -> Belief:
-    """Belief with this mean, its covariance `J P J^T` where a J is given."""
+    """Belief with another mean; its covariance becomes `J P J^T` if J is given."""
     if isinstance(belief, Gaussian):
         return Gaussian(mean, belief.covariance if J is None else factor.turned(J, belief.covariance))
     return GaussianRoot(mean, belief.root if J is None else linalg.matmul(J, belief.root))
 
 
 def retract_belief(manifold: Manifold, x: Array, belief: Belief) -> Belief:
-    """Belief in `x ⊞ delta`, given that in delta: its mean moved, its covariance in the tangent space there."""
+    """Belief about `x ⊞ delta`, given that about delta: its covariance is in the tangent space at the new mean."""
     mean = manifold.retract(x, belief.mean)
     if manifold.flat:
         return with_mean(belief, mean)
@@ -133,7 +150,7 @@ def retract_belief(manifold: Manifold, x: Array, belief: Belief) -> Belief:
 
 
 def to_tangent(manifold: Manifold, x: Array, belief: Belief) -> Belief:
-    """Belief in the increment delta from x, given that in `x ⊞ delta`; the inverse of `settle`."""
+    """Belief about the increment delta from x, given that about `x ⊞ delta`; the inverse of `retract_belief`."""
     mean = manifold.local(x, belief.mean)
     if manifold.flat:
         return with_mean(belief, mean)

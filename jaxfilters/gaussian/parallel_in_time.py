@@ -2,11 +2,11 @@ r"""Kalman filter and smoother of long sequences in logarithmic depth, on roots 
 
 $$x_t = F_t x_{t-1} + b_t + q_t,\ q_t \sim N(0, Q_t),\qquad y_t = H_t x_t + d_t + r_t,\ r_t \sim N(0, R_t).$$
 
-What all frames from one to another say is an element; elements are combined by an associative operator, in any
-grouping, so that `jax.lax.associative_scan` needs about 2 log2 T rounds instead of T steps (F. Yaghoobi, A. Corenflos,
-S. Hassan, S. Särkkä, "Parallel square-root statistical linear regression for inference in nonlinear state space
-models", 2022, sections 3 and 4). There is more to compute, several times over: for accelerators and long sequences. On
-a CPU the filters of `jaxfilters.extended` are faster.
+An element summarises a run of frames; elements are combined by an associative operator, in any grouping, so that
+`jax.lax.associative_scan` needs about 2 log2 T rounds instead of T steps (F. Yaghoobi, A. Corenflos, S. Hassan,
+S. Särkkä, "Parallel square-root statistical linear regression for inference in nonlinear state space models", 2022,
+sections 3 and 4). The total number of operations is several times larger: it is meant for accelerators and long
+sequences. On a CPU, `kalman` and `smoothing.rts` are faster.
 """
 
 import math
@@ -17,22 +17,28 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import GaussianRoot
+from jaxfilters.gaussian.manifold import euclidean
 from jaxfilters.math import linalg
 from jaxfilters.math.linalg import tria
 
 
 class LinearModel(NamedTuple):
-    """The steps of a linear Gaussian model: every field with time first, or without time if it never changes."""
+    """A linear Gaussian model: every field with time as its first axis, or without time if it is constant."""
 
     F: Float[Array, "*t n n"]
+    """Transition matrix."""
     root_Q: Float[Array, "*t n _"]
     """Any root of the process noise covariance."""
     H: Float[Array, "*t m n"]
+    """Observation matrix."""
     root_R: Float[Array, "*t m _"]
     """Any root of the observation noise covariance."""
     b: Float[Array, "*t n"] | float = 0.0
+    """Known input of the transition."""
     d: Float[Array, "*t m"] | float = 0.0
+    """Known offset of the observation."""
 
 
 class _Step(NamedTuple):
@@ -47,9 +53,9 @@ class _Step(NamedTuple):
 
 
 class _Past(NamedTuple):
-    """What some frames say of the state x before them, and of their last state given x.
+    """Some frames, given the state x before them.
 
-    The latter is N(A x + b, U U^T); the likelihood of x is exp(eta^T x - |Z^T x|^2 / 2).
+    Their last state is N(A x + b, U U^T); the likelihood of x is exp(eta^T x - |Z^T x|^2 / 2).
     """
 
     A: Array
@@ -60,7 +66,7 @@ class _Past(NamedTuple):
 
 
 class _Future(NamedTuple):
-    """A state given a later one, and all observations until then, is N(E x + g, L L^T)."""
+    """A state, given a later state x and all observations before it, is N(E x + g, L L^T)."""
 
     E: Array
     g: Array
@@ -71,23 +77,45 @@ class _Future(NamedTuple):
 def parallel_kalman(
     prior: GaussianRoot, model: LinearModel, ys: Float[Array, "t m"], mask: Bool[Array, "t m"] | None = None
 ) -> tuple[GaussianRoot, Float[Array, " t"]]:
-    """Beliefs after every observation, time first, and the log evidence of each given those before it.
+    """Kalman filter in logarithmic depth: beliefs after every observation, and the log evidence of each.
 
     Args:
-        prior: Belief before the first step.
-        model: The steps.
-        ys: Observations; NaN where nothing was read.
-        mask: False for components that were not seen, whatever `ys` holds there.
+        prior: Belief before the first step, with a mean of shape (n,).
+        model: The model.
+        ys: Observations (t, m); NaN where nothing was read.
+        mask: False for components to leave out, (t, m), whatever `ys` holds there.
+
+    Returns:
+        Beliefs (t, n) and (t, n, n), and log p(y_t | y_1:t-1), (t,), in nats.
 
     Raises:
-        ValueError: If a field of `model` has another length than `ys`.
+        ValueError: If shapes do not fit one another, or a field of `model` has another length than `ys`.
+        TypeError: If an argument is of another kind.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.GaussianRoot(jnp.zeros(1), jnp.eye(1))
+        >>> model = jf.smoothing.LinearModel(jnp.eye(1), 0.3 * jnp.eye(1), jnp.eye(1), jnp.eye(1))
+        >>> beliefs, log_evidences = jf.smoothing.parallel_kalman(prior, model, jnp.ones((8, 1)))
+        >>> smoothed = jf.smoothing.parallel_rts(beliefs, model)
+        >>> smoothed.mean.shape, log_evidences.shape
+        ((8, 1), (8,))
     """
+    checks.belief("prior", prior, GaussianRoot)
+    checks.on_manifold("prior", prior, euclidean)
+    checks.floating("ys", ys)
+    if ys.ndim != 2 or ys.shape[0] < 1:
+        raise ValueError(f"ys must have the shape (t, m), t at least 1; got {ys.shape}.")
+    if mask is not None:
+        checks.boolean("mask", mask, ys.shape, ", that of ys")
+    _check_model(model, prior.mean.shape[0], ys.shape[1])
     steps = _of_every_frame(model, ys)
-    seen = jnp.isfinite(ys) if mask is None else jnp.isfinite(ys) & mask
+    read = jnp.isfinite(ys) if mask is None else jnp.isfinite(ys) & mask
     steps = steps._replace(
-        H=jnp.where(seen[..., None], steps.H, 0.0), root_R=jnp.where(seen[..., None], steps.root_R, 0.0)
+        H=jnp.where(read[..., None], steps.H, 0.0), root_R=jnp.where(read[..., None], steps.root_R, 0.0)
     )
-    residuals = jnp.where(seen, jnp.where(seen, ys, 0.0) - steps.d, 0.0)
+    residuals = jnp.where(read, jnp.where(read, ys, 0.0) - steps.d, 0.0)
     elements = jax.vmap(_past)(steps, residuals)
     first = _first(prior, jax.tree.map(lambda leaf: leaf[0], steps), residuals[0])
     elements = jax.tree.map(lambda leaf, start: leaf.at[0].set(start), elements, first)
@@ -100,11 +128,28 @@ def parallel_kalman(
 
 @jax.jit
 def parallel_rts(beliefs: GaussianRoot, model: LinearModel) -> GaussianRoot:
-    """Beliefs given the whole sequence, from those of `filter_in_parallel`, time first.
+    """Rauch-Tung-Striebel smoother in logarithmic depth: beliefs given the whole sequence.
+
+    Args:
+        beliefs: Beliefs of `parallel_kalman`, (t, n) and (t, n, n).
+        model: The same model.
+
+    Returns:
+        The smoothed beliefs, time first.
 
     Raises:
-        ValueError: If a field of `model` has another length than `beliefs`.
+        ValueError: If shapes do not fit one another, or a field of `model` has another length than `beliefs`.
+        TypeError: If an argument is of another kind.
     """
+    if not isinstance(beliefs, GaussianRoot):
+        raise TypeError(f"beliefs must be a GaussianRoot with time first; got a {type(beliefs).__name__}.")
+    checks.floating("beliefs.mean", beliefs.mean)
+    if beliefs.mean.ndim != 2 or jnp.shape(beliefs.root) != (*beliefs.mean.shape, beliefs.mean.shape[1]):
+        raise ValueError(
+            "beliefs must have a mean of shape (t, n) and a root of shape (t, n, n); "
+            f"got {beliefs.mean.shape} and {jnp.shape(beliefs.root)}."
+        )
+    _check_model(model, beliefs.mean.shape[1], None)
     steps = _of_every_frame(model, beliefs.mean)
     following = jax.tree.map(lambda leaf: leaf[1:], steps)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
@@ -115,21 +160,40 @@ def parallel_rts(beliefs: GaussianRoot, model: LinearModel) -> GaussianRoot:
     return GaussianRoot(found.g, found.L)
 
 
+def _check_model(model: LinearModel, n: int, m: int | None) -> None:
+    if not isinstance(model, LinearModel):
+        raise TypeError(f"model must be a LinearModel; got a {type(model).__name__}.")
+    for name, rows, columns in (("F", n, n), ("root_Q", n, None), ("H", m, n), ("root_R", m, None)):
+        value = getattr(model, name)
+        checks.floating(f"model.{name}", value)
+        shape = value.shape
+        fits = len(shape) in (2, 3) and all(
+            wanted is None or wanted == size for wanted, size in zip((rows, columns), shape[-2:], strict=True)
+        )
+        if not fits:
+            wanted = f"({'m' if rows is None else rows}, {'any width' if columns is None else columns})"
+            raise ValueError(f"model.{name} must have the shape {wanted}, after an axis of time if any; got {shape}.")
+    for name, size in (("b", n), ("d", m)):
+        shape = jnp.shape(getattr(model, name))
+        if shape and (len(shape) > 2 or (size is not None and shape[-1] != size)):
+            raise ValueError(f"model.{name} must have the shape ({size},), after an axis of time if any; got {shape}.")
+
+
 def _past(step: _Step, y: Array) -> _Past:
     """One frame, given the state before it."""
     n = step.F.shape[0]
     root, gain, rest = _conditioned(step.H, step.root_Q, step.root_R)
-    surprise = y - _times(step.H, step.b)
-    seen = linalg.matmul(step.H, step.F)
-    whitened = linalg.solve_triangular(root, seen)
+    innovation = y - _times(step.H, step.b)
+    HF = linalg.matmul(step.H, step.F)
+    whitened = linalg.solve_triangular(root, HF)
     Z = linalg.tria(whitened.T)
-    A = step.F - linalg.matmul(gain, seen)
-    eta = _times(whitened.T, linalg.solve_triangular(root, surprise))
-    return _Past(A, step.b + _times(gain, surprise), rest[:, :n], eta, Z)
+    A = step.F - linalg.matmul(gain, HF)
+    eta = _times(whitened.T, linalg.solve_triangular(root, innovation))
+    return _Past(A, step.b + _times(gain, innovation), rest[:, :n], eta, Z)
 
 
 def _first(prior: GaussianRoot, step: _Step, y: Array) -> _Past:
-    """The first frame, with the prior in it: what comes before does not matter."""
+    """The first frame together with the prior: nothing depends on a state before it."""
     n = step.F.shape[0]
     mean = _times(step.F, prior.mean) + step.b
     root, gain, rest = _conditioned(step.H, _predicted(prior, step), step.root_R)
@@ -190,7 +254,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _conditioned(H: Array, root_P: Array, root_R: Array) -> tuple[Array, Array, Array]:
-    """Root of the covariance of H x + r, the gain, and the root of what is not known of x after that was seen."""
+    """Root of the covariance of H x + r, the gain, and a root of the covariance of x given H x + r."""
     m, n = H.shape
     above = jnp.hstack([linalg.matmul(H, root_P), root_R])
     below = jnp.hstack([root_P, jnp.zeros((n, root_R.shape[1]), root_P.dtype)])

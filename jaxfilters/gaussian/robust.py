@@ -1,11 +1,11 @@
-r"""Observations of which some are wild: a Gaussian filter that asks of each how far it may be trusted.
+r"""Gaussian filters for observations with outliers: each observation is weighted by the probability that it is none.
 
 $$y_t = h(x_t) + r_t,\qquad r_t \sim (1 - \epsilon) N(0, R) + \epsilon N(0, R_o),$$
 
-the contaminated normal (J. Tukey, "A survey of sampling from contaminated distributions", 1960). The belief is the
-mixture of what the two noises would make of it, as one Gaussian with the same mean and covariance. All of it is
-smooth, so that the share of outliers and their noise can be learnt; and as an outlier still says something, a filter
-that has gone astray comes back.
+the contaminated normal (J. W. Tukey, "A survey of sampling from contaminated distributions", in "Contributions to
+Probability and Statistics", 1960). The posterior is a mixture of those that the two noises give, and is replaced by one
+Gaussian with the same mean and covariance. It is a smooth function of the parameters, so that the share of outliers
+and their noise can be estimated by gradients; and as outliers keep some weight, a filter that has diverged recovers.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import ExtendedKalman, Observation
@@ -26,16 +27,16 @@ class RobustInfo(NamedTuple):
     """Diagnostics of one update."""
 
     log_evidence: Float[Array, ""]
-    """Log density of the observation, wild or not."""
+    """Log density of the observation under both noises, given all observations before it."""
     inner: KalmanInfo
-    """Of the update that trusts the observation."""
+    """Diagnostics of the update with the inlier noise."""
     inlier_probability: Float[Array, ""]
-    """Probability that it is not wild; 1 - `outlier_probability` where nothing was seen."""
+    """Probability that the observation is no outlier; 1 - `outlier_probability` where nothing was read."""
 
 
 @pytree_dataclass
 class Robust:
-    """Parameters of a filter whose observations may be wild."""
+    """Parameters of a filter made by `robust`; its arguments describe them."""
 
     inner: Filter
     outlier_probability: Float[Array, ""]
@@ -43,27 +44,51 @@ class Robust:
 
 
 def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier_noise: Float[Array, "m m"]) -> Filter:
-    """The filter `inner` for observations of which a share has another, larger noise.
+    """Gaussian filter `inner` for observations of which a share are outliers with another, larger noise.
 
-    An observation is wild as a whole: rows that go astray one by one are observations of their own.
+    An observation is an outlier as a whole; components that fail one by one are observations of their own. The state
+    is the `Gaussian` of `inner`, the info a `RobustInfo`.
 
     Args:
-        inner: Made by `extended`, with covariances (not `kalman.square_root`).
-        outlier_probability: Share of observations that are wild, in (0, 1).
-        outlier_noise: Covariance of their noise.
+        inner: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman` with a `Gaussian`
+            prior, i.e. not for `jf.arithmetic.square_root`.
+        outlier_probability: Share of the observations that are outliers, in (0, 1).
+        outlier_noise: Covariance of the noise of outliers, (m, m).
+
+    Returns:
+        The filter.
 
     Raises:
-        ValueError: If `inner` is another kind of filter, or `outlier_noise` no covariance.
+        ValueError: If `inner` is another kind of filter; if `outlier_probability` is outside (0, 1); if `outlier_noise`
+            is no covariance or has another shape than the observation noise of `inner`.
+        TypeError: If `inner` is no filter, or `outlier_noise` no array of floating-point numbers.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
+        >>> filter = jf.robust(inner, 0.05, 100.0 * jnp.eye(1))
+        >>> y = jnp.array([[0.1], [30.0], [0.2]])
+        >>> _, (beliefs, infos) = jf.run(filter, jax.random.key(0), y)
+        >>> (infos.inlier_probability > 0.5).tolist()
+        [True, False, True]
     """
+    checks.is_filter("inner", inner)
     if not isinstance(inner.params, ExtendedKalman) or not isinstance(inner.params.prior, Gaussian):
         raise ValueError(
-            f"inner must be made by extended with a Gaussian prior; its parameters are {type(inner.params).__name__}."
+            "inner must be made by extended_kalman (or kalman, unscented_kalman, cubature_kalman) with a Gaussian "
+            f"prior; its parameters are {type(inner.params).__name__}."
         )
-    if jnp.shape(outlier_noise) != jnp.shape(inner.params.observation_noise):
-        raise ValueError(
-            f"outlier_noise must be shaped as inner's observation_noise, "
-            f"{jnp.shape(inner.params.observation_noise)}; got {jnp.shape(outlier_noise)}."
-        )
+    checks.probability("outlier_probability", outlier_probability)
+    checks.shaped(
+        "outlier_noise",
+        outlier_noise,
+        jnp.shape(inner.params.observation_noise),
+        ", that of the observation noise of inner",
+    )
+    checks.noise("outlier_noise", outlier_noise, None, is_root=False)
     return Filter(Robust(inner, jnp.asarray(outlier_probability), outlier_noise), _init, _predict, _update)
 
 
@@ -77,24 +102,20 @@ def _predict(model: Robust, key: AnyKey, belief: Gaussian, control: PyTree) -> G
 
 def _update(model: Robust, key: AnyKey, belief: Gaussian, observation: PyTree) -> tuple[Gaussian, RobustInfo]:
     inner = model.inner.params
-    wildly = (observation if isinstance(observation, Observation) else Observation(observation))._replace(
-        noise=model.outlier_noise
-    )
-    trusting, info = model.inner.update(inner, key, belief, observation)
-    doubting, wild_info = model.inner.update(inner, key, belief, wildly)
-    usual = jnp.log1p(-model.outlier_probability) + info.log_evidence
-    wild = jnp.log(model.outlier_probability) + wild_info.log_evidence
-    inlier_probability = jax.nn.sigmoid(usual - wild)
-    return _merged(inner, doubting, trusting, inlier_probability), RobustInfo(
-        jnp.logaddexp(usual, wild), info, inlier_probability
+    observed = observation if isinstance(observation, Observation) else Observation(observation)
+    inlier, inlier_info = model.inner.update(inner, key, belief, observed)
+    outlier, outlier_info = model.inner.update(inner, key, belief, observed._replace(noise=model.outlier_noise))
+    log_inlier = jnp.log1p(-model.outlier_probability) + inlier_info.log_evidence
+    log_outlier = jnp.log(model.outlier_probability) + outlier_info.log_evidence
+    inlier_probability = jax.nn.sigmoid(log_inlier - log_outlier)
+    return _merged(inner, inlier, outlier, inlier_probability), RobustInfo(
+        jnp.logaddexp(log_inlier, log_outlier), inlier_info, inlier_probability
     )
 
 
-def _merged(
-    model: ExtendedKalman, doubting: Gaussian, trusting: Gaussian, inlier_probability: Float[Array, ""]
-) -> Gaussian:
-    """One Gaussian for both; on a manifold the two tangent spaces are taken for one, as far as they are apart."""
-    moved = model.manifold.local(doubting.mean, trusting.mean)
-    covariance = inlier_probability * trusting.covariance + (1 - inlier_probability) * doubting.covariance
-    spread = inlier_probability * (1 - inlier_probability) * factor.outer(moved[:, None], moved[:, None])
-    return Gaussian(model.manifold.retract(doubting.mean, inlier_probability * moved), covariance + spread)
+def _merged(model: ExtendedKalman, inlier: Gaussian, outlier: Gaussian, probability: Float[Array, ""]) -> Gaussian:
+    """One Gaussian with the moments of both; on a manifold the tangent spaces at the two means are taken to be one."""
+    apart = model.manifold.local(outlier.mean, inlier.mean)
+    covariance = probability * inlier.covariance + (1 - probability) * outlier.covariance
+    spread = probability * (1 - probability) * factor.outer(apart[:, None], apart[:, None])
+    return Gaussian(model.manifold.retract(outlier.mean, probability * apart), covariance + spread)

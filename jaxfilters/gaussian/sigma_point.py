@@ -1,30 +1,134 @@
-"""Sigma-point filters: `extended_kalman` with a regression on points in place of derivatives."""
+"""Sigma-point Kalman filters: `extended_kalman` with a regression on points in place of derivatives."""
 
-from typing import Any
+from collections.abc import Callable
+
+from jaxtyping import Array, Float, PyTree
 
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian import arithmetic as arithmetics
+from jaxfilters.gaussian.arithmetic import Arithmetic
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.gaussian.linearize import cubature, unscented
+from jaxfilters.gaussian.manifold import Manifold, euclidean
+from jaxfilters.gaussian.measurement_update import subtract
 
 
-def unscented_kalman(*model: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0, **options: Any) -> Filter:
-    """Unscented Kalman filter (E. A. Wan and R. van der Merwe, 2000): 2 n + 1 points and no derivative.
+def unscented_kalman(
+    prior: Gaussian | GaussianRoot,
+    transition: Callable[[Array, PyTree], Array],
+    process_noise: Array | Callable[[PyTree], Array],
+    observe: Callable[[Array], Float[Array, " m"]],
+    observation_noise: Float[Array, "m _"],
+    *,
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+    arithmetic: Arithmetic = arithmetics.joseph,
+    manifold: Manifold = euclidean,
+    residual: Callable[[Array, Array], Array] = subtract,
+) -> Filter:
+    """Unscented Kalman filter: 2 n + 1 sigma points in place of derivatives.
+
+    E. A. Wan and R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000.
 
     Args:
-        model: `prior, transition, process_noise, observe, observation_noise`, as for `extended_kalman`.
-        alpha: Distance of the points from the mean, relative to the spread that matches the fourth moment.
-        beta: Weight of the centre point in the covariance; 2 suits Gaussian states.
-        kappa: Added to the dimension of the state in the distance of the points.
-        options: `arithmetic`, `manifold`, `residual` and `iterations` of `extended_kalman`.
+        prior: Belief before the first observation, with a mean of shape (n,), as for `extended_kalman`.
+        transition: `(x, control) -> x` without noise; (n,) to (n,).
+        process_noise: Covariance of the process noise, (n, n), or `control -> covariance`.
+        observe: `x -> y` without noise; (n,) to (m,).
+        observation_noise: Covariance of the observation noise, (m, m).
+        alpha: Distance of the points from the mean, relative to sqrt(n + kappa) standard deviations; positive.
+        beta: Weight of the centre point in the covariance, at least 0; 2 suits Gaussian states.
+        kappa: Addition to the dimension n in the distance of the points, at least 0.
+        arithmetic: `jf.arithmetic.joseph`, `square_root` (all covariances are then roots) or `fast`.
+        manifold: Space of the states, as for `extended_kalman`.
+        residual: `(y, y_hat) -> y - y_hat`, for observations that wrap around.
+
+    Returns:
+        The filter, like that of `extended_kalman`.
+
+    Raises:
+        ValueError: If `alpha` is not positive, `beta` or `kappa` negative, or as for `extended_kalman`.
+        TypeError: As for `extended_kalman`.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
+        >>> transition = lambda x, control: x
+        >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
+        >>> filter = jf.unscented_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> last, _ = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
+        >>> last.mean.shape
+        (2,)
     """
-    return extended_kalman(*model, linearize=unscented(alpha, beta, kappa), **options)
+    return extended_kalman(
+        prior,
+        transition,
+        process_noise,
+        observe,
+        observation_noise,
+        linearize=unscented(alpha, beta, kappa),
+        arithmetic=arithmetic,
+        manifold=manifold,
+        residual=residual,
+    )
 
 
-def cubature_kalman(*model: Any, **options: Any) -> Filter:
-    """Cubature Kalman filter (I. Arasaratnam and S. Haykin, 2009): 2 n equally weighted points and no derivative.
+def cubature_kalman(
+    prior: Gaussian | GaussianRoot,
+    transition: Callable[[Array, PyTree], Array],
+    process_noise: Array | Callable[[PyTree], Array],
+    observe: Callable[[Array], Float[Array, " m"]],
+    observation_noise: Float[Array, "m _"],
+    *,
+    arithmetic: Arithmetic = arithmetics.joseph,
+    manifold: Manifold = euclidean,
+    residual: Callable[[Array, Array], Array] = subtract,
+) -> Filter:
+    """Cubature Kalman filter: 2 n equally weighted points in place of derivatives, and no parameter.
+
+    I. Arasaratnam and S. Haykin, "Cubature Kalman filters", IEEE Transactions on Automatic Control 54(6), 2009.
 
     Args:
-        model: `prior, transition, process_noise, observe, observation_noise`, as for `extended_kalman`.
-        options: `arithmetic`, `manifold`, `residual` and `iterations` of `extended_kalman`.
+        prior: Belief before the first observation, with a mean of shape (n,), as for `extended_kalman`.
+        transition: `(x, control) -> x` without noise; (n,) to (n,).
+        process_noise: Covariance of the process noise, (n, n), or `control -> covariance`.
+        observe: `x -> y` without noise; (n,) to (m,).
+        observation_noise: Covariance of the observation noise, (m, m).
+        arithmetic: `jf.arithmetic.joseph`, `square_root` (all covariances are then roots) or `fast`.
+        manifold: Space of the states, as for `extended_kalman`.
+        residual: `(y, y_hat) -> y - y_hat`, for observations that wrap around.
+
+    Returns:
+        The filter, like that of `extended_kalman`.
+
+    Raises:
+        ValueError: As for `extended_kalman`.
+        TypeError: As for `extended_kalman`.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
+        >>> transition = lambda x, control: x
+        >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
+        >>> filter = jf.cubature_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> last, _ = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
+        >>> last.mean.shape
+        (2,)
     """
-    return extended_kalman(*model, linearize=cubature, **options)
+    return extended_kalman(
+        prior,
+        transition,
+        process_noise,
+        observe,
+        observation_noise,
+        linearize=cubature,
+        arithmetic=arithmetic,
+        manifold=manifold,
+        residual=residual,
+    )

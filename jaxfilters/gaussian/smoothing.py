@@ -1,10 +1,11 @@
-"""Beliefs given the future too: the Rauch-Tung-Striebel smoother of any filter made by `extended`."""
+"""The Rauch-Tung-Striebel smoother of any filter made by `extended_kalman`: beliefs given a whole sequence."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxfilters.filter import Filter, keep_all, run
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
 from jaxfilters.typing import AnyKey, Mask
@@ -13,36 +14,76 @@ from jaxfilters.typing import AnyKey, Mask
 def filter_and_smooth(
     filter: Filter, key: AnyKey, observations: PyTree, controls: PyTree = None, *, mask: Mask | None = None
 ) -> tuple[Belief, PyTree]:
-    """Beliefs given the whole sequence, time first, and the infos of the filter that found them.
+    """Smoothed beliefs given the whole sequence, time first, and the infos of the filter.
 
-    `infos.log_evidence.sum()` is the log evidence of the sequence. Arguments as for `jaxfilters.run`.
+    `infos.log_evidence.sum()` is the log evidence of the sequence.
+
+    Args:
+        filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
+        key: Random key; the filter ignores it.
+        observations: Observations, time first, as for `jf.run`.
+        controls: Known inputs, time first, or `None`.
+        mask: False for frames without an observation, (t,).
+
+    Returns:
+        The smoothed beliefs, with leaves (t, n) and (t, d, d), and the infos of the filter.
+
+    Raises:
+        ValueError: If `filter` is another kind of filter, or lengths differ.
+        TypeError: If `filter` is no filter.
     """
+    _check_filter(filter)
     _, (beliefs, infos) = run(filter, key, observations, controls, mask=mask, collect=keep_all)
     return rts(filter, beliefs, controls), infos
 
 
 def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
-    """Beliefs given the whole sequence, time first, from those of the filter, each given the past.
+    """Rauch-Tung-Striebel smoother: beliefs given the whole sequence, from those of the filter.
 
-    Each is conditioned on what the next one, which already knows the future, says of the step between them (S. Särkkä,
-    "Bayesian Filtering and Smoothing", 2013, theorem 8.2; made linear as `filter` does, section 9.2). A frame without
-    an observation is no different: its belief is the prediction.
+    Each belief is conditioned on the smoothed one of the next frame (S. Särkkä, "Bayesian Filtering and Smoothing",
+    2013, theorem 8.2; linearised as `filter` does, section 9.2). A frame without an observation is no different: its
+    belief is the prediction.
 
     Args:
-        filter: Made by `extended`.
-        beliefs: The states that `run` collects, time first; or what a wrapper of the filter made of them.
-        controls: As `run` had them, time first.
+        filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
+        beliefs: The states that `jf.run` collects, time first, with leaves (t, n) and (t, d, d); or those of a wrapper
+            of the filter, such as `constrained`.
+        controls: The controls of that run, time first.
+
+    Returns:
+        The smoothed beliefs, time first; the last is that of the filter.
 
     Raises:
-        ValueError: If `filter` is another kind of filter, or `controls` has another length than `beliefs`.
+        ValueError: If `filter` is another kind of filter, `beliefs` have other shapes than its states, or `controls`
+            another length than `beliefs`.
+        TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> _, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)))
+        >>> smoothed = jf.smoothing.rts(filter, beliefs)
+        >>> bool((smoothed.covariance[:-1] < beliefs.covariance[:-1]).all())
+        True
     """
-    if not isinstance(filter.params, ExtendedKalman):
-        raise ValueError(f"filter must be made by extended; its parameters are {type(filter.params).__name__}.")
-    length = beliefs.mean.shape[0]
-    lengths = {leaf.shape[0] for leaf in jax.tree.leaves(controls)}
-    if not lengths <= {length}:
+    _check_filter(filter)
+    length = checks.beliefs("beliefs", beliefs, filter.params.prior)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(controls)}
+    if not lengths <= {(length,)}:
         raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
     return _backward(filter.params, beliefs, controls)
+
+
+def _check_filter(filter: Filter) -> None:
+    checks.is_filter("filter", filter)
+    if not isinstance(filter.params, ExtendedKalman):
+        raise ValueError(
+            "filter must be made by extended_kalman, unscented_kalman, cubature_kalman or kalman; "
+            f"its parameters are {type(filter.params).__name__}."
+        )
 
 
 @jax.jit
@@ -50,9 +91,9 @@ def _backward(model: ExtendedKalman, beliefs: Belief, controls: PyTree) -> Belie
     def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
         belief, control = inputs
         origin, ahead = linear_transition(model, belief, control)
-        known = to_tangent(model.manifold, origin, following)
+        next_belief = to_tangent(model.manifold, origin, following)
         noise = noise_of_step(model, control)
-        delta = model.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        delta = model.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed
 

@@ -1,7 +1,7 @@
-"""Smoothing while frames arrive: beliefs about the state some frames ago, given everything until now.
+"""Fixed-lag smoothing: beliefs about the state some frames ago, given all observations until now, as frames arrive.
 
-Both wrap a filter and are filters, with the infos of the inner one. In the first frames, when the state of so many
-frames ago does not exist, the belief is about the state before the first observation.
+Both smoothers wrap a filter and are filters, with the infos of the inner one. In the first frames, when the state of
+so many frames ago does not exist, the belief is about the state before the first observation.
 """
 
 from dataclasses import field
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
 from jaxfilters.particle.differentiable_resampling import Transport
@@ -20,35 +21,35 @@ from jaxfilters.typing import AnyKey
 
 
 class LineageState(NamedTuple):
-    """A particle filter's state, and where its particles have been."""
+    """State of a particle filter, and the trajectories of its particles over the last frames."""
 
     inner: Any
     window: PyTree
-    """Leaves `(lag + 1, ..., n)`: the lineages of the particles, the oldest frame first, the newest last."""
+    """Ancestors of the particles, leaves `(lag + 1, ..., n)`, the oldest frame first."""
 
     @property
     def delayed(self) -> PyTree:
-        """Particles `lag` frames ago, leaves `(..., n)`; their weights are those of the particles now."""
+        """Particles `lag` frames ago, leaves `(..., n)`; their weights are those of the current particles."""
         return jax.tree.map(lambda leaf: leaf[0], self.window)
 
 
 class GaussianLagState(NamedTuple):
-    """A Gaussian filter's belief, and those before it."""
+    """Belief of a Gaussian filter, those of the last frames, and the smoothed one."""
 
     belief: Belief
     window: Belief
-    """Beliefs of the last `lag + 1` frames, each given the past, the oldest first."""
+    """Filtered beliefs of the last `lag + 1` frames, the oldest first."""
     controls: PyTree
-    """Of the same frames."""
+    """Controls of the same frames."""
     frames: Int[Array, ""]
-    """How many there were."""
+    """Number of frames so far."""
     delayed: Belief
-    """The state `lag` frames ago, given everything until now."""
+    """Belief about the state `lag` frames ago, given all observations until now."""
 
 
 @pytree_dataclass
 class FixedLag:
-    """Parameters of a fixed-lag smoother."""
+    """Parameters of a filter made by `fixed_lag` or `fixed_lag_rts`; their arguments describe them."""
 
     inner: Filter
     control: PyTree
@@ -56,17 +57,26 @@ class FixedLag:
 
 
 def fixed_lag(inner: Filter, lag: int) -> Filter:
-    """Fixed-lag smoother by lineages of any particle filter whose state has `particles`, `log_weights` and `ancestors`.
+    """Fixed-lag smoother of a particle filter, by the ancestors of its particles.
 
-    So have those of `bootstrap`, `rao_blackwell` and `adaptive_particle_filter`; of `guided`, the state's `ensemble`
-    has them. The shorter the lag, the more different particles are left; five to fifty frames are usual (G. Kitagawa,
-    "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models", 1996, section 4). The state is a
-    `LineageState`.
+    The smaller the lag, the more distinct ancestors are left; five to fifty frames are usual (G. Kitagawa, "Monte Carlo
+    filter and smoother for non-Gaussian nonlinear state space models", Journal of Computational and Graphical
+    Statistics 5(1), 1996, section 4). The state is a `LineageState`.
+
+    Args:
+        inner: Particle filter whose state, or its field `ensemble`, has `particles`, `log_weights` and `ancestors`,
+            like those of `bootstrap`, `rao_blackwell`, `adaptive_diffusion` and `guided`.
+        lag: Number of frames that the smoothed belief is behind, at least 1.
+
+    Returns:
+        The filter.
 
     Raises:
         ValueError: If `lag < 1`; if `inner` resamples by transport, whose particles are averages and have no ancestors;
-            or, when it runs, if the state of `inner` is another one.
+            or, when it is traced, if the state of `inner` is another one.
+        TypeError: If `inner` is no filter.
     """
+    checks.is_filter("inner", inner)
     _check(lag)
     if any(isinstance(leaf, Transport) for leaf in _schemes(inner.params)):
         raise ValueError("inner must choose ancestors when it resamples; particles moved by transport have none.")
@@ -74,19 +84,38 @@ def fixed_lag(inner: Filter, lag: int) -> Filter:
 
 
 def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
-    """Fixed-lag Rauch-Tung-Striebel smoother of a filter made by `extended`; the state is a `GaussianLagState`.
+    """Fixed-lag Rauch-Tung-Striebel smoother of a Gaussian filter; the state is a `GaussianLagState`.
 
     Args:
-        inner: The filter.
-        lag: How many frames the smoothed belief is behind, at least 1; each frame costs that many steps back.
+        inner: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
+        lag: Number of frames that the smoothed belief is behind, at least 1; each frame costs that many steps back.
         control: Any control, where predictions have them: its shapes are needed before the first one arrives.
+
+    Returns:
+        The filter.
 
     Raises:
         ValueError: If `inner` is another kind of filter, or `lag < 1`.
+        TypeError: If `inner` is no filter.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> filter = jf.smoothing.fixed_lag_rts(inner, lag=3)
+        >>> _, (states, infos) = jf.run(filter, jax.random.key(0), jnp.ones((10, 1)))
+        >>> bool(states.delayed.covariance[-1, 0, 0] < states.belief.covariance[-1, 0, 0])
+        True
     """
+    checks.is_filter("inner", inner)
     _check(lag)
     if not isinstance(inner.params, ExtendedKalman):
-        raise ValueError(f"inner must be made by extended; its parameters are {type(inner.params).__name__}.")
+        raise ValueError(
+            "inner must be made by extended_kalman, unscented_kalman, cubature_kalman or kalman; "
+            f"its parameters are {type(inner.params).__name__}."
+        )
     return Filter(FixedLag(inner, control, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
 
 
@@ -114,7 +143,7 @@ def _update_lineages(
     ensemble = _ensemble(inner)
 
     def children_of_the_same() -> PyTree:
-        # Layered filters resample in their update, too: any sibling has the same past.
+        # Partitioned filters resample in their update, too: any sibling has the same ancestors.
         child = jnp.zeros_like(before).at[before].set(jnp.arange(before.size, dtype=before.dtype))
         return _followed(state.window, child[ensemble.ancestors])
 
@@ -124,7 +153,7 @@ def _update_lineages(
 
 
 def _ensemble(state: Any) -> Any:
-    """What holds the particles of a filter's state."""
+    """The part of a filter's state that holds the particles."""
     ensemble = getattr(state, "ensemble", state)
     if not all(hasattr(ensemble, name) for name in ("particles", "log_weights", "ancestors")):
         raise ValueError(f"inner must have particles, log_weights and ancestors in its state; got {type(state)}.")
@@ -132,7 +161,7 @@ def _ensemble(state: Any) -> Any:
 
 
 def _schemes(params: Any) -> list:
-    """How a filter resamples, or the one inside it."""
+    """Resampling schemes of a filter and of the one inside it."""
     return [getattr(part, "scheme", None) for part in (params, getattr(params, "marginal", None))]
 
 
@@ -152,7 +181,7 @@ def _begin_beliefs(model: FixedLag, key: AnyKey) -> GaussianLagState:
 def _predict_beliefs(model: FixedLag, key: AnyKey, state: GaussianLagState, control: PyTree) -> GaussianLagState:
     got, wanted = (str(jax.tree.structure(tree)) for tree in (model.control, control))
     if got != wanted:
-        raise ValueError(f"control of fixed_lag_rts must be like those of the predictions, {wanted}; got {got}.")
+        raise ValueError(f"control of fixed_lag_rts must have the structure of the controls, {wanted}; got {got}.")
     belief = model.inner.predict(model.inner.params, key, state.belief, control)
     window, controls = _pushed(state.window, belief), _pushed(state.controls, control)
     return _smoothed(model, GaussianLagState(belief, window, controls, state.frames + 1, state.delayed))
@@ -167,15 +196,17 @@ def _update_beliefs(
 
 def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
     extended = model.inner.params
-    # Before the first frame there are only copies of the prior, which nothing moved.
+    # Before the first frame there are only copies of the prior, with no transition between them.
     exists = jnp.arange(model.lag) >= model.lag - state.frames
 
     def step(following: Belief, inputs: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
         belief, control, exists = inputs
         origin, ahead = linear_transition(extended, belief, control)
-        known = to_tangent(extended.manifold, origin, following)
+        next_belief = to_tangent(extended.manifold, origin, following)
         noise = noise_of_step(extended, control)
-        delta = extended.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        delta = extended.arithmetic.rts(
+            increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root
+        )
         smoothed = retract_belief(extended.manifold, belief.mean, delta)
         return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
 

@@ -1,4 +1,4 @@
-"""What a Kalman update reports, and which components of a measurement count."""
+"""Diagnostics of a Kalman update, and the components of an observation that it uses."""
 
 import math
 from typing import Any, NamedTuple
@@ -16,21 +16,21 @@ class KalmanInfo:
     """Diagnostics of one update. Nothing in it, nor in the belief beside it, is NaN unless the belief before was."""
 
     innovation: Float[Array, "..."]
-    """(m,): `y - y_hat`; 0 for components left out: masked, certain before they were seen, dependent or invalid."""
+    """`y - y_hat`, (m,); 0 for components left out: masked, invalid, or certain beforehand."""
     innovation_root: Float[Array, "..."]
-    """(m, m), lower L with `L L^T` the covariance of the innovation; zeros for components left out."""
+    """Lower root L of the covariance `L L^T` of the innovation, (m, m); zeros for components left out."""
     log_evidence: Float[Array, "..."]
-    """Log density of the components of y that count, given all before them. `-inf` where the model or the belief is
-    broken: a prediction or a noise that is not finite, an innovation covariance that is not positive semidefinite."""
+    """Marginal log-likelihood of the observation, log p(y_t | y_1:t-1), in nats, over the components used. `-inf` where
+    a prediction or a noise is not finite, or the innovation covariance is not positive semidefinite."""
     nis: Float[Array, "..."]
     """Normalised innovation squared: chi-squared with `rank` degrees of freedom."""
     rank: Int[Array, "..."]
-    """How many components of y count: the rank of the innovation covariance over those that were seen."""
+    """Number of components used: the rank of the innovation covariance over those that were read."""
     deficiency: Int[Array, "..."]
-    """How many components were seen and add nothing: certain beforehand, or given by those before them to rounding.
-    There the innovation covariance loses rank, and they are left out."""
+    """Number of components that were read but are left out, because they were certain beforehand or follow from the
+    components before them, to rounding: there the innovation covariance loses rank."""
     num_invalid: Int[Array, "..."]
-    """How many components, not masked, were NaN or infinite, or had such a prediction or noise; they are left out."""
+    """Number of components, not masked, that are left out because they, their prediction or noise are not finite."""
 
 
 class Rows(NamedTuple):

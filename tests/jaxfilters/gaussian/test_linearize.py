@@ -37,7 +37,7 @@ def test_a_linear_function_is_itself(x64, rng, form, strategy, n):
     found = jax.jit(lambda belief: strategy(lambda x: A @ x + b, belief))(form(mean, root))
     np.testing.assert_allclose(found.value, A @ mean + b, atol=1e-10)
     np.testing.assert_allclose(found.F, A, atol=1e-9)
-    np.testing.assert_allclose(found.lost_root @ found.lost_root.T, np.zeros((4, 4)), atol=1e-18)
+    np.testing.assert_allclose(found.residual_root @ found.residual_root.T, np.zeros((4, 4)), atol=1e-18)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES.values(), ids=STRATEGIES)
@@ -49,7 +49,7 @@ def test_directions_without_variance_do_no_harm(x64, rng, form, strategy):
     def spread(root):
         found = strategy(lambda x: jnp.sin(A @ x), form(mean, root))
         P = root @ root.T
-        return found.F @ P @ found.F.T + found.lost_root @ found.lost_root.T
+        return found.F @ P @ found.F.T + found.residual_root @ found.residual_root.T
 
     # Four components of the state carry all of its variance, if the others follow from them.
     value, slope = jax.jit(jax.value_and_grad(lambda root: jnp.trace(spread(root))))(jnp.asarray(root))
@@ -74,7 +74,7 @@ def test_second_order_finds_the_moments_of_a_quadratic(x64, rng, form):
     found, biased = jax.jit(lambda belief: (second_order_covariance_only(h, belief), second_order(h, belief)))(
         form(mean, root)
     )
-    lost = found.lost_root @ found.lost_root.T
+    lost = found.residual_root @ found.residual_root.T
     np.testing.assert_allclose(lost, 0.5 * np.einsum("kij,jp,lpq,qi->kl", bend, P, bend, P), rtol=1e-9)
     np.testing.assert_allclose(found.value, h(mean), rtol=1e-12)
 
@@ -86,7 +86,7 @@ def test_second_order_finds_the_moments_of_a_quadratic(x64, rng, form):
     np.testing.assert_allclose(np.diag(np.cov(seen)), np.diag(exact), rtol=0.02)
     error = 4 * np.sqrt(np.diag(exact) / 400_000)
     assert (abs(seen.mean(axis=1) - biased.value) < error).all()
-    np.testing.assert_allclose(biased.lost_root @ biased.lost_root.T, lost, rtol=1e-9)
+    np.testing.assert_allclose(biased.residual_root @ biased.residual_root.T, lost, rtol=1e-9)
 
 
 def textbook_unscented(h, mean, P, alpha, beta, kappa):
@@ -120,7 +120,9 @@ def test_sigma_points_agree_with_textbook(x64, rng, form, strategy, parameters):
     expected, covariance, cross = textbook_unscented(h, mean, P, *parameters)
     np.testing.assert_allclose(found.value, expected, rtol=1e-10)
     np.testing.assert_allclose(P @ found.F.T, cross, atol=1e-10)
-    np.testing.assert_allclose(found.F @ P @ found.F.T + found.lost_root @ found.lost_root.T, covariance, atol=1e-10)
+    np.testing.assert_allclose(
+        found.F @ P @ found.F.T + found.residual_root @ found.residual_root.T, covariance, atol=1e-10
+    )
 
 
 def test_strategies_with_equal_numbers_are_equal():

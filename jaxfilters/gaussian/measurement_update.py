@@ -1,0 +1,187 @@
+r"""One measurement update: linearised at a point, or iterated.
+
+The iterated update lowers the negative logarithm of the posterior density,
+$J(x) = \tfrac12 |x - m|^2_{P^{-1}} + \tfrac12 |y - h(x)|^2_{R^{-1}}$, by Gauss-Newton steps (B. M. Bell and
+F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE Transactions on Automatic Control
+38(2), 1993). Its minimum is the mode. The mean of a skewed posterior lies elsewhere: to the next order of Laplace's
+expansion it minimises $J(x) + \tfrac12 \log |S(x)|$, with $S = H P H^T + R$ of the observation linearised at x
+(L. Tierney and J. B. Kadane, "Accurate approximations for posterior moments and marginal densities", Journal of the
+American Statistical Association 81, 1986; `docs/derivations/iterated_update.md`).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor, info
+from jaxfilters.gaussian.linearize import Linearization, Linearize, lower_root
+from jaxfilters.gaussian.manifold import Belief, with_mean
+from jaxfilters.math import linalg
+
+_HALVINGS = 6
+
+
+class Measurement(NamedTuple):
+    """An observation, and its prediction as a function of coordinates about the mean of the belief."""
+
+    belief: Belief
+    start: Float[Array, " n"]
+    """Coordinates of the mean: its numbers where the manifold is flat, else zeros."""
+    y: Float[Array, " m"]
+    mask: Array | None
+    noise: Float[Array, "m _"]
+    predict: Callable[[Array], Array]
+    """`coordinates -> y`, without noise."""
+    residual: Callable[[Array, Array], Array]
+    linearize: Linearize
+    arithmetic: Arithmetic
+
+
+def subtract(y: Float[Array, " m"], y_hat: Float[Array, " m"]) -> Float[Array, " m"]:
+    """The difference of two observations that are vectors."""
+    return y - y_hat
+
+
+def is_difference(residual: Callable) -> bool:
+    """Whether a residual is `subtract`."""
+    return getattr(residual, "func", residual) is subtract
+
+
+def linear_update(
+    measurement: Measurement, offset: Float[Array, " n"] | None = None
+) -> tuple[Belief, KalmanInfo, Linearization]:
+    """Belief in the coordinates after an update linearised at an increment from the mean (`None`: at the mean).
+
+    Returns:
+        The belief, the diagnostics, and the linear function that stands for the observation.
+    """
+    linear, reference = _linear_at(measurement, offset)
+    if reference is None:
+        y, y_hat = measurement.y, linear.value
+    else:
+        read, y = _difference(measurement, reference)
+        # A residual that is not finite is the model's fault, unless nothing was read.
+        y_hat = jnp.where(jnp.isfinite(y), linear.value, jnp.nan)
+        y = jnp.where(read, jnp.where(jnp.isfinite(y), y, 0.0), jnp.nan)
+    if offset is not None:
+        y_hat = y_hat - factor.apply(linear.F, offset)
+    prior = with_mean(measurement.belief, measurement.start)
+    posterior, report = measurement.arithmetic.update(
+        prior, y, linear.F, measurement.noise, y_hat, measurement.mask, linear.residual_root
+    )
+    return posterior, report, linear
+
+
+def iterated_update(
+    measurement: Measurement, first: Float[Array, " n"] | None, iterations: int, to_mean: bool
+) -> tuple[Belief, KalmanInfo]:
+    """Belief in the coordinates after damped Gauss-Newton steps, and the diagnostics of an update linearised there.
+
+    Every step is halved until it lowers the cost, with the residual as it is, not linearised. An increment from the
+    mean is P g, and g is carried beside it: the prior's part of the cost is g^T P g / 2, without an inverse of P.
+
+    Args:
+        measurement: The observation.
+        first: Increment at which the first step is linearised; `None` is the mean.
+        iterations: How many steps there are.
+        to_mean: Whether log|S| / 2 is part of the cost. Its gradient u moves the minimum by -C u, where C is the
+            covariance of the posterior.
+    """
+    prior_root = lower_root(measurement.belief)
+    times_P = lambda v: factor.apply(prior_root, factor.apply(prior_root.T, v))
+
+    def refine(index, offset, dual):
+        posterior, report, linear = linear_update(measurement, offset)
+        end, end_dual = posterior.mean - measurement.start, _dual(report, linear.F, report.innovation)
+        if to_mean:
+            # The first step is that of the plain update: its result is never better than where the iteration ends.
+            u = jnp.where(index > 0, _log_determinant_slope(measurement, report, linear, prior_root, offset), 0.0)
+            # C u = P u - P F^T S^-1 F P u.
+            shift_dual = _dual(report, linear.F, factor.apply(_counted(report, linear.F), times_P(u))) - u
+            end, end_dual = end + times_P(shift_dual), end_dual + shift_dual
+        step, dual_step = end - offset, end_dual - dual
+        likelihood_cost = _likelihood_cost(measurement, report, linear, prior_root if to_mean else None)
+
+        def cost(length):
+            at = offset + length * step
+            return 0.5 * jnp.sum((dual + length * dual_step) * at) + likelihood_cost(at)
+
+        lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype), 0.0)
+        costs = jax.lax.map(cost, lengths)
+        length = lengths[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+        # The last round only linearises the observation at the final point.
+        length = jnp.where(index < iterations, length, 0.0)
+        return offset + length * step, dual + length * dual_step, posterior, report
+
+    offset = dual = jnp.zeros(measurement.start.shape, measurement.start.dtype)
+    done = 0
+    if first is not None:
+        # The prior's part of the cost is not known at a point that is no P g: the first step is a whole one.
+        posterior, report, linear = linear_update(measurement, first)
+        offset, dual, done = posterior.mean - measurement.start, _dual(report, linear.F, report.innovation), 1
+    results = jax.eval_shape(partial(refine, done), offset, dual)[2:]
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), results)
+    found = jax.lax.fori_loop(done, iterations + 1, lambda i, at: refine(i, *at[:2]), (offset, dual, *empty))
+    offset, _, posterior, report = found
+    return with_mean(posterior, measurement.start + offset), report
+
+
+def _linear_at(measurement, offset):
+    """The linear function at an increment; where residuals are no differences, of the residual from a reference."""
+    at = measurement.start if offset is None else measurement.start + offset
+    about = with_mean(measurement.belief, at)
+    # Where the residual is a difference, that from a reference would only cost time.
+    if is_difference(measurement.residual):
+        return measurement.linearize(measurement.predict, about), None
+    reference = measurement.predict(at)
+    from_reference = lambda x: measurement.residual(measurement.predict(x), reference)
+    return measurement.linearize(from_reference, about), reference
+
+
+def _difference(measurement, y_hat):
+    """Which components were read, and the residual, 0 for the others."""
+    y, mask = measurement.y, measurement.mask
+    read = jnp.isfinite(y) if mask is None else jnp.isfinite(y) & mask
+    return read, jnp.where(read, measurement.residual(jnp.where(read, y, 0.0), y_hat), 0.0)
+
+
+def _dual(report, F, innovation):
+    """`F^T S^-1 innovation`, over the components that count."""
+    whitened = linalg.solve_triangular(report.innovation_root, innovation)
+    weights = linalg.solve_triangular(report.innovation_root, whitened, transpose=True)
+    return factor.apply(_counted(report, F).T, weights)
+
+
+def _likelihood_cost(measurement, report, linear, prior_root):
+    """Negative log likelihood at an increment, but for a constant; with log|S| / 2 where a root of P is given."""
+    counts = factor.diagonal(report.innovation_root) > 0
+    noise_root = measurement.arithmetic.noise_root(measurement.noise, counts, linear.residual_root)
+
+    def cost(offset):
+        residual = info.observed(counts, _difference(measurement, measurement.predict(measurement.start + offset))[1])
+        misfit = 0.5 * jnp.sum(linalg.solve_triangular(noise_root, residual) ** 2)
+        if prior_root is None:
+            return misfit
+        F = _counted(report, _linear_at(measurement, offset)[0].F)
+        diagonal = factor.diagonal(linalg.tria(jnp.hstack([linalg.matmul(F, prior_root), noise_root])))
+        return misfit + jnp.sum(jnp.log(jnp.where(counts, jnp.abs(diagonal), 1.0)))
+
+    return cost
+
+
+def _log_determinant_slope(measurement, report, linear, prior_root, offset):
+    """Gradient of log|S| / 2 at an increment, S = F P F^T + R: with W = S^-1 F P, that of the sum of W_ij F_ij."""
+    FP = factor.outer(linalg.matmul(_counted(report, linear.F), prior_root), prior_root)
+    root = report.innovation_root
+    W = linalg.solve_triangular(root, linalg.solve_triangular(root, FP), transpose=True)
+    slope = jax.jacfwd(lambda at: jnp.sum(W * _counted(report, _linear_at(measurement, at)[0].F)))(offset)
+    return jnp.where(jnp.all(jnp.isfinite(slope)), slope, 0.0)
+
+
+def _counted(report, F):
+    """The rows of F that count, zero for the others."""
+    return info.observed(factor.diagonal(report.innovation_root) > 0, F)
