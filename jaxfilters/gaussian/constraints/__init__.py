@@ -16,4 +16,4 @@ from jaxfilters.gaussian.constraints.linear import feasible as feasible
 from jaxfilters.gaussian.constraints.linear import linear_constraints as linear_constraints
 from jaxfilters.gaussian.constraints.moments import Moments as Moments
 from jaxfilters.gaussian.constraints.sites import Sites as Sites
-from jaxfilters.gaussian.constraints.sites import no_sites as no_sites
+from jaxfilters.gaussian.constraints.sites import initial_sites as initial_sites

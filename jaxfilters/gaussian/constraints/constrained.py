@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian.constraints import LinearConstraints, Sites, TruncationInfo, expectation_propagation
+from jaxfilters.gaussian.constraints import LinearConstraints, TruncationInfo, expectation_propagation, initial_sites
 from jaxfilters.typing import AnyKey
 
 
@@ -74,12 +74,11 @@ class EPConstraints:
     """Rows whose value is constant in time."""
 
     def start(self):
-        zeros = jnp.zeros_like(self.constraints.lower)
-        return Sites(zeros, zeros, zeros)
+        return initial_sites(self.constraints)
 
     def __call__(self, belief, memory):
         belief, sites, info = expectation_propagation.truncate(belief, self.constraints, memory)
-        return belief, sites.only(self.lasting), info
+        return belief, sites.select(self.lasting), info
 
 
 @pytree_dataclass

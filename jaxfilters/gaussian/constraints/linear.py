@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import linprog
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 
 Numbers = ArrayLike | Sequence[Any]
 """An array, or what makes one: a number, a list, a list of lists."""
@@ -122,3 +123,19 @@ def _some_point_satisfies(normals, lower, upper):
         return True
     result = linprog(np.zeros(normals.shape[1]), sides[present], bounds[present], bounds=(None, None))
     return result.status == 0
+
+
+def check_width(belief: Any, constraints: LinearConstraints) -> None:
+    """Reject a belief that is not Gaussian, or that the rows do not fit.
+
+    Raises:
+        TypeError: `belief` is not a `Gaussian` or `GaussianRoot`.
+        ValueError: `constraints.normals` does not have one column for each component of the belief.
+    """
+    if not isinstance(belief, Gaussian | GaussianRoot):
+        raise TypeError(f"belief: expected a Gaussian or a GaussianRoot; got {type(belief).__name__}.")
+    shape, n = jnp.shape(constraints.normals), jnp.shape(belief.mean)[-1]
+    if len(shape) != 2 or shape[1] != n:
+        raise ValueError(
+            f"constraints: expected normals of shape (k, {n}), a column for each component of the belief; got {shape}."
+        )
