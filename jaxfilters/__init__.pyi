@@ -24,9 +24,9 @@ from .gaussian.arithmetic.info import KalmanInfo as KalmanInfo
 from .gaussian.belief import Gaussian as Gaussian
 from .gaussian.belief import GaussianRoot as GaussianRoot
 from .gaussian.consider import schmidt_kalman as schmidt_kalman
-from .gaussian.constraints.constrained import EPConstraints as EPConstraints
-from .gaussian.constraints.constrained import TruncateEachStep as TruncateEachStep
-from .gaussian.constraints.constrained import constrained as constrained
+from .gaussian.constraints.constrained_filter import EPConstraints as EPConstraints
+from .gaussian.constraints.constrained_filter import TruncateEachStep as TruncateEachStep
+from .gaussian.constraints.constrained_filter import constrained as constrained
 from .gaussian.ensemble import ensemble_kalman as ensemble_kalman
 from .gaussian.extended import Observation as Observation
 from .gaussian.extended import extended_kalman as extended_kalman

@@ -21,7 +21,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.constraints.constrained import ConstrainedState
+from jaxfilters.gaussian.constraints.constrained_filter import ConstrainedState
 from jaxfilters.typing import AnyKey, as_pytree
 
 

@@ -22,7 +22,7 @@ from jaxfilters.gaussian.arithmetic import KalmanInfo, joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.consider import SchmidtInfo, SchmidtState, schmidt_kalman
 from jaxfilters.gaussian.constraints import LinearConstraints, TruncationInfo, cut, linear_constraints
-from jaxfilters.gaussian.constraints.constrained import (
+from jaxfilters.gaussian.constraints.constrained_filter import (
     ConstrainedInfo,
     ConstrainedState,
     EPConstraints,
@@ -65,7 +65,7 @@ class Inequalities(NamedTuple):
 
 
 def inequalities(rows: LimitRows) -> Inequalities:
-    """The rows, checked: see `jaxfilters.truncation.linear_constraints`."""
+    """The rows, checked: see `jaxfilters.constraints.linear_constraints`."""
     return Inequalities(linear_constraints(rows.normals, rows.lower, rows.upper, rows.names), rows.static)
 
 

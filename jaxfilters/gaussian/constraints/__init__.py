@@ -1,7 +1,8 @@
-"""Gaussian beliefs cut by linear inequalities: moments of what is left, as a Gaussian again.
+"""Gaussian beliefs under linear inequalities: moments of the truncated belief, as a Gaussian again.
 
-`cut` applies one inequality, or a list of them in order; `expectation_propagation` applies all of them together and
-does not count one twice that is applied again. All take a belief by covariance or by root, and give back the same.
+`cut` truncates by one inequality, or by a list of them in order; `expectation_propagation` truncates by all of them
+together, and can replace the effect of an earlier truncation. All take a belief by covariance or by root, and return
+the same kind. `jf.constrained` applies them to a filter in every step.
 """
 
 from jaxfilters.gaussian.constraints import cut as cut
@@ -16,4 +17,4 @@ from jaxfilters.gaussian.constraints.linear import feasible as feasible
 from jaxfilters.gaussian.constraints.linear import linear_constraints as linear_constraints
 from jaxfilters.gaussian.constraints.moments import Moments as Moments
 from jaxfilters.gaussian.constraints.sites import Sites as Sites
-from jaxfilters.gaussian.constraints.sites import no_sites as no_sites
+from jaxfilters.gaussian.constraints.sites import initial_sites as initial_sites

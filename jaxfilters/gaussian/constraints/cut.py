@@ -1,18 +1,19 @@
-"""A Gaussian belief cut by inequalities one at a time: one half-space, one interval, or a list of them in order.
+"""A Gaussian belief truncated by inequalities one at a time: one half-space, one interval, or a list of them in order.
 
-Each cut matches the mean and the covariance of the belief that is left, exactly. After several cuts in a row the
-result depends on their order, because the belief in between is taken to be Gaussian again; `expectation_propagation`
-does not have that fault.
+Each truncation has the exact mean and covariance of the truncated belief. After several truncations in a row the
+result depends on their order, because each intermediate belief is approximated by a Gaussian; the result of
+`expectation_propagation` does not.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.constraints import moments
 from jaxfilters.gaussian.constraints.directions import Belief, Direction, along, compiled, reshape
 from jaxfilters.gaussian.constraints.info import CutInfo, TruncationInfo, constraint_distances, distances_along
-from jaxfilters.gaussian.constraints.linear import LinearConstraints
+from jaxfilters.gaussian.constraints.linear import LinearConstraints, check_width
 
 
 def halfspace(
@@ -22,16 +23,30 @@ def halfspace(
     *,
     skip: Float[Array, ""] | float = jnp.inf,
 ) -> tuple[Belief, CutInfo]:
-    """Moments of the belief in `normal^T x <= upper`, and diagnostics.
+    """Moments of a belief truncated to `normal^T x <= upper`, and diagnostics.
 
-    With the bound c standard deviations s away, and the moments of a standard normal variable below c, the mean moves
-    by `mean P normal / s` and the covariance by `(variance - 1) P normal normal^T P / s^2` (the closed form of
-    N. Shimada et al., "Shape and pose estimation of an articulated object", 1997, equations 21 to 29). Nothing is
-    done where c exceeds `skip`.
+    Let s be the standard deviation of `normal^T x` and c the distance of the bound from its mean, divided by s. With
+    the moments of a standard normal variable below c, the mean changes by `mean P normal / s` and the covariance by
+    `(variance - 1) P normal normal^T P / s^2` (a closed form of N. Shimada et al., "Shape and pose estimation of an
+    articulated object", 1997, equations 21 to 29).
+
+    Args:
+        belief: The belief to truncate, a `Gaussian` or `GaussianRoot` of n components.
+        normal: (n,).
+        upper: The bound; may be `inf`.
+        skip: The belief is returned as it is where c exceeds this number.
+
+    Returns:
+        The truncated belief, and its `CutInfo`.
+
+    Raises:
+        TypeError: `belief` is not Gaussian.
+        ValueError: `normal` does not have one number for each component of the belief.
     """
+    _check_normal(belief, normal)
     direction = along(belief, normal)
     distances = distances_along(direction, -jnp.inf, upper)
-    # Without a bound a cut does nothing.
+    # An infinite bound has no effect.
     c = jnp.where(distances[1] > skip, jnp.inf, distances[1])
     return _apply(belief, direction, distances, moments.one_sided(c))
 
@@ -39,7 +54,25 @@ def halfspace(
 def interval(
     belief: Belief, normal: Float[Array, " n"], lower: Float[Array, ""] | float, upper: Float[Array, ""] | float
 ) -> tuple[Belief, CutInfo]:
-    """Moments of the belief in `lower <= normal^T x <= upper`, and diagnostics. Bounds may be infinite."""
+    """Moments of a belief truncated to `lower <= normal^T x <= upper`, and diagnostics.
+
+    Args:
+        belief: The belief to truncate, a `Gaussian` or `GaussianRoot` of n components.
+        normal: (n,).
+        lower: Lower bound; may be `-inf`.
+        upper: Upper bound, at least `lower`; may be `inf`.
+
+    Returns:
+        The truncated belief, and its `CutInfo`.
+
+    Raises:
+        TypeError: `belief` is not Gaussian.
+        ValueError: `normal` does not have one number for each component of the belief, or `lower` exceeds `upper`
+            where both are known.
+    """
+    _check_normal(belief, normal)
+    if not isinstance(lower, jax.core.Tracer) and not isinstance(upper, jax.core.Tracer) and not lower <= upper:
+        raise ValueError(f"lower, upper: expected lower <= upper; got {lower} and {upper}.")
     direction = along(belief, normal)
     distances = distances_along(direction, lower, upper)
     return _apply(belief, direction, distances, moments.interval(-distances[0], distances[1]))
@@ -49,11 +82,23 @@ def interval(
 def sequential_halfspaces(
     belief: Belief, constraints: LinearConstraints, *, skip: Float[Array, ""] | float = jnp.inf
 ) -> tuple[Belief, TruncationInfo]:
-    """The belief cut by one half-space after the other: of each row the upper bound, then the lower.
+    """Belief truncated by one half-space after the other: for each row by the upper bound, then by the lower.
 
-    As in N. Shimada et al., "Shape and pose estimation of an articulated object", 1997, sections 4 and 5: with both
-    bounds of a row apart, and those further than `skip` standard deviations left out.
+    The method of N. Shimada et al., "Shape and pose estimation of an articulated object", 1997, sections 4 and 5.
+
+    Args:
+        belief: The belief to truncate, a `Gaussian` or `GaussianRoot` of n components.
+        constraints: k rows on n components.
+        skip: Bounds that are further from the mean than this number of standard deviations are not applied.
+
+    Returns:
+        The truncated belief, and its `TruncationInfo`.
+
+    Raises:
+        TypeError: `belief` is not Gaussian.
+        ValueError: The normals do not have one column for each component of the belief.
     """
+    check_width(belief, constraints)
 
     def cut(belief, row):
         normal, lower, upper = row
@@ -66,7 +111,20 @@ def sequential_halfspaces(
 
 @compiled
 def sequential_intervals(belief: Belief, constraints: LinearConstraints) -> tuple[Belief, TruncationInfo]:
-    """The belief cut by one interval after the other, in the order of the rows."""
+    """Belief truncated by one interval after the other, in the order of the rows.
+
+    Args:
+        belief: The belief to truncate, a `Gaussian` or `GaussianRoot` of n components.
+        constraints: k rows on n components.
+
+    Returns:
+        The truncated belief, and its `TruncationInfo`.
+
+    Raises:
+        TypeError: `belief` is not Gaussian.
+        ValueError: The normals do not have one column for each component of the belief.
+    """
+    check_width(belief, constraints)
 
     def cut(belief, row):
         belief, info = interval(belief, *row)
@@ -90,3 +148,10 @@ def _apply(belief: Belief, direction: Direction, distances: Array, cut: moments.
     ratio = jnp.where(certain, 1.0, cut.variance)
     log_mass = jnp.where(certain, jnp.where(infeasible, -jnp.inf, 0.0), cut.log_mass)
     return reshape(belief, direction, shift, ratio), CutInfo(distances, log_mass, infeasible)
+
+
+def _check_normal(belief, normal):
+    if not isinstance(belief, Gaussian | GaussianRoot):
+        raise TypeError(f"belief: expected a Gaussian or a GaussianRoot; got {type(belief).__name__}.")
+    if jnp.shape(normal) != jnp.shape(belief.mean):
+        raise ValueError(f"normal: expected shape {jnp.shape(belief.mean)}; got {jnp.shape(normal)}.")

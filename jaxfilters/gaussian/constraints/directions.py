@@ -1,7 +1,7 @@
-"""What a Gaussian belief says along one direction, and changes of it: the atoms of truncation, for both beliefs.
+"""Marginals of a Gaussian belief along a direction, and rank-one changes of the belief that change such a marginal.
 
 A change of the marginal of `normal^T x` from N(mean, deviation^2) to another Gaussian changes the whole belief by one
-rank: nothing is factorised, inverted or downdated, and zero variances are welcome. Roots keep their width but not a
+rank. No matrix is factorised, inverted or downdated, and variances may be zero. Roots keep their width but not a
 triangular shape.
 """
 
@@ -17,29 +17,33 @@ from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.math import linalg
 
 Belief = TypeVar("Belief", Gaussian, GaussianRoot)
-Rest = ParamSpec("Rest")
+Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 class Direction(NamedTuple):
-    """The marginal of a belief along a normal, and how the belief hangs on it."""
+    """The marginal of a belief along a normal, and the covariance of the state with it."""
 
     mean: Float[Array, "..."]
     """`normal^T mean`."""
     deviation: Float[Array, "..."]
     """Standard deviation s of `normal^T x`, at least 0."""
     gain: Float[Array, "..."]
-    """(n,), `P normal / s`: how far x moves with `normal^T x`, per standard deviation; 0 where certain."""
+    """(n,), `P normal / s`: the change of E[x] when `normal^T x` changes by one standard deviation; 0 where certain."""
     weight: Float[Array, "..."]
     """The gain again for a covariance; for a root (m,) the unit vector `root^T normal / s`."""
     certain: Bool[Array, "..."]
-    """Whether s is no more than rounding of the belief."""
+    """Whether s is no larger than the rounding error of the belief."""
     rounding: Float[Array, "..."]
-    """How far `normal^T x` may be off by rounding of the belief."""
+    """Bound of the rounding error of `normal^T x`."""
+    noise: Float[Array, "..."]
+    """Bound of the relative rounding error of the variance s^2."""
+    axis: Bool[Array, "..."]
+    """(n,), True for the component that the normal is parallel to, if any."""
 
 
 def along(belief: Gaussian | GaussianRoot, normal: Float[Array, " n"]) -> Direction:
-    """The belief along `normal`."""
+    """Marginal of the belief along `normal`, (n,)."""
     if isinstance(belief, GaussianRoot):
         # A sum of products, because a batch of products with thin matrices takes twice the time.
         turned = jnp.sum(normal[:, None] * belief.root, axis=0)
@@ -53,34 +57,48 @@ def along(belief: Gaussian | GaussianRoot, normal: Float[Array, " n"]) -> Direct
     weight = turned * jnp.where(certain, 0.0, 1 / jnp.where(certain, 1.0, deviation))
     gain = jnp.sum(belief.root * weight, axis=1) if isinstance(belief, GaussianRoot) else weight
     rounding = floor + _rounding(belief) * (abs(normal) @ abs(belief.mean))
-    return Direction(normal @ belief.mean, deviation, gain, weight, certain, rounding)
+    share = floor / jnp.where(certain, 1.0, deviation)
+    noise = 2 * share if isinstance(belief, GaussianRoot) else share**2
+    axis = (normal != 0) & (jnp.sum(normal != 0) == 1) & ~certain
+    return Direction(normal @ belief.mean, deviation, gain, weight, certain, rounding, noise, axis)
 
 
 def component(belief: GaussianRoot, index: Int[Array, ""]) -> Direction:
-    """The belief along one axis, at less cost; certain where it has no variance at all."""
+    """Marginal of one component, at less cost than `along`; certain where its variance is exactly zero."""
     row = belief.root[index]
     deviation = linalg.safe_norm(row)
     certain = deviation == 0
     weight = row * jnp.where(certain, 0.0, 1 / jnp.where(certain, 1.0, deviation))
     gain = jnp.sum(belief.root * weight, axis=1)
-    return Direction(belief.mean[index], deviation, gain, weight, certain, jnp.zeros_like(deviation))
+    zero = jnp.zeros_like(deviation)
+    axis = (jnp.arange(len(belief.root)) == index) & ~certain
+    return Direction(belief.mean[index], deviation, gain, weight, certain, zero, zero, axis)
 
 
 def reshape(belief: Belief, direction: Direction, shift: Float[Array, ""], ratio: Float[Array, ""]) -> Belief:
-    """Belief whose marginal along the direction has moved by `shift` deviations and has `ratio` times its variance.
+    """Belief whose marginal along the direction has a changed mean and variance.
 
-    What is uncorrelated with the direction stays as it was.
+    Components that are uncorrelated with the direction keep their marginals.
+
+    Args:
+        belief: The belief that `direction` was computed from.
+        direction: The marginal to change.
+        shift: Change of its mean in standard deviations.
+        ratio: New variance over old variance.
     """
     mean = belief.mean + shift * direction.gain
+    # A component that the normal is parallel to is scaled: the difference would lose a small variance to rounding.
+    axis = direction.axis
     if isinstance(belief, GaussianRoot):
-        return GaussianRoot(
-            mean, belief.root + (linalg.safe_sqrt(ratio) - 1) * jnp.outer(direction.gain, direction.weight)
-        )
-    return Gaussian(mean, belief.covariance + (ratio - 1) * jnp.outer(direction.gain, direction.weight))
+        scale = linalg.safe_sqrt(ratio)
+        changed = belief.root + (scale - 1) * jnp.outer(direction.gain, direction.weight)
+        return GaussianRoot(mean, jnp.where(axis[:, None], scale * belief.root, changed))
+    changed = belief.covariance + (ratio - 1) * jnp.outer(direction.gain, direction.weight)
+    return Gaussian(mean, jnp.where(axis[:, None] | axis, ratio * belief.covariance, changed))
 
 
 def image(belief: Belief, normals: Float[Array, "k n"]) -> Belief:
-    """Belief in `normals x`."""
+    """Belief in `normals x`, (k,), for normals (k, n)."""
     mean = normals @ belief.mean
     if isinstance(belief, GaussianRoot):
         return GaussianRoot(mean, linalg.matmul(normals, belief.root))
@@ -88,7 +106,7 @@ def image(belief: Belief, normals: Float[Array, "k n"]) -> Belief:
 
 
 def resolution(belief: Gaussian | GaussianRoot) -> float:
-    """Standard deviation, relative to those it is combined from, up to which it may be rounding."""
+    """Largest standard deviation that may be rounding error, relative to the deviations that it is computed from."""
     return _rounding(belief) if isinstance(belief, GaussianRoot) else _rounding(belief) ** 0.5
 
 
@@ -96,11 +114,11 @@ def _rounding(belief):
     return belief.mean.size * float(jnp.finfo(belief.mean.dtype).eps)
 
 
-def compiled(function: Callable[Rest, Result]) -> Callable[Rest, Result]:
-    """The function of a belief, compiled once for each kind of belief and each set of shapes.
+def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Compile a function whose first argument is a belief once for each class of belief and each set of shapes.
 
-    For JAX (0.10) any two dataclasses with as many fields are equal as trees, and once in some hundred times it runs
-    what it has compiled for a covariance on a square root. So the kind is an argument of its own.
+    Two registered dataclasses with equally many fields can compare equal as trees, and JAX 0.10 occasionally runs on a
+    root what it compiled for a covariance. The class is therefore a static argument of its own.
     """
     of_kind = jax.jit(lambda _kind, *args, **kwargs: function(*args, **kwargs), static_argnums=0)
 

@@ -1,9 +1,11 @@
-"""The sites that demand themselves: the loop of expectation propagation over scalar rows, and its derivative.
+"""Fixed point of expectation propagation over scalar inequalities, and its derivative.
 
 Sites are Gaussian factors `exp(shift z - precision z^2 / 2)` of k values z, kept as `natural` (k, 2): precision and
-shift. The values have the standard deviation 1 and the mean 0 under the belief given, which may contain sites already.
+shift. Each value is counted from an origin within or near its bounds, in standard deviations of the given belief,
+which may contain sites already. `docs/derivations/narrow_constraints.md` derives the equations.
 """
 
+from dataclasses import replace
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -24,54 +26,70 @@ class Rows(NamedTuple):
     lower: Array
     upper: Array
     active: Array
-    """Rows to be met."""
-    given: Array
-    """(k, 2), the sites that the belief given contains."""
+    """Rows whose sites are updated."""
 
 
-class Patience(NamedTuple):
-    """How the loop goes on, and when it ends."""
+class Settings(NamedTuple):
+    """Damping and stopping rule of the iteration."""
 
     damping: Array | float
     max_sweeps: Array | int
     tolerance: Array | float
 
 
-class Tilted(NamedTuple):
-    """A row applied to the belief without its site, seen from the belief with it: in its standard deviations."""
+class Approximation(NamedTuple):
+    """The sites found, the belief with them, and how they were found."""
 
-    proper: Array
-    """Whether the belief without the site is one."""
-    deviation: Array
-    """Standard deviation of the belief with the site."""
-    shift: Array
-    """That of the site, about the mean of the belief with it."""
-    left: Array
-    """Precision without the site."""
-    cut: moments.Moments
-    """In the standard deviations that it has without the site."""
+    natural: Float[Array, "k 2"]
+    """Precisions and shifts of the sites."""
+    mean: Float[Array, " k"]
+    covariance: Float[Array, "k k"]
+    remaining: Float[Array, "k k"]
+    """`I - covariance diag(change of the precisions)`: the derivative of the mean by that of the given belief."""
+    sweeps: Int[Array, ""]
+    """How often the rows were gone through."""
+    change: Float[Array, ""]
+    """The larger one of the changes of a mean, in standard deviations, and of a log variance, in the last sweep."""
+
+
+class Marginal(NamedTuple):
+    """A marginal of the belief, divided by its site, in the standard deviations of the marginal from its mean.
+
+    The quotient (the cavity distribution) is proportional to `exp(-slope v - curvature v^2 / 2)`; it is truncated to
+    `lower <= v <= upper`.
+    """
+
+    slope: Array
+    curvature: Array
+    """Share of the precision that does not come from the site, in (0, 1]. For a narrow row it is below the rounding
+    error, on which the result does not depend."""
+    lower: Array
+    upper: Array
 
 
 @jax.custom_jvp
 def fixed_point(
-    belief: Gaussian | GaussianRoot, rows: Rows, natural: Float[Array, "k 2"], patience: Patience
-) -> tuple[Float[Array, "k 2"], Int[Array, ""], Float[Array, ""]]:
-    """Sites that demand themselves, how many sweeps it took to find them, and what the last of these changed.
+    belief: Gaussian | GaussianRoot, rows: Rows, given: Float[Array, "k 2"], settings: Settings
+) -> Approximation:
+    """Sites at which the belief has the moments of every row.
 
-    `belief` is the one given, in the values z; the loop starts from the sites `natural` that it contains. The changes
-    are those of `Patience.tolerance`: of means in standard deviations, and of log variances.
+    Args:
+        belief: The given belief in the values z.
+        rows: The inequalities.
+        given: Sites that the belief contains already. The iteration starts from them.
+        settings: The iteration stops when the change in a sweep is at most `settings.tolerance`.
     """
-    # On a root the variances of narrow rows keep their digits, however often they are changed.
+    # The variances of narrow rows keep their relative accuracy in a root, however often they are changed.
     start = belief if isinstance(belief, GaussianRoot) else GaussianRoot(belief.mean, _factor(belief.covariance))
 
     def visit(k, carry):
         belief, natural, largest = carry
         direction = component(belief, k)
         row = jax.tree.map(itemgetter(k), rows)
-        step = demanded(direction.mean, direction.deviation, natural[k], row) - natural[k]
-        largest = jnp.maximum(largest, _change(direction, step))
-        belief, _ = times(belief, direction, patience.damping * step)
-        return belief, natural.at[k].add(patience.damping * step), largest
+        change = site_change(direction.mean, direction.deviation, natural[k], row)
+        largest = jnp.maximum(largest, _size(direction, change))
+        belief = _times_component(belief, direction, k, settings.damping * change)
+        return belief, natural.at[k].add(settings.damping * change), largest
 
     def sweep(carry):
         belief, natural, count, _ = carry
@@ -79,137 +97,211 @@ def fixed_point(
         belief, natural, largest = jax.lax.fori_loop(0, len(natural), visit, (belief, natural, unchanged))
         return belief, natural, count + 1, largest
 
-    unfinished = lambda carry: (carry[3] > patience.tolerance) & (carry[2] < patience.max_sweeps)
-    carry = start, natural, jnp.int32(0), jnp.full((), jnp.inf, natural.dtype)
-    return jax.lax.while_loop(unfinished, sweep, carry)[1:]
+    unfinished = lambda carry: (carry[3] > settings.tolerance) & (carry[2] < settings.max_sweeps)
+    carry = start, given, jnp.int32(0), jnp.full((), jnp.inf, given.dtype)
+    _, natural, sweeps, change = jax.lax.while_loop(unfinished, sweep, carry)
+    # Once more from the start: the mean and the sites have been rounded in different ways in the loop.
+    belief, remaining = _conditioned(start, natural - given)
+    return Approximation(natural, belief.mean, linalg.matmul(belief.root, belief.root.T), remaining, sweeps, change)
+
+
+def _conditioned(belief: GaussianRoot, natural):
+    """The belief times factors of its components, and the derivative of its mean by that of the given belief."""
+    # Factors that add information go first, so that no belief in between is wider than the given one, or improper.
+    order = jnp.argsort(-natural[:, 0])
+
+    def step(i, carry):
+        belief, remaining = carry
+        k = order[i]
+        direction = component(belief, k)
+        tightened = _tightened(direction.deviation**2, natural[k, 0])
+        row = remaining[k] / tightened
+        # Without subtraction where the derivative is small.
+        others = remaining - (natural[k, 0] * direction.deviation * direction.gain)[:, None] * row
+        return _times_component(belief, direction, k, natural[k]), others.at[k].set(row)
+
+    return jax.lax.fori_loop(0, len(natural), step, (belief, jnp.eye(len(natural), dtype=natural.dtype)))
+
+
+def _times_component(belief: GaussianRoot, direction: Direction, k, natural):
+    """The belief times a factor of component k, whose new mean keeps its relative accuracy however small it is."""
+    changed, _ = times(belief, direction, natural)
+    variance = direction.deviation**2
+    mean = (direction.mean + variance * natural[1]) / _tightened(variance, natural[0])
+    return replace(changed, mean=changed.mean.at[k].set(mean))
 
 
 def times(belief, direction, natural):
-    """The belief times one factor, normalised, and the log of how much narrower it has become.
+    """The belief times one factor, normalised, and the log of the ratio of its standard deviations along the factor.
 
     Args:
         belief: `Gaussian` or `GaussianRoot`.
-        direction: What it says of the value that the factor is of.
+        direction: The marginal of the value that the factor depends on.
         natural: (2,), precision and shift of the factor.
     """
     precision, shift = natural
     mean, deviation = direction.mean, direction.deviation
-    # Less than this is rounding, and would blow the belief up.
-    tightened = jnp.maximum(1 + precision * deviation**2, jnp.finfo(natural.dtype).eps ** 0.5)
+    tightened = _tightened(deviation**2, precision)
     moved = deviation * (shift - precision * mean) / tightened
     return reshape(belief, direction, moved, 1 / tightened), -0.5 * jnp.log(tightened)
 
 
-def tilted(mean: Array, deviation: Array, left: Array, natural: Array, rows: Rows) -> Tilted:
-    """The rows applied to the belief without their sites, elementwise.
+def _tightened(variance, precision):
+    """The ratio by which a factor divides a variance."""
+    # A smaller number is a rounding error, and the belief would become very wide.
+    return jnp.maximum(1 + precision * variance, jnp.finfo(variance.dtype).eps ** 0.5)
+
+
+def marginal(mean: Array, deviation: Array, natural: Array, rows: Rows) -> Marginal:
+    """Marginals of the belief divided by their sites, elementwise.
 
     Args:
         mean: (...), of the values with their sites.
-        deviation: (...).
-        left: (...), share of the precision that is left without the site: `1 - precision deviation^2`.
+        deviation: (...), positive.
         natural: (..., 2), the sites.
         rows: The rows, with fields of that shape.
     """
-    eps = jnp.finfo(left.dtype).eps
-    deviation = jnp.where(rows.active, jnp.maximum(deviation, eps**0.5), 1.0)
-    shift = deviation * (natural[..., 1] - natural[..., 0] * mean)
-    # Next to a narrow row nothing is left but rounding, and what there was to begin with has to do.
-    clear, began = left > 32 * eps, 1 - rows.given[..., 0]
-    proper = rows.active & (clear | (began > 8 * eps))
-    began = jnp.where(began > 8 * eps, began, 1.0)
-    left = jnp.where(clear, left, began * deviation**2)
-    shift = jnp.where(clear, shift, deviation * (began * mean + rows.given[..., 1]))
-    from_mean = lambda bound: jnp.sqrt(left) * ((bound - mean) / deviation + shift / left)
-    return Tilted(proper, deviation, shift, left, moments.interval(from_mean(rows.lower), from_mean(rows.upper)))
+    slope = deviation * (natural[..., 1] - natural[..., 0] * mean)
+    curvature = 1 - natural[..., 0] * deviation**2
+    return Marginal(slope, curvature, (rows.lower - mean) / deviation, (rows.upper - mean) / deviation)
 
 
-def demanded(mean: Array, deviation: Array, natural: Array, rows: Rows) -> Array:
-    """Natural parameters (..., 2) of the sites that would give the values the moments of the rows themselves.
+def truncated(cavity: Marginal) -> moments.Moments:
+    """Moments of the truncated quotient; its log mass is relative to the density at v = 0."""
+    positive = jnp.maximum(cavity.curvature, jnp.finfo(cavity.curvature.dtype).eps ** 1.5)
+    return moments.exponential_quadratic(cavity.slope, positive, cavity.lower, cavity.upper)
 
-    Elementwise: mean and deviation (...) of the values with their present sites `natural` (..., 2). A row that is not
-    active, and one next to which nothing else is known any more, demands the site that it has.
+
+def site_change(mean: Array, deviation: Array, natural: Array, rows: Rows) -> Array:
+    """Changes (..., 2) of the sites that give the values the moments of the truncated marginals, elementwise.
+
+    Args:
+        mean: (...), of the values with their present sites.
+        deviation: (...).
+        natural: (..., 2), the present sites.
+        rows: The rows. One that is not active does not change, and neither does one whose value is certain.
     """
-    eps = jnp.finfo(mean.dtype).eps
-    known = deviation > eps**0.5
-    proper, deviation, shift, left, cut = tilted(mean, deviation, 1 - natural[..., 0] * deviation**2, natural, rows)
-    # Nothing is made so narrow that it could not be told from rounding afterwards.
-    smallest = jnp.maximum(128 * eps, 4 * eps * left / deviation**2)
-    variance = jnp.maximum(cut.variance, jnp.minimum(smallest, 1.0))
-    precision = left * (1 - variance) / (variance * deviation**2)
-    shift = (jnp.sqrt(left) * cut.mean - shift * (1 - variance)) / (variance * deviation)
-    site = jnp.stack([precision, shift + precision * mean], axis=-1)
-    return jnp.where((proper & known)[..., None], site, jax.lax.stop_gradient(natural))
-
-
-def conditioned(
-    belief: Gaussian | GaussianRoot, natural: Float[Array, "k 2"]
-) -> tuple[Float[Array, " k"], Float[Array, "k k"], Float[Array, "k k"]]:
-    """Mean and covariance of a belief of mean zero times factors of its components, and `I - covariance precision`.
-
-    The last, with the precisions of the factors as a diagonal matrix, is what a narrow factor leaves; it has been found
-    without subtraction.
-    """
-    prior = linalg.matmul(belief.root, belief.root.T) if isinstance(belief, GaussianRoot) else belief.covariance
-    precision, shift = natural.T
-    identity = jnp.eye(len(prior), dtype=prior.dtype)
-    left = jnp.linalg.solve(identity + prior * precision, identity)
-    P = linalg.matmul(left, prior)
-    return P @ shift, P, left
+    changeable = rows.active & _resolved(deviation)
+    deviation = jnp.where(changeable, deviation, 1.0)
+    precision, shift = _local_change(marginal(mean, deviation, natural, rows), deviation)
+    precision = precision / deviation**2
+    change = jnp.stack([precision, shift / deviation + precision * mean], axis=-1)
+    return jnp.where(changeable[..., None], change, 0.0)
 
 
 @fixed_point.defjvp
 def _fixed_point_jvp(primals, tangents):
-    # Where what the sites demand less what they are is zero for all givens: d natural = -(d lacking / d natural)^-1
-    # (d lacking / d givens) d givens. In this way a loop of unknown length has derivatives in both modes.
-    (belief, rows, start, _), (d_belief, d_rows, d_start, _) = primals, tangents
-    natural, sweeps, change = fixed_point(*primals)
-    marginals = lambda belief, start: conditioned(belief, natural - start)[:2]
-    (mean, P), (d_mean, d_P) = jax.jvp(marginals, (belief, start), (d_belief, d_start))
-    slopes = _slopes_of_demand(mean, P, natural, rows)
-    d_given = jnp.stack([d_mean, jnp.diagonal(d_P), d_rows.lower, d_rows.upper, *d_rows.given.T])
-    d_lacking = jnp.einsum("skp,sk->kp", slopes[:6], d_given, precision="highest")
+    # Implicit differentiation: the derivative of the changes by the sites, times the tangent of the sites, cancels the
+    # derivative by everything else. This differentiates a loop of unknown length in both modes.
+    (belief, rows, given, _), (d_belief, d_rows, d_given, _) = primals, tangents
+    found = fixed_point(*primals)
+    natural, mean, P = found[:3]
+    # Tangents of mean and covariance at constant sites.
+    d_mean, d_P = _tangents_of_belief(belief, d_belief, natural - given, -d_given, found)
+    variance = jnp.diagonal(P)
+    changeable = rows.active & _resolved(linalg.safe_sqrt(variance))
+    deviation = jnp.where(changeable, linalg.safe_sqrt(variance), 1.0)
+    cavity = marginal(mean, deviation, natural, rows)
+    # From here on sites are in the standard deviations of their marginals, from the means: all numbers are near one.
+    slopes = jnp.where(changeable, _slopes(cavity, deviation), 0.0)
+    by_lower, by_upper = slopes[2:]
+    by_mean, by_log_variance = _by_marginal(cavity, slopes)
+    d_step = by_mean * d_mean / deviation + by_log_variance * jnp.diagonal(d_P) / deviation**2
+    d_step += by_lower * d_rows.lower / deviation + by_upper * d_rows.upper / deviation
     # A row that is left alone keeps the site that it was given.
-    alone = jnp.all(slopes == 0, axis=(0, 2))
-    d_lacking = jnp.where(alone[:, None], d_start, d_lacking)
-    step = jnp.linalg.solve(_derivative_of_lacking(mean, P, slopes), -d_lacking.ravel())
+    d_own = _localized(d_given, mean, deviation)
+    d_step = jnp.where(changeable, d_step, d_own)
+    matrix = _derivative_of_change(P / (deviation[:, None] * deviation), slopes, by_mean, by_log_variance, changeable)
+    precision, shift = jnp.linalg.solve(matrix, -d_step.ravel()).reshape(d_step.shape)
+    d_precision = precision / deviation**2
+    d_natural = jnp.stack([d_precision, shift / deviation + d_precision * mean], axis=-1)
+    d_mean += jnp.matmul(P, d_natural[:, 1] - d_precision * mean, precision="highest")
+    d_P -= linalg.matmul(P * d_precision, P)
+    d_remaining = -d_P * (natural - given)[:, 0] - P * (d_precision - d_given[:, 0])
     no_tangent = np.zeros((), jax.dtypes.float0)
-    return (natural, sweeps, change), (step.reshape(natural.shape), no_tangent, jnp.zeros_like(change))
+    return found, Approximation(d_natural, d_mean, d_P, d_remaining, no_tangent, jnp.zeros_like(found.change))
 
 
-def _slopes_of_demand(mean, P, natural, rows):
-    """Derivatives (8, k, 2) of what a row demands by its mean, variance, bounds, given site and present site."""
-    own = jnp.stack([mean, jnp.diagonal(P), rows.lower, rows.upper, *rows.given.T, *natural.T])
+def _tangents_of_belief(belief, d_belief, factors, d_factors, found):
+    """Tangents of mean and covariance of the belief times factors, from those of the belief and of the factors."""
+    if isinstance(belief, GaussianRoot):
+        half = linalg.matmul(d_belief.root, belief.root.T)
+        d_prior = half + half.T
+    else:
+        d_prior = d_belief.covariance
+    mean, P, remaining = found.mean, found.covariance, found.remaining
+    force = factors[:, 1] - factors[:, 0] * mean
+    full = lambda a, b: jnp.matmul(a, b, precision="highest")
+    d_mean = full(remaining, d_belief.mean + full(d_prior, force)) + full(P, d_factors[:, 1] - d_factors[:, 0] * mean)
+    return d_mean, full(full(remaining, d_prior), remaining.T) - full(P * d_factors[:, 0], P)
 
-    def demand(own):
-        mean, variance, lower, upper = own[:4]
-        row = rows._replace(lower=lower, upper=upper, given=own[4:6].T)
-        return demanded(mean, linalg.safe_sqrt(variance), own[6:].T, row)
 
-    axes = jnp.eye(len(own), dtype=own.dtype)
-    return jax.vmap(lambda axis: jax.jvp(demand, (own,), (jnp.broadcast_to(axis[:, None], own.shape),))[1])(axes)
+def _local_change(cavity: Marginal, deviation: Array):
+    """Changes of precision and shift, in the standard deviations of the marginals and from their means."""
+    row = truncated(cavity)
+    # The smallest deviation that is resolved, so that a row that allows a single point has a finite precision.
+    smallest = _smallest(deviation) ** 2 / deviation**2
+    variance = jnp.maximum(row.variance, jnp.minimum(smallest, 1.0))
+    return jnp.stack([1 / variance - 1, row.mean / variance])
 
 
-def _derivative_of_lacking(mean, P, slopes):
-    """Derivative (2 k, 2 k) of what the sites demand beyond themselves, by themselves.
+def _slopes(cavity: Marginal, deviation):
+    """Derivatives (4, 2, k) of the changes by the four fields of the marginals."""
+    change = lambda *fields: _local_change(Marginal(*fields), deviation)
+    axes = jnp.eye(4, dtype=deviation.dtype)
+    broadcast = lambda axis: tuple(jnp.broadcast_to(axis[:, None], (4, *deviation.shape)))
+    return jax.vmap(lambda axis: jax.jvp(change, tuple(cavity), broadcast(axis))[1])(axes)
 
-    A row demands by its own marginal, and that hangs on the sites of all rows: with the precision of site j the mean of
-    row k changes at the rate `-P_kj mean_j` and its variance at `-P_kj^2`; with the shift the mean at `P_kj`.
+
+def _by_marginal(cavity: Marginal, slopes):
+    """Derivatives (2, k) of the changes by the means, in standard deviations, and by the log variances."""
+    by_slope, by_curvature, by_lower, by_upper = slopes
+    share = 1 - cavity.curvature
+    by_mean = -share * by_slope - by_lower - by_upper
+    by_bounds = cavity.lower * by_lower + cavity.upper * by_upper
+    return by_mean, 0.5 * (cavity.slope * by_slope - by_bounds) - share * by_curvature
+
+
+def _derivative_of_change(correlation, slopes, by_mean, by_log_variance, changeable):
+    """Derivative (2 k, 2 k) of the changes by the sites, precisions first.
+
+    A change depends on its own site, and on the sites of all rows through its marginal: with the precision of site j
+    the log variance of row k changes at the rate -correlation_kj^2, with the shift its mean at the rate correlation_kj.
     """
-    by_mean, by_variance, *_, by_precision, by_shift = slopes
-    means, variances = jnp.stack([-P * mean, P], axis=-1), jnp.stack([-P * P, jnp.zeros_like(P)], axis=-1)
-    marginals = by_mean[:, :, None, None] * means[:, None] + by_variance[:, :, None, None] * variances[:, None]
-    # By roundings more than the identity: rows that contradict each other demand nothing but each other's negative.
-    more = 1 + 8 * jnp.finfo(P.dtype).eps
-    itself = jnp.stack([by_precision, by_shift], axis=-1) - more * jnp.eye(2, dtype=P.dtype)
-    identity = jnp.eye(len(mean), dtype=P.dtype)
-    return (marginals + itself[:, :, None] * identity[:, None, :, None]).reshape(2 * len(mean), -1)
+    own = jnp.stack([-slopes[1], slopes[0]], axis=1)
+    through = jnp.stack(
+        [-by_log_variance[..., None] * correlation**2, by_mean[..., None] * correlation],
+        axis=1,
+    )
+    k = len(correlation)
+    identity = jnp.eye(k, dtype=correlation.dtype)
+    alone = jnp.where(changeable, 0.0, -jnp.eye(2, dtype=correlation.dtype)[..., None])
+    # Where rows contradict each other, the sites are not determined, and the matrix is regularised.
+    regular = 8 * jnp.finfo(correlation.dtype).eps * jnp.eye(2, dtype=correlation.dtype)
+    blocks = through + (own + alone - regular[..., None])[..., None] * identity
+    return blocks.transpose(0, 2, 1, 3).reshape(2 * k, 2 * k)
 
 
-def _change(direction: Direction, step):
-    """Larger one of what a step means to the mean, in standard deviations, and to the log variance; 0 if rounding."""
+def _localized(d_natural, mean, deviation):
+    """Tangents (2, k) of sites, in the standard deviations of the marginals and from their means."""
+    d_precision, d_shift = d_natural.T
+    return jnp.stack([d_precision * deviation**2, deviation * (d_shift - d_precision * mean)])
+
+
+def _smallest(x):
+    """The smallest standard deviation to which a row of zero width reduces a value, relative to the given belief."""
+    return float(jnp.finfo(x.dtype).eps) ** 0.75
+
+
+def _resolved(deviation):
+    return deviation > _smallest(deviation)
+
+
+def _size(direction: Direction, change):
+    """The larger one of the changes of the mean, in standard deviations, and of the log variance; 0 if rounding."""
     mean, deviation = direction.mean, jnp.where(direction.certain, 1.0, direction.deviation)
-    moved = jnp.maximum(abs(step[1] - step[0] * mean) * deviation, abs(step[0]) * deviation**2)
-    rounding = 2 * jnp.finfo(step.dtype).eps * (abs(mean) + 1 / deviation) / deviation
+    moved = jnp.maximum(abs(change[1] - change[0] * mean) * deviation, abs(change[0]) * deviation**2)
+    rounding = 4 * jnp.finfo(change.dtype).eps * (1 + abs(mean) / deviation)
     return jnp.where(direction.certain | (moved < rounding), 0.0, moved)
 
 

@@ -1,4 +1,4 @@
-"""What truncation reports, and the distances to constraints in standard deviations."""
+"""Diagnostics of truncations, and the distances to constraints in standard deviations."""
 
 import jax
 import jax.numpy as jnp
@@ -7,19 +7,19 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.constraints.directions import Direction, along
-from jaxfilters.gaussian.constraints.linear import LinearConstraints
+from jaxfilters.gaussian.constraints.linear import LinearConstraints, check_width
 
 
 @pytree_dataclass
 class CutInfo:
-    """Diagnostics of one cut."""
+    """Diagnostics of a truncation by one inequality."""
 
     distances: Float[Array, "..."]
-    """(2,), from the mean inwards from the lower and from the upper bound, in standard deviations; negative outside."""
+    """(2,), distances of the mean from the lower and from the upper bound, in standard deviations; negative outside."""
     log_mass: Float[Array, "..."]
-    """Log of the share of the belief that lay within the bounds; `-inf` where infeasible."""
+    """Log of the probability that the inequality holds under the given belief; `-inf` where infeasible."""
     infeasible: Bool[Array, "..."]
-    """Whether the value was certain, and outside; the belief was then left as it was."""
+    """Whether the value was certain and outside of the bounds; the belief was then left as it was."""
 
 
 @pytree_dataclass
@@ -29,24 +29,32 @@ class TruncationInfo:
     distances: Float[Array, "..."]
     """(k, 2), `constraint_distances` of the belief before truncation."""
     log_mass: Float[Array, "..."]
-    """Log of the share of the belief that satisfies all constraints, as the method estimates it; `-inf` where one of
-    them is infeasible."""
+    """Log of the probability that all constraints hold, as the method estimates it; `-inf` where one is infeasible."""
     infeasible: Bool[Array, "..."]
-    """(k,), rows that contradict what is certain, or that expectation propagation could not meet together with the
-    others."""
+    """(k,), rows that a certain value violates, or that the mean still violates after expectation propagation because
+    they contradict other rows."""
     sweeps: Int[Array, "..."]
-    """How often the rows were gone through."""
+    """Number of sweeps over the rows."""
     converged: Bool[Array, "..."]
-    """Whether the last sweep changed less than was tolerated."""
+    """Whether the last sweep changed the belief by no more than the tolerance."""
 
 
 def constraint_distances(belief: Gaussian | GaussianRoot, constraints: LinearConstraints) -> Float[Array, "k 2"]:
-    """How far the mean is inside the lower and the upper bound of each row, in standard deviations; negative outside.
+    """Distances of the mean from the lower and the upper bound of each row, in standard deviations; negative outside.
 
     `(normal^T mean - lower) / s` and `(upper - normal^T mean) / s` (N. Shimada et al., "Shape and pose estimation of an
-    articulated object", 1997, equation 24). A bound that is not there is infinitely far; where the value is certain,
-    any bound is, inside or outside.
+    articulated object", 1997, equation 24), where s is the standard deviation of `normal^T x`. The distance from an
+    infinite bound is infinite. Where the value is certain, distances are infinite, negative where a bound is violated.
+
+    Args:
+        belief: A `Gaussian` or `GaussianRoot` of n components.
+        constraints: k rows on n components.
+
+    Raises:
+        TypeError: `belief` is not Gaussian.
+        ValueError: The normals do not have one column for each component of the belief.
     """
+    check_width(belief, constraints)
     directions = jax.vmap(along, (None, 0))(belief, constraints.normals)
     return jax.vmap(distances_along)(directions, constraints.lower, constraints.upper)
 
@@ -54,7 +62,7 @@ def constraint_distances(belief: Gaussian | GaussianRoot, constraints: LinearCon
 def distances_along(
     direction: Direction, lower: Float[Array, ""] | float, upper: Float[Array, ""] | float
 ) -> Float[Array, " 2"]:
-    """The distances of one row, from the belief along its normal."""
+    """Distances (2,) of one row, from the marginal of the belief along its normal."""
     slack = jnp.stack([direction.mean - lower, upper - direction.mean])
     scaled = jnp.isfinite(slack) & ~direction.certain
     endless = jnp.where(slack >= -direction.rounding, jnp.inf, -jnp.inf)

@@ -1,4 +1,4 @@
-"""The factors that stand for inequalities from one truncation to the next."""
+"""Gaussian factors that stand for inequalities, carried from one truncation to the next."""
 
 import jax
 import jax.numpy as jnp
@@ -10,39 +10,53 @@ from jaxfilters.gaussian.constraints.linear import LinearConstraints
 
 @pytree_dataclass
 class Sites:
-    """Factors `exp(log_scale + shift z - precision z^2 / 2)` of `z = normal^T x`, one for each of k rows."""
+    """Factors `exp(log_scale + shift d - precision d^2 / 2)` of `d = normal^T x - origin`, one for each of k rows.
+
+    Measured from an origin within the bounds, the shift of a narrow row is of the order of one. Measured from zero, it
+    would be the product of a large precision and a position, and its digits would be lost in single precision.
+    """
 
     precision: Float[Array, "..."]
-    """(k,), at least 0."""
+    """(k,), at least 0, in the inverse squared unit of `normal^T x`."""
     shift: Float[Array, "..."]
-    """(k,)."""
+    """(k,), the derivative of the log factor at the origin."""
     log_scale: Float[Array, "..."]
-    """(k,). Only the reported `log_mass` depends on it."""
+    """(k,), the log factor at the origin. Only the reported `log_mass` depends on it."""
+    origin: Float[Array, "..."]
+    """(k,), in the unit of `normal^T x`."""
 
-    def only(self, rows: Bool[Array, " k"]) -> "Sites":
-        """The sites of the chosen rows; factors of one for the others.
+    def select(self, rows: Bool[Array, " k"]) -> "Sites":
+        """Sites of the selected rows, and factors of one for the others.
 
-        To be given to the next truncation where only the chosen rows are about something that has not changed.
+        The next truncation takes the result where only the selected rows concern quantities that are constant in time.
+
+        Args:
+            rows: (k,), True for the rows whose sites are kept.
         """
         return jax.tree.map(lambda leaf: jnp.where(rows, leaf, 0.0), self)
 
 
-def no_sites(constraints: LinearConstraints) -> Sites:
-    """Factors of one: the sites of a belief that no row has been applied to."""
-    ones = jnp.zeros_like(constraints.lower)
-    return Sites(ones, ones, ones)
+def initial_sites(constraints: LinearConstraints) -> Sites:
+    """Factors of one: the sites of a belief to which no row has been applied yet.
+
+    Args:
+        constraints: The k rows; only their number and type matter.
+
+    Returns:
+        Sites whose fields are all zeros, (k,).
+    """
+    zeros = jnp.zeros_like(constraints.lower)
+    return Sites(zeros, zeros, zeros, zeros)
 
 
-def standardized(sites: Sites, mean: Float[Array, " k"], unit: Float[Array, " k"]) -> Sites:
-    """The same factors as functions of `(z - mean) / unit`."""
-    shift = sites.shift - sites.precision * mean
-    log_scale = sites.log_scale + mean * (sites.shift - 0.5 * sites.precision * mean)
-    return Sites(sites.precision * unit * unit, shift * unit, log_scale)
+def standardized(sites: Sites, origin: Float[Array, " k"], unit: Float[Array, " k"]) -> Sites:
+    """The same factors as functions of `(z - origin) / unit`, where `z = normal^T x`."""
+    moved = origin - sites.origin
+    shift = sites.shift - sites.precision * moved
+    log_scale = sites.log_scale + moved * (sites.shift - 0.5 * sites.precision * moved)
+    return Sites(sites.precision * unit * unit, shift * unit, log_scale, jnp.zeros_like(origin))
 
 
-def destandardized(sites: Sites, mean: Float[Array, " k"], unit: Float[Array, " k"]) -> Sites:
-    """Factors of `(z - mean) / unit` as functions of z."""
-    precision = sites.precision / (unit * unit)
-    shift = sites.shift / unit
-    log_scale = sites.log_scale - mean * (shift + 0.5 * precision * mean)
-    return Sites(precision, shift + precision * mean, log_scale)
+def destandardized(sites: Sites, origin: Float[Array, " k"], unit: Float[Array, " k"]) -> Sites:
+    """Factors of `(z - origin) / unit` as functions of `z - origin`."""
+    return Sites(sites.precision / (unit * unit), sites.shift / unit, sites.log_scale, origin)

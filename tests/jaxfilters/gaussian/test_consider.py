@@ -10,7 +10,7 @@ from jaxfilters import Gaussian, keep_all
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.consider import consider, schmidt_kalman
 from jaxfilters.gaussian.constraints import linear_constraints
-from jaxfilters.gaussian.constraints.constrained import EPConstraints, constrained
+from jaxfilters.gaussian.constraints.constrained_filter import EPConstraints, constrained
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.gaussian.linearize import second_order_covariance_only
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.gaussian.constraints import check_feasible, feasible, linear_constraints
+from jaxfilters.gaussian.constraints import LinearConstraints, check_feasible, feasible, linear_constraints
 
 
 def test_constraints_are_a_pytree_with_static_names(x64):
@@ -12,7 +12,7 @@ def test_constraints_are_a_pytree_with_static_names(x64):
     assert len(jax.tree.leaves(constraints)) == 3
     np.testing.assert_array_equal(constraints.lower, [-1, -1])
     doubled = jax.tree.map(lambda leaf: 2 * leaf, constraints)
-    assert isinstance(doubled, constraints.LinearConstraints)
+    assert isinstance(doubled, LinearConstraints)
     np.testing.assert_array_equal(doubled.normals, [[2, 0], [0, 4]])
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 import jaxfilters
 from jaxfilters import Gaussian, keep_all
 from jaxfilters.gaussian.constraints import cut, linear_constraints
-from jaxfilters.gaussian.constraints.constrained import EPConstraints, TruncateEachStep, constrained
+from jaxfilters.gaussian.constraints.constrained_filter import EPConstraints, TruncateEachStep, constrained
 from jaxfilters.gaussian.extended import extended_kalman
 
 
