@@ -25,8 +25,8 @@ from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
 from jaxfilters.math import diffusion
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState, adaptive_diffusion
-from jaxfilters.particle.bootstrap import ParticleInfo
 from jaxfilters.particle.partitioned import Partitions, consecutive, counted_once
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey
 
 POSE, DEFORMATION = 6, 5

@@ -21,10 +21,12 @@ from jaxfilters.filter import Filter
 from jaxfilters.math import diffusion
 from jaxfilters.math.diffusion import DiffusionFit
 from jaxfilters.math.linalg import safe_sqrt
-from jaxfilters.particle.bootstrap import ParticleInfo, check_ensemble, resample, reweight, untempered
+from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme
 from jaxfilters.particle.partitioned import EnsembleLogLikelihood, Partitions, in_one_group, partitioned_update
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import AnyKey, ResamplingScheme, SamplePrior, as_pytree
 
@@ -109,7 +111,7 @@ def adaptive_diffusion(
     Raises:
         ValueError: If `num_particles < 1`, a scale, a distance or a limit is out of range, or sizes do not agree.
     """
-    check_ensemble(num_particles, 1.0)
+    checks.check_ensemble(num_particles, 1.0, scheme, None)
     steady_std = jnp.zeros(0) if steady_std is None else jnp.asarray(steady_std, dtype=float)
     mode_scale = jnp.asarray(mode_scale, dtype=float)
     low, high = (jnp.broadcast_to(jnp.asarray(limit, dtype=float), fit.scale.shape) for limit in (low, high))
@@ -181,7 +183,7 @@ def _update(
         return model.log_likelihood(particles, observation)
 
     if model.partitions is None:
-        log_weights, info = reweight(log_weights, log_likelihood(particles), ancestors, untempered)
+        log_weights, info = reweight(log_weights, log_likelihood(particles), ancestors, no_tempering)
     else:
         particles, log_weights, ancestors, info = partitioned_update(
             key,

@@ -61,23 +61,22 @@ def _is_integer(value: Any) -> bool:
     return jnp.issubdtype(jnp.result_type(value), jnp.integer)
 
 
-def check_ensemble(num_particles: Any, ess_threshold: Any) -> None:
-    """Check the number of particles and the threshold below which they are resampled."""
+def check_ensemble(num_particles: Any, ess_threshold: Any, scheme: Any, temper: Any) -> None:
+    """Check what builders of particle filters have in common.
+
+    Args:
+        num_particles: A Python integer of at least 1.
+        ess_threshold: A number of at least 0.
+        scheme: A resampling scheme: a function, or an object with a method `resample`.
+        temper: A function, or `None`; of an `AdaptiveTempering` the concrete `ess_fraction` must be in (0, 1].
+    """
     check_num_particles(num_particles)
     check_scalar("ess_threshold", ess_threshold, "a fraction of num_particles, at least 0", lambda value: value >= 0)
-
-
-def check_scheme(scheme: Any) -> None:
-    """Require a resampling scheme: a function, or an object with a method `resample`."""
     if not callable(scheme) and not callable(getattr(scheme, "resample", None)):
         raise TypeError(f"scheme must be a function of jaxfilters.resampling or similar; got {scheme!r}.")
-
-
-def check_temper(temper: Any) -> None:
-    """Require a callable; of an `AdaptiveTempering`, a concrete `ess_fraction` in (0, 1]."""
     check_callables(temper=temper)
     if hasattr(temper, "ess_fraction"):
-        check_scalar("ess_fraction", temper.ess_fraction, "in (0, 1]", lambda value: 0 < value <= 1)
+        check_scalar("ess_fraction of temper", temper.ess_fraction, "in (0, 1]", lambda value: 0 < value <= 1)
 
 
 def check_shape(name: str, value: Any, expected: tuple[int, ...], reason: str = "") -> None:
@@ -274,3 +273,11 @@ def check_groups(groups: Any, num_coordinates: int) -> None:
     if members is not None and not np.all(members.any(axis=0)):
         missing = np.flatnonzero(~members.any(axis=0)).tolist()
         raise ValueError(f"groups of partitions must hold every coordinate; got none that holds {missing}.")
+
+
+def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
+    """Require a point like the state of one particle, and an information matrix of its tangent space."""
+    if not (hasattr(guidance, "point") and hasattr(guidance, "information")):
+        raise TypeError(f"guide must return a Guidance; got {type(guidance).__name__}.")
+    like("point of guide", guidance.point, x, "the nonlinear state of a particle")
+    check_covariance("information of guide", guidance.information, size)

@@ -18,9 +18,10 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
-from jaxfilters.particle.bootstrap import ParticleInfo, resample, reweight, untempered
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transport
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, as_pytree
 
 
@@ -130,14 +131,14 @@ def partitioned_update(
         raise ValueError("scheme must choose ancestors between the stages; transport averages particles.")
     resample_key, noise_key = jax.random.split(key)
     first_likelihood = log_likelihood(particles)
-    log_weights, first = reweight(log_weights, first_likelihood, ancestors, untempered)
+    log_weights, first = reweight(log_weights, first_likelihood, ancestors, no_tempering)
     (particles, first_likelihood), log_weights, chosen = resample(
         resample_key, (particles, first_likelihood), log_weights, scheme, 1.0
     )
     noise = standard_normal(noise_key, particles.shape, particles.dtype)
     particles = particles + jitter[:, None] * noise
     second_likelihood = stage_weights(log_likelihood(particles), first_likelihood)
-    log_weights, second = reweight(log_weights, second_likelihood, ancestors, untempered)
+    log_weights, second = reweight(log_weights, second_likelihood, ancestors, no_tempering)
     unexplained = second.log_evidence == -jnp.inf
     info = second._replace(
         log_evidence=jnp.where(unexplained, -jnp.inf, first.log_evidence),

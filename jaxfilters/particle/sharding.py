@@ -30,7 +30,8 @@ from jaxtyping import Array, Int32, PyTree, Shaped
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.particle.bootstrap import ParticleInfo, resample, untempered
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample
 from jaxfilters.typing import AnyKey
 
 AXIS = "particles"
@@ -91,7 +92,7 @@ def sharded(filter: Filter, mesh: Mesh, *, axis: str = AXIS, island_threshold: f
         raise ValueError(f"island_threshold must be a share of the devices, at least 0; got {island_threshold!r}.")
     share = _share(filter, mesh, axis)
     temper = filter.params.temper
-    if getattr(temper, "func", temper) is not untempered:
+    if getattr(temper, "func", temper) is not no_tempering:
         raise ValueError("filter must not be tempered: each island would flatten likelihoods by a power of its own.")
     island = _with_particles(filter, share)
     _, specs = _specs(filter, axis)
