@@ -262,8 +262,11 @@ def check_sizes(name: str, sizes: Any) -> None:
             raise ValueError(f"{name} must be an integer or a tuple of integers, at least 0; got {sizes!r}.")
 
 
-def check_groups(groups: Any, num_coordinates: int) -> None:
-    """Require boolean groups (g, d) of d coordinates; where concrete, every coordinate must be in one of them."""
+def check_partitions(partitions: Any, num_coordinates: int) -> None:
+    """Require boolean groups (g, d) that hold every coordinate, and a jitter of at least 0, where they are concrete."""
+    check_callables(stage_weights=partitions.stage_weights)
+    check_scalar("jitter of partitions", partitions.jitter, "at least 0", lambda value: value >= 0)
+    groups = partitions.groups
     shape = jnp.shape(groups)
     if len(shape) != 2 or shape[0] < 1 or shape[1] != num_coordinates:
         raise ValueError(f"groups of partitions must have the shape (g, {num_coordinates}); got {shape}.")
@@ -281,3 +284,20 @@ def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
         raise TypeError(f"guide must return a Guidance; got {type(guidance).__name__}.")
     like("point of guide", guidance.point, x, "the nonlinear state of a particle")
     check_covariance("information of guide", guidance.information, size)
+
+
+def check_history(history: Any) -> None:
+    """Require the ensembles of a run: leaves with time as first and the particles as last axis, integer ancestors."""
+    if not all(hasattr(history, name) for name in ("particles", "log_weights", "ancestors")):
+        raise TypeError(f"history must be a History, as keep_history collects it; got {type(history).__name__}.")
+    if jnp.ndim(history.log_weights) != 2:
+        raise ValueError(f"log_weights of history must have the shape (t, n); got {jnp.shape(history.log_weights)}.")
+    length, count = jnp.shape(history.log_weights)
+    check_shape("ancestors of history", history.ancestors, (length, count), "its log_weights")
+    if not _is_integer(history.ancestors):
+        raise TypeError(f"ancestors of history must be integers; got {jnp.result_type(history.ancestors)}.")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(history.particles):
+        shape = jnp.shape(leaf)
+        if len(shape) < 2 or (shape[0], shape[-1]) != (length, count):
+            name = f"particles{jax.tree_util.keystr(path)} of history"
+            raise ValueError(f"{name} must have the shape ({length}, ..., {count}); got {shape}.")
