@@ -7,6 +7,7 @@ array without a value.
 """
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import jax
@@ -54,7 +55,7 @@ def check_scalar(name: str, value: Any, condition: str, holds: Callable[[np.ndar
         raise TypeError(f"{name} must be a number, {condition}; got {value!r}.")
     number = concrete(value)
     if number is not None and not holds(number):
-        raise ValueError(f"{name} must be {condition}; got {value!r}.")
+        raise ValueError(f"{name} must be {condition}; got {number}.")
 
 
 def _is_integer(value: Any) -> bool:
@@ -92,37 +93,38 @@ def check_floating(name: str, value: Any) -> None:
         raise TypeError(f"{name} must hold floating-point numbers; got {jnp.result_type(value)}.")
 
 
-def check_covariance(name: str, value: Any, size: int | None = None) -> None:
+def check_covariance(name: str, value: Any, size: int | None = None, kind: str = "a covariance") -> None:
     """Require a square matrix; where it is concrete also one that is finite, symmetric and positive semidefinite.
 
     Args:
         name: Name of the argument.
         value: The matrix, maybe traced.
-        size: Its number of rows, if that is known.
+        size: Number of its rows, if that is known.
+        kind: What the matrix is, for the message.
     """
     shape = jnp.shape(value)
     if len(shape) != 2 or shape[0] != shape[1] or (size is not None and shape[0] != size):
         expected = "(n, n)" if size is None else f"({size}, {size})"
-        raise ValueError(f"{name} must be a covariance of shape {expected}; got {shape}.")
+        raise ValueError(f"{name} must be {kind} of shape {expected}; got {shape}.")
     matrix = concrete(value)
     if matrix is None or matrix.size == 0:
         return
     if not np.all(np.isfinite(matrix)):
-        raise ValueError(f"{name} must be a covariance of finite numbers; got {matrix.tolist()}.")
+        raise ValueError(f"{name} must be {kind} of finite numbers; got {matrix.tolist()}.")
     largest = np.max(np.abs(matrix))
     if np.max(np.abs(matrix - matrix.T)) > _SYMMETRY_TOLERANCE * largest:
-        raise ValueError(f"{name} must be a covariance, which is symmetric; got {matrix.tolist()}.")
+        raise ValueError(f"{name} must be {kind}, which is symmetric; got {matrix.tolist()}.")
     lowest = np.linalg.eigvalsh(matrix.astype(float))[0]
     if lowest < -_EIGENVALUE_TOLERANCE * largest:
         raise ValueError(
-            f"{name} must be a covariance, which is positive semidefinite; got one with the eigenvalue {lowest:.3g}."
+            f"{name} must be {kind}, which is positive semidefinite; got one with the eigenvalue {lowest:.3g}."
         )
 
 
 def check_gaussian(name: str, belief: Any) -> None:
     """Require a `Gaussian` with a mean (n,) and a covariance (n, n) of floating-point numbers."""
     if not (hasattr(belief, "mean") and hasattr(belief, "covariance")):
-        raise TypeError(f"{name} must be a Gaussian with mean and covariance; got {type(belief).__name__}.")
+        raise TypeError(f"{name} must be a Gaussian with mean and covariance; got {_kind(belief)}.")
     mean, covariance = jnp.shape(belief.mean), jnp.shape(belief.covariance)
     if len(mean) != 1 or covariance != mean * 2:
         raise ValueError(f"{name} must have a mean (n,) and a covariance (n, n); got {mean} and {covariance}.")
@@ -142,7 +144,12 @@ def check_vectors(name: str, particles: Any) -> None:
 def _described(tree: PyTree, shapes: list) -> str:
     if isinstance(tree, jax.Array):
         return f"the shape {shapes[0]}"
-    return f"a {type(tree).__name__} with leaves of shape {', '.join(map(str, shapes))}"
+    return f"{_kind(tree)} with leaves of shape {', '.join(map(str, shapes))}"
+
+
+def _kind(value: Any) -> str:
+    """The kind of an object, for messages: JAX's own classes of arrays have no names that a user knows."""
+    return f"an array of shape {value.shape}" if isinstance(value, jax.Array) else f"a {type(value).__name__}"
 
 
 def checked_noise(noise: PyTree, particles: PyTree) -> PyTree:
@@ -204,8 +211,9 @@ def scalar_log_density(name: str, value: Any) -> Any:
 def log_likelihoods_of_ensemble(value: Any, count: int) -> Any:
     """Log-likelihoods of all particles at once, which must be one array (n,)."""
     if not isinstance(value, jax.Array) or jnp.shape(value) != (count,):
-        shape = jnp.shape(value) if isinstance(value, jax.Array) else type(value).__name__
-        raise ValueError(f"log_likelihood must return one number for each particle, of shape ({count},); got {shape}.")
+        raise ValueError(
+            f"log_likelihood must return one number for each particle, of shape ({count},); got {_kind(value)}."
+        )
     return value
 
 
@@ -231,7 +239,7 @@ def checked_dynamics(dynamics: Callable, noise_dim: int, linear_size: int) -> Ca
     def checked(x: PyTree, control: PyTree) -> Any:
         step = dynamics(x, control)
         if not all(hasattr(step, name) for name in ("f_n", *expected)):
-            raise TypeError(f"dynamics must return a MixedDynamics; got {type(step).__name__}.")
+            raise TypeError(f"dynamics must return a MixedDynamics; got {_kind(step)}.")
         like("f_n of dynamics", step.f_n, x, "x, which sample_prior draws")
         for name, shape in expected.items():
             sizes = f"noise_dim is {n} and linear_prior has {l} components"
@@ -246,7 +254,7 @@ def checked_dynamics(dynamics: Callable, noise_dim: int, linear_size: int) -> Ca
 def check_linear_observation(linear: Any, y: Any, linear_size: int) -> None:
     """Require the fields of a `LinearObservation` and the observation itself to have matching shapes."""
     if not all(hasattr(linear, name) for name in ("h", "C", "R")):
-        raise TypeError(f"observe must return a LinearObservation; got {type(linear).__name__}.")
+        raise TypeError(f"observe must return a LinearObservation; got {_kind(linear)}.")
     if jnp.ndim(linear.h) != 1:
         raise ValueError(f"h of observe must have the shape (m,); got {jnp.shape(linear.h)}.")
     size = jnp.shape(linear.h)[0]
@@ -281,15 +289,15 @@ def check_partitions(partitions: Any, num_coordinates: int) -> None:
 def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
     """Require a point like the state of one particle, and an information matrix of its tangent space."""
     if not (hasattr(guidance, "point") and hasattr(guidance, "information")):
-        raise TypeError(f"guide must return a Guidance; got {type(guidance).__name__}.")
+        raise TypeError(f"guide must return a Guidance; got {_kind(guidance)}.")
     like("point of guide", guidance.point, x, "the nonlinear state of a particle")
-    check_covariance("information of guide", guidance.information, size)
+    check_covariance("information of guide", guidance.information, size, "an information matrix")
 
 
 def check_history(history: Any) -> None:
     """Require the ensembles of a run: leaves with time as first and the particles as last axis, integer ancestors."""
     if not all(hasattr(history, name) for name in ("particles", "log_weights", "ancestors")):
-        raise TypeError(f"history must be a History, as keep_history collects it; got {type(history).__name__}.")
+        raise TypeError(f"history must be a History, as keep_history collects it; got {_kind(history)}.")
     if jnp.ndim(history.log_weights) != 2:
         raise ValueError(f"log_weights of history must have the shape (t, n); got {jnp.shape(history.log_weights)}.")
     length, count = jnp.shape(history.log_weights)
@@ -301,3 +309,21 @@ def check_history(history: Any) -> None:
         if len(shape) < 2 or (shape[0], shape[-1]) != (length, count):
             name = f"particles{jax.tree_util.keystr(path)} of history"
             raise ValueError(f"{name} must have the shape ({length}, ..., {count}); got {shape}.")
+
+
+def names_matrices_that_cannot_be_shared(step: Callable) -> Callable:
+    """Wrap a prediction or an update `(model, ...)`: say what is wrong where a shared matrix depends on the particle."""
+
+    @wraps(step)
+    def wrapped(model: Any, *args: Any) -> Any:
+        try:
+            return step(model, *args)
+        except ValueError as error:
+            if model.covariance_axis is not None or "out_axes" not in str(error):
+                raise
+            raise ValueError(
+                "dynamics and observe of rao_blackwell_shared must return matrices that do not depend on the particle "
+                f"(rao_blackwell takes those that do); got other ones: {error}"
+            ) from error
+
+    return wrapped

@@ -285,6 +285,7 @@ def _predict(model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control
     return predict_ensemble(model, key, state, control)[0]
 
 
+@checks.names_matrices_that_cannot_be_shared
 def predict_ensemble(
     model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree
 ) -> tuple[RaoBlackwellState, Increments]:
@@ -309,7 +310,7 @@ def predict_ensemble(
         delta, log_correction = model.proposal(noise, spread, step.Q_n)
         drift = step.A_n @ mean
         mean = step.f_l + step.A_l @ mean + gain @ delta
-        x = checks.like("the result of retract", model.retract(step.f_n, drift + delta), step.f_n, "its argument x")
+        x = checks.like("the result of retract", model.retract(step.f_n, drift + delta), step.f_n, "x")
         return x, mean, covariance, log_correction, Increments(step.f_n, drift, delta, spread, gain)
 
     increments_axes = Increments._make((-1, -1, -1, axis, axis))
@@ -328,6 +329,7 @@ def _update(
     return update_ensemble(model, state, observation)
 
 
+@checks.names_matrices_that_cannot_be_shared
 def update_ensemble(
     model: RaoBlackwell, state: RaoBlackwellState, observation: PyTree, log_ratio: Float[Array, " n"] | None = None
 ) -> tuple[RaoBlackwellState, ParticleInfo]:

@@ -135,7 +135,7 @@ def spread_sequences(sequences: PyTree, mesh: Mesh, *, axis: str) -> PyTree:
 def _share(filter: Filter, mesh: Mesh, axis: str) -> int:
     """Number of particles of each device."""
     if not isinstance(filter, Filter):
-        raise TypeError(f"filter must be a Filter; got {type(filter).__name__}.")
+        raise TypeError(f"filter must be a Filter; got {filter!r}.")
     names = {one.name for one in fields(filter.params)} if is_dataclass(filter.params) else set()
     if not {"num_particles", "scheme", "temper"} <= names:
         raise ValueError(
@@ -150,7 +150,7 @@ def _share(filter: Filter, mesh: Mesh, axis: str) -> int:
 
 def _length(mesh: Mesh, axis: str) -> int:
     if not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh must be a jax.sharding.Mesh; got {type(mesh).__name__}.")
+        raise TypeError(f"mesh must be a jax.sharding.Mesh; got {mesh!r}.")
     if axis not in mesh.shape:
         raise ValueError(f"axis must be one of those of the mesh, {', '.join(mesh.axis_names)}; got {axis!r}.")
     return mesh.shape[axis]

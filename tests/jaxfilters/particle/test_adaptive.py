@@ -245,7 +245,10 @@ def test_double_precision_stays_double(x64):
         ({"mode_scale": jnp.ones(4)}, r"each of 2 \+ 1 coordinates; got 4"),
         ({"low": -1.0}, "low and high"),
         ({"low": 2.0, "high": 1.0}, "low and high"),
-        ({"partitions": Partitions(consecutive(2, 2))}, "groups of 3 coordinates; got 4"),
+        (
+            {"partitions": Partitions(consecutive(2, 2))},
+            r"groups of partitions must have the shape \(g, 3\); got \(2, 4\)",
+        ),
     ],
 )
 def test_parameters_that_cannot_be_are_rejected(options, named):

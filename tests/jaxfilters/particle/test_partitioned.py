@@ -106,7 +106,7 @@ def test_each_particle_moves_move_one_group_and_siblings_take_turns():
 
 @pytest.mark.parametrize("sizes", [(), (3, 0)])
 def test_groups_that_cannot_be_are_rejected(sizes):
-    with pytest.raises(ValueError, match="consecutive needs sizes of at least 1"):
+    with pytest.raises(ValueError, match="sizes of consecutive must be"):
         consecutive(*sizes)
 
 
