@@ -4,6 +4,14 @@ The ensemble axis is the last one of every leaf. Everywhere in this module a log
 `+inf` as the largest finite number, and an ensemble in which no particle has any weight counts as evenly weighted.
 Particles without weight contribute nothing, whatever their values are, NaN included. Every function raises a
 `ValueError` where `log_weights` is not a vector, and a `TypeError` where it does not hold floating-point numbers.
+
+Example:
+    >>> import jax.numpy as jnp, jaxfilters as jf
+    >>> log_weights = jnp.log(jnp.array([1.0, 3.0]))
+    >>> round(float(jf.weights.mean(jnp.array([0.0, 10.0]), log_weights)), 3)
+    7.5
+    >>> round(float(jf.weights.effective_sample_size(log_weights)), 3)
+    1.6
 """
 
 import math

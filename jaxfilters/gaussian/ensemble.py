@@ -85,23 +85,20 @@ def ensemble_kalman(
         noise: Source of `randomness`: by default a random key for each sample; `StandardNormal(d)` passes d standard
             normal numbers instead.
         inflation: Factor by which the deviations from the ensemble mean are multiplied before every update, at least 1
-            (multiplicative covariance inflation: J. L. Anderson and S. L. Anderson, "A Monte Carlo implementation of
-            the nonlinear filtering problem to produce ensemble assimilations and forecasts", Monthly Weather Review
-            127, 1999). It compensates the underestimated spread of small ensembles. May be an array or a traced value.
+            (J. L. Anderson and S. L. Anderson, Monthly Weather Review 127, 1999). It compensates for the
+            underestimated spread of small ensembles. May be an array or a traced value.
 
     Returns:
         A filter whose state is an `EnsembleState` and whose info is an `EnsembleInfo`.
 
     Raises:
-        TypeError: If a callback is not callable.
         ValueError: If `num_particles < 2`, `inflation < 1`, or `R` is not a covariance; and when the filter is traced,
-            if a callback returns an array of the wrong shape or type, or an observation does not have the shape `(m,)`.
+            if a callback returns an array of the wrong shape or type, or an observation is not of shape `(m,)`.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(3), jnp.eye(3)))
-        >>> transition = lambda noise, x, control: 0.9 * x + 0.1 * noise
-        >>> observe = lambda x: x[:2]
+        >>> transition, observe = lambda noise, x, control: 0.9 * x + 0.1 * noise, lambda x: x[:2]
         >>> filter = jf.ensemble_kalman(
         ...     prior, transition, observe, 0.2 * jnp.eye(2), num_particles=100, noise=jf.StandardNormal(3)
         ... )

@@ -5,6 +5,14 @@ Y. Sato et al. 2006, equations 15 and 18-24; in English: K. Oka, Y. Sato, Y. Nak
 estimation system based on particle filtering with adaptive diffusion control", IAPR Conference on Machine Vision
 Applications, 2005; Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion",
 2007, section 3.3).
+
+Example:
+    >>> import jax, jax.numpy as jnp, jaxfilters as jf
+    >>> fit = jf.math.diffusion.start(jnp.ones(2))
+    >>> log_likelihood = lambda particles, y: -jnp.sum((particles - y[:, None]) ** 2, axis=0)
+    >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2), jnp.eye(2)))
+    >>> pf = jf.adaptive_diffusion(prior, log_likelihood, fit, num_particles=100, mode_scale=jnp.ones(2))
+    >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 2)))
 """
 
 import math
@@ -15,6 +23,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
@@ -122,25 +131,25 @@ def adaptive_diffusion(
     """
     checks.check_callables(sample_prior=sample_prior, log_likelihood=log_likelihood, update_fit=update_fit)
     checks.check_ensemble(num_particles, 1.0, scheme, None)
-    steady_std = jnp.zeros(0) if steady_std is None else jnp.asarray(steady_std, dtype=float)
-    mode_scale = jnp.asarray(mode_scale, dtype=float)
-    low, high = (jnp.broadcast_to(jnp.asarray(limit, dtype=float), fit.scale.shape) for limit in (low, high))
-    params = AdaptiveDiffusion(
-        as_pytree(sample_prior),
-        as_pytree(log_likelihood),
-        fit,
-        as_pytree(update_fit),
-        low,
-        high,
-        steady_std,
-        mode_scale,
-        float(mode_distance),
-        partitions,
-        num_particles,
-        scheme,
-    )
+    sizes = _Sizes(low, high, () if steady_std is None else steady_std, mode_scale).as_arrays(fit.scale.shape)
+    callbacks = (as_pytree(sample_prior), as_pytree(log_likelihood), fit, as_pytree(update_fit))
+    params = AdaptiveDiffusion(*callbacks, *sizes, float(mode_distance), partitions, num_particles, scheme)
     _check(params)
     return Filter(params, _init, _predict, _update)
+
+
+class _Sizes(NamedTuple):
+    """Standard deviations and scales of the coordinates, in the order of the fields of `AdaptiveDiffusion`."""
+
+    low: ArrayLike
+    high: ArrayLike
+    steady_std: ArrayLike
+    mode_scale: ArrayLike
+
+    def as_arrays(self, shape: tuple[int, ...]) -> "_Sizes":
+        """Floating-point arrays, the limits one for each coordinate that keeps its velocity."""
+        low, high, steady_std, mode_scale = (jnp.asarray(size, dtype=float) for size in self)
+        return _Sizes(jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), steady_std, mode_scale)
 
 
 def _init(model: AdaptiveDiffusion, key: AnyKey) -> AdaptiveDiffusionState:

@@ -312,7 +312,7 @@ def check_history(history: Any) -> None:
 
 
 def names_matrices_that_cannot_be_shared(step: Callable) -> Callable:
-    """Wrap a prediction or an update `(model, ...)`: say what is wrong where a shared matrix depends on the particle."""
+    """Wrap a prediction or an update, so that its error explains which matrices must not depend on the particle."""
 
     @wraps(step)
     def wrapped(model: Any, *args: Any) -> Any:

@@ -68,6 +68,13 @@ def placement(filter: Filter, mesh: Mesh, *, axis: str = AXIS) -> PyTree[NamedSh
         TypeError: If `filter` is not a `Filter` or `mesh` is not a `jax.sharding.Mesh`.
         ValueError: If the filter is of another kind, the mesh has no such axis, or the length of that axis does not
             divide the number of particles.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, move = lambda key: jnp.zeros(1), lambda key, x, control: x + jax.random.normal(key, (1,))
+        >>> pf = jf.bootstrap(prior, move, lambda x, y: -jnp.sum((x - y) ** 2), num_particles=100)
+        >>> mesh = jax.sharding.Mesh(jax.devices(), ("particles",))
+        >>> state = jax.device_put(jf.init(pf, jax.random.key(0)), jf.sharding.placement(pf, mesh))
     """
     _share(filter, mesh, axis)
     structure, specs = _specs(filter, axis)

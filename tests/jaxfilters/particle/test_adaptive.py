@@ -247,7 +247,7 @@ def test_double_precision_stays_double(x64):
         ({"low": 2.0, "high": 1.0}, "low and high"),
         (
             {"partitions": Partitions(consecutive(2, 2))},
-            r"groups of partitions must have the shape \(g, 3\); got \(2, 4\)",
+            r"shape \(g, 3\); got \(2, 4\)",
         ),
     ],
 )
