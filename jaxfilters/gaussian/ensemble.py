@@ -138,7 +138,7 @@ def _predict(model: EnsembleKalman, key: AnyKey, state: EnsembleState, control: 
 def _update(
     model: EnsembleKalman, key: AnyKey, state: EnsembleState, observation: Array
 ) -> tuple[EnsembleState, EnsembleInfo]:
-    checks.check_shape("observation", observation, model.R.shape[:1], "the rows of R")
+    checks.check_shape("observation", observation, model.R.shape[:1], "one number for each row of R")
     count = model.num_particles
     mean = jnp.mean(state.particles, axis=1, keepdims=True)
     x = mean + model.inflation.astype(mean.dtype) * (state.particles - mean)
@@ -167,7 +167,7 @@ def _update(
 def _observe(model: EnsembleKalman) -> Callable:
     def observe(x: Array) -> Array:
         predicted = model.observe(x)
-        checks.check_shape("the result of observe", predicted, model.R.shape[:1], "the rows of R")
+        checks.check_shape("the result of observe", predicted, model.R.shape[:1], "one number for each row of R")
         return predicted
 
     return observe

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int32, PyTree
 
@@ -95,7 +94,7 @@ def adaptive_diffusion(
     high: float | Float[Array, " m"] = math.inf,
     update_fit: Callable[[DiffusionFit, Array, Array], DiffusionFit] = diffusion.update,
     partitions: Partitions | None = None,
-    mode_distance: float = 2.0,
+    mode_distance: ArrayLike = 2.0,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
 ) -> Filter:
     r"""Build a particle filter of a vector that keeps its velocity, with noise that adapts to that velocity.
@@ -131,9 +130,11 @@ def adaptive_diffusion(
     """
     checks.check_callables(sample_prior=sample_prior, log_likelihood=log_likelihood, update_fit=update_fit)
     checks.check_ensemble(num_particles, 1.0, scheme, None)
+    if not isinstance(fit, DiffusionFit):
+        raise TypeError(f"fit must be a DiffusionFit of jaxfilters.math.diffusion.start; got {fit!r}.")
     sizes = _Sizes(low, high, () if steady_std is None else steady_std, mode_scale).as_arrays(fit.scale.shape)
     callbacks = (as_pytree(sample_prior), as_pytree(log_likelihood), fit, as_pytree(update_fit))
-    params = AdaptiveDiffusion(*callbacks, *sizes, float(mode_distance), partitions, num_particles, scheme)
+    params = AdaptiveDiffusion(*callbacks, *sizes, mode_distance, partitions, num_particles, scheme)
     _check(params)
     return Filter(params, _init, _predict, _update)
 
@@ -149,6 +150,9 @@ class _Sizes(NamedTuple):
     def as_arrays(self, shape: tuple[int, ...]) -> "_Sizes":
         """Floating-point arrays, the limits one for each coordinate that keeps its velocity."""
         low, high, steady_std, mode_scale = (jnp.asarray(size, dtype=float) for size in self)
+        for name, limit in (("low", low), ("high", high)):
+            if limit.shape not in ((), shape):
+                raise ValueError(f"{name} must be one number or have the shape {shape}; got {limit.shape}.")
         return _Sizes(jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), steady_std, mode_scale)
 
 
@@ -176,6 +180,7 @@ def _predict(
 ) -> AdaptiveDiffusionState:
     resample_key, noise_key = jax.random.split(key)
     tau = jnp.asarray(1.0 if control is None else control, state.elapsed.dtype)
+    checks.check_shape("control", tau, (), "it is the time since the last prediction")
     tau = jnp.where(tau > 0, tau, 0.0)
     particles, log_weights, ancestors = resample(resample_key, state.particles, state.log_weights, model.scheme, 1.0)
     changing = tau * diffusion.spread(state.fit, state.velocity, low=model.low, high=model.high)
@@ -225,9 +230,9 @@ def _with_estimate(model: AdaptiveDiffusion, state: AdaptiveDiffusionState, expl
     estimate = weights.mean_around_mode(
         state.particles, state.log_weights, model.mode_scale, distance=model.mode_distance
     )
-    coasting = state.velocity.shape[0]
+    m = state.velocity.shape[0]
     passed = state.elapsed > 0
-    velocity = (estimate - state.estimate)[:coasting] / jnp.where(passed, state.elapsed, 1.0)
+    velocity = (estimate - state.estimate)[:m] / jnp.where(passed, state.elapsed, 1.0)
     # The mean of the prior is not an estimate of the target, so that the first estimate has no velocity and the second
     # one no change of velocity.
     moves = explained & passed & (state.num_estimates >= 1)
@@ -243,13 +248,15 @@ def _with_estimate(model: AdaptiveDiffusion, state: AdaptiveDiffusionState, expl
 
 
 def _check(model: AdaptiveDiffusion) -> None:
-    low, high = np.asarray(model.low), np.asarray(model.high)
-    coasting, steady, size = low.shape[0], model.steady_std.shape[0], model.mode_scale.shape[0]
-    diffusion.check_positive("mode_scale", model.mode_scale)
-    diffusion.check_positive("mode_distance", model.mode_distance)
-    if not np.all((low >= 0) & (high >= low)):
-        raise ValueError(f"low and high must be 0 <= low <= high; got {low} and {high}.")
-    if size != coasting + steady:
-        raise ValueError(f"mode_scale must have one number for each of {coasting} + {steady} coordinates; got {size}.")
+    m, steady, size = model.low.shape[0], jnp.shape(model.steady_std), jnp.shape(model.mode_scale)
+    if len(steady) != 1 or size != (m + steady[0],):
+        given = f"a fit of {m} coordinates, steady_std {steady} and mode_scale {size}"
+        raise ValueError(f"mode_scale must have one number for each of {m} + {sum(steady)} coordinates; got {given}.")
+    checks.check_values("mode_scale", model.mode_scale, "positive", lambda value: value > 0)
+    checks.check_values("steady_std", model.steady_std, "at least 0", lambda value: value >= 0)
+    checks.check_scalar("mode_distance", model.mode_distance, "positive", lambda value: value > 0)
+    checks.check_values(
+        "low and high", (model.low, model.high), "0 <= low <= high", lambda v: (v[0] >= 0) & (v[1] >= v[0])
+    )
     if model.partitions is not None:
-        checks.check_partitions(model.partitions, size)
+        checks.check_partitions(model.partitions, size[0])

@@ -58,6 +58,13 @@ def check_scalar(name: str, value: Any, condition: str, holds: Callable[[np.ndar
         raise ValueError(f"{name} must be {condition}; got {number}.")
 
 
+def check_values(name: str, values: Any, condition: str, holds: Callable[[np.ndarray], Any]) -> None:
+    """Require that a condition, described in words, holds for all numbers of an array where it is concrete."""
+    numbers = concrete(values)
+    if numbers is not None and not np.all(holds(numbers)):
+        raise ValueError(f"{name} must be {condition}; got {numbers.tolist()}.")
+
+
 def _is_integer(value: Any) -> bool:
     return jnp.issubdtype(jnp.result_type(value), jnp.integer)
 
@@ -83,7 +90,7 @@ def check_ensemble(num_particles: Any, ess_threshold: Any, scheme: Any, temper: 
 def check_shape(name: str, value: Any, expected: tuple[int, ...], reason: str = "") -> None:
     """Require an array of exactly this shape."""
     if jnp.shape(value) != expected:
-        explained = f", as {reason}" if reason else ""
+        explained = f" ({reason})" if reason else ""
         raise ValueError(f"{name} must have the shape {expected}{explained}; got {jnp.shape(value)}.")
 
 
@@ -258,9 +265,9 @@ def check_linear_observation(linear: Any, y: Any, linear_size: int) -> None:
     if jnp.ndim(linear.h) != 1:
         raise ValueError(f"h of observe must have the shape (m,); got {jnp.shape(linear.h)}.")
     size = jnp.shape(linear.h)[0]
-    check_shape("C of observe", linear.C, (size, linear_size), "h and linear_prior have these sizes")
+    check_shape("C of observe", linear.C, (size, linear_size), "the sizes of h and of linear_prior")
     check_covariance("R of observe", linear.R, size)
-    check_shape("observation", y, (size,), "h of observe has")
+    check_shape("observation", y, (size,), "the size of h of observe")
 
 
 def check_sizes(name: str, sizes: Any) -> None:
@@ -301,7 +308,7 @@ def check_history(history: Any) -> None:
     if jnp.ndim(history.log_weights) != 2:
         raise ValueError(f"log_weights of history must have the shape (t, n); got {jnp.shape(history.log_weights)}.")
     length, count = jnp.shape(history.log_weights)
-    check_shape("ancestors of history", history.ancestors, (length, count), "its log_weights")
+    check_shape("ancestors of history", history.ancestors, (length, count), "that of its log_weights")
     if not _is_integer(history.ancestors):
         raise TypeError(f"ancestors of history must be integers; got {jnp.result_type(history.ancestors)}.")
     for path, leaf in jax.tree_util.tree_leaves_with_path(history.particles):

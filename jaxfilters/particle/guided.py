@@ -137,7 +137,7 @@ def _update(model: Guided, key: AnyKey, state: GuidedState, observation: PyTree)
 
     def to_point(origin: PyTree, point: PyTree) -> Array:
         delta = model.local(origin, point)
-        checks.check_shape("the result of local", delta, (size,), "noise_dim of the inner filter")
+        checks.check_shape("the result of local", delta, (size,), "noise_dim of inner")
         return delta
 
     towards = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)(predicted.origin, guidance.point) - predicted.drift

@@ -108,7 +108,7 @@ def reweight(
     invalid = jnp.isnan(log_factor) | jnp.isposinf(log_factor)
     usable = jnp.where(invalid, -jnp.inf, log_factor)
     tempered = temper(usable, log_weights)
-    checks.check_shape("the result of temper", tempered, log_weights.shape, "its arguments")
+    checks.check_shape("the result of temper", tempered, log_weights.shape, "that of its arguments")
     normalized, log_evidence = weights.normalize(log_weights + tempered)
     info = ParticleInfo(
         log_evidence=log_evidence,

@@ -246,6 +246,12 @@ PARTICLE = [
     Case("adaptive scalar", lambda: run_adaptive(lambda key: jnp.zeros(())), ("sample_prior", "()")),
     Case("adaptive integer", lambda: run_adaptive(lambda key: jnp.zeros(2, int)), ("sample_prior", "int32")),
     Case("adaptive scale", lambda: run_adaptive(mode_scale=jnp.ones(3)), ("mode_scale", "3")),
+    Case(
+        "adaptive steady", lambda: run_adaptive(steady_std=-jnp.ones(1), mode_scale=jnp.ones(3)), ("steady_std", "-1")
+    ),
+    Case("adaptive low", lambda: run_adaptive(low=jnp.ones(3)), ("low", "(3,)", "(2,)")),
+    Case("adaptive high", lambda: run_adaptive(low=2.0, high=1.0), ("low", "high", "2.0", "1.0")),
+    Case("adaptive distance", lambda: run_adaptive(mode_distance=0.0), ("mode_distance", "0.0")),
     Case("groups (1, 3)", partitions(jnp.ones((1, 3), bool)), ("groups", "(1, 3)", "2")),
     Case("groups (2,)", partitions(jnp.ones(2, bool)), ("groups", "(2,)")),
     Case("groups of numbers", partitions(jnp.ones((1, 2))), ("groups", "float32")),
