@@ -33,40 +33,14 @@ from jaxfilters.math.linalg import cholesky, matmul, solve_triangular
 from jaxfilters.noise import StandardNormal
 from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transport
+from jaxfilters.particle.mixed_model import LinearObservation as LinearObservation
+from jaxfilters.particle.mixed_model import MixedDynamics as MixedDynamics
 from jaxfilters.particle.proposals import Proposal, exact
 from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import no_tempering
 from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree
-
-
-class MixedDynamics(NamedTuple):
-    """One step of the model for one particle, linearised about its nonlinear state x.
-
-    With n the dimension of the tangent space of x (`noise_dim`) and l the size of the linear state.
-    """
-
-    f_n: PyTree
-    """The next nonlinear state for a zero increment, a point like x."""
-    A_n: Float[Array, "n l"]
-    """How the linear state drives the increment of x."""
-    Q_n: Float[Array, "n n"]
-    """Covariance of the noise of the increment of x."""
-    f_l: Float[Array, " l"]
-    """The part of the next linear state that does not depend on the linear state."""
-    A_l: Float[Array, "l l"]
-    """Transition matrix of the linear state."""
-    Q_l: Float[Array, "l l"]
-    """Covariance of the process noise of the linear state, independent of the other noise."""
-
-
-class LinearObservation(NamedTuple):
-    """The observation model y = h + C l + e with e ~ N(0, R), for one particle."""
-
-    h: Float[Array, " m"]
-    C: Float[Array, "m l"]
-    R: Float[Array, "m m"]
 
 
 class RaoBlackwellState(NamedTuple):
@@ -181,12 +155,40 @@ def rao_blackwell_shared(
 ) -> Filter:
     """Build a Rao-Blackwellized particle filter whose particles share one covariance of the linear state.
 
-    For models whose matrices `A_n`, `Q_n`, `A_l`, `Q_l`, `C` and `R` do not depend on the nonlinear state: every
-    particle would carry the same covariance, so that one small matrix recursion a step replaces n of them. The
-    arguments, the result, the errors and the example are those of `rao_blackwell`.
+    For models whose matrices `A_n`, `Q_n`, `A_l`, `Q_l`, `C` and `R` do not depend on the nonlinear state. Every
+    particle would carry the same covariance, so that one small matrix recursion a step replaces n of them.
+
+    Args:
+        sample_prior: `key -> x`, the nonlinear state.
+        linear_prior: Belief about the linear state `(l,)` before the first observation, the same for all particles.
+        dynamics: `(x, control) -> MixedDynamics`, whose matrices must not depend on x.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar, for observations that do not depend on the linear state.
+        num_particles: Number n of particles.
+        noise_dim: Dimension of the tangent space of the nonlinear state.
+        observe: `x -> LinearObservation`, for observations that do, whose `C` and `R` must not depend on x.
+        retract: `(x, delta) -> x`, moves the nonlinear state by an increment; addition by default.
+        proposal: As for `rao_blackwell`.
+        scheme: As for `rao_blackwell`.
+        ess_threshold: As for `rao_blackwell`.
+        temper: As for `rao_blackwell`.
+
+    Returns:
+        A filter whose state is a `RaoBlackwellState` and whose info is a `ParticleInfo`.
 
     Raises:
-        ValueError: Also when the filter is traced, if one of these matrices depends on the nonlinear state.
+        TypeError: As `rao_blackwell`.
+        ValueError: As `rao_blackwell`; and when the filter is traced, if one of the matrices depends on x.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one, velocity = jnp.ones((1, 1)), jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> dynamics = lambda x, dt: jf.MixedDynamics(x, dt * one, 0.01 * one, jnp.zeros(1), one, 0.1 * one)
+        >>> pf = jf.rao_blackwell_shared(
+        ...     lambda key: jnp.zeros(1), velocity, dynamics, lambda x, y: -jnp.sum((y - x) ** 2),
+        ...     num_particles=100, noise_dim=1,
+        ... )
+        >>> jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), jnp.full(5, 0.1))[0].covariance.shape
+        (1, 1)
     """
     callbacks = (sample_prior, linear_prior, dynamics, retract, _condition_on(log_likelihood, observe), temper)
     own = _build(callbacks, ess_threshold, num_particles, noise_dim, proposal, scheme)
