@@ -43,15 +43,17 @@ from .particle import proposals as proposals
 from .particle import resampling as resampling
 from .particle import sharding as sharding
 from .particle.adaptive import adaptive_diffusion as adaptive_diffusion
-from .particle.bootstrap import AdaptiveTempering as AdaptiveTempering
+from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
 from .particle.guided import Guidance as Guidance
 from .particle.guided import guided as guided
+from .particle.mixed_model import LinearObservation as LinearObservation
+from .particle.mixed_model import MixedDynamics as MixedDynamics
 from .particle.partitioned import Partitions as Partitions
-from .particle.rao_blackwell import LinearObservation as LinearObservation
-from .particle.rao_blackwell import MixedDynamics as MixedDynamics
 from .particle.rao_blackwell import rao_blackwell as rao_blackwell
 from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
+from .particle.tempering import AdaptiveTempering as AdaptiveTempering
+from .particle.weighting import ParticleInfo as ParticleInfo
 
 __version__: str
 __all__: list[str]

@@ -1,8 +1,17 @@
-"""Log weights of an ensemble: normalising, effective sample size, moments, tempering.
+"""Log weights of an ensemble: normalisation, effective sample size, moments, quantiles, tempering.
 
 The ensemble axis is the last one of every leaf. Everywhere in this module a log weight of NaN counts as `-inf`,
-`+inf` as the largest finite number, and an ensemble in which nothing has any weight counts as evenly weighted.
-Particles without weight contribute nothing, whatever their values: not even NaN.
+`+inf` as the largest finite number, and an ensemble in which no particle has any weight counts as evenly weighted.
+Particles without weight contribute nothing, whatever their values are, NaN included. Every function raises a
+`ValueError` where `log_weights` is not a vector, and a `TypeError` where it does not hold floating-point numbers.
+
+Example:
+    >>> import jax.numpy as jnp, jaxfilters as jf
+    >>> log_weights = jnp.log(jnp.array([1.0, 3.0]))
+    >>> round(float(jf.weights.mean(jnp.array([0.0, 10.0]), log_weights)), 3)
+    7.5
+    >>> round(float(jf.weights.effective_sample_size(log_weights)), 3)
+    1.6
 """
 
 import math
@@ -17,14 +26,14 @@ _TEMPER_LOWEST_LOG2 = -40.0
 
 
 def uniform(num: int, dtype: DTypeLike = float) -> Float[Array, " n"]:
-    """Equal log weights of `num` particles."""
+    """Return equal log weights `(num,)` that sum to one."""
     return jnp.full(num, -math.log(num), dtype=dtype)
 
 
 def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Log weights that sum to one, and the log of what they summed to.
+    """Return log weights that sum to one, and the logarithm of the sum of the given ones.
 
-    Where all are `-inf` the weights come out even and the log sum is `-inf`.
+    Where all are `-inf` the weights become equal and the log sum is `-inf`.
     """
     shifted, peak = _below_peak(log_weights)
     log_sum = jnp.log(jnp.sum(jnp.exp(shifted)))
@@ -32,31 +41,39 @@ def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Floa
 
 
 def relative(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Weights of which the largest is one."""
+    """Return weights `(n,)` scaled so that the largest is one."""
     return jnp.exp(_below_peak(log_weights)[0])
 
 
 def linear(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Weights that sum to one."""
+    """Return weights `(n,)` that sum to one."""
     weights = relative(log_weights)
     return weights / jnp.sum(weights)
 
 
 def _below_peak(log_weights):
+    _check(log_weights)
     finite_above = jnp.minimum(log_weights, jnp.finfo(log_weights.dtype).max)
     log_weights = jnp.where(jnp.isnan(log_weights), -jnp.inf, finite_above)
     peak = jax.lax.stop_gradient(jnp.max(log_weights))
-    dead = peak == -jnp.inf
-    return jnp.where(dead, 0.0, log_weights - jnp.where(dead, 0.0, peak)), peak
+    no_weight = peak == -jnp.inf
+    return jnp.where(no_weight, 0.0, log_weights - jnp.where(no_weight, 0.0, peak)), peak
+
+
+def _check(log_weights):
+    if jnp.ndim(log_weights) != 1:
+        raise ValueError(f"log_weights must have the shape (n,); got {jnp.shape(log_weights)}.")
+    if not jnp.issubdtype(log_weights.dtype, jnp.floating):
+        raise TypeError(f"log_weights must hold floating-point numbers; got {log_weights.dtype}.")
 
 
 def effective_sample_size(log_weights: Float[Array, " n"]) -> Float[Array, ""]:
-    """`1 / sum(w**2)` of the normalised weights: from 1, one particle has it all, to n, all are equal."""
+    """Return `1 / sum(w**2)` of the normalised weights: 1 if one particle has all weight, n if all are equal."""
     return 1 / jnp.sum(jnp.square(linear(log_weights)))
 
 
 def mean(particles: PyTree[Shaped[Array, "..."]], log_weights: Float[Array, " n"]) -> PyTree[Float[Array, "..."]]:
-    """Weighted mean of every leaf `(..., n)` over its last axis; of a boolean leaf, the probability of truth."""
+    """Return the weighted mean of every leaf `(..., n)` over its last axis; of a boolean leaf, the probability."""
     w = linear(log_weights)
     return jax.tree.map(lambda leaf: jnp.sum(jnp.where(w > 0, leaf, 0) * w, axis=-1), particles)
 
@@ -68,11 +85,14 @@ def mean_around_mode(
     *,
     distance: float | Num[Array, ""] = 2.0,
 ) -> Float[Array, " d"]:
-    """Weighted mean of the particles near the heaviest one: where the highest peak of several is.
+    """Return the weighted mean `(d,)` of the particles near the one with the largest weight.
 
-    Near means a Euclidean distance below `distance` once every coordinate is divided by its `scale`, positive and in
-    the coordinate's own unit (K. Oka, Y. Sato et al. 2006, equations 18-19). Of equally heavy particles the first
-    counts as the heaviest; which particles are near is a constant to differentiation.
+    For a posterior with several modes this is the position of the highest one. A particle is near if its Euclidean
+    distance is below `distance` once every coordinate is divided by its `scale`, which is positive and in the unit of
+    the coordinate (K. Oka, Y. Sato et al. 2006, equations 18-19; in English: K. Oka, Y. Sato, Y. Nakanishi and
+    H. Koike, "Head pose estimation system based on particle filtering with adaptive diffusion control", IAPR Conference
+    on Machine Vision Applications, 2005). Of equal weights the first is taken; which particles are near is a constant
+    to differentiation.
     """
     heaviest = jnp.argmax(linear(log_weights))
     apart = jax.lax.stop_gradient((x - x[:, heaviest, None]) / scale[:, None])
@@ -82,7 +102,7 @@ def mean_around_mode(
 
 
 def covariance(x: Float[Array, "d n"], log_weights: Float[Array, " n"]) -> Float[Array, "d d"]:
-    """Weighted covariance `sum_i w_i (x_i - mean)(x_i - mean)^T`, without a small-sample correction."""
+    """Return the weighted covariance `sum_i w_i (x_i - mean)(x_i - mean)^T`, without a small-sample correction."""
     w = linear(log_weights)
     centred = jnp.where(w > 0, x - mean(x, log_weights)[:, None], 0.0)
     return jnp.matmul(centred * w, centred.T, precision="highest")
@@ -91,7 +111,7 @@ def covariance(x: Float[Array, "d n"], log_weights: Float[Array, " n"]) -> Float
 def quantile(
     x: Num[Array, "*batch n"], log_weights: Float[Array, " n"], probability: float | Num[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """Smallest value with at least `probability` of the weight at or below it, along the last axis."""
+    """Return the smallest value with at least `probability` of the weight at or below it, along the last axis."""
     w = linear(log_weights)
     values = jnp.where(w > 0, x, jnp.inf)
     order = jnp.argsort(values, axis=-1)
@@ -103,11 +123,12 @@ def quantile(
 def temper_exponent(
     log_likelihood: Float[Array, " n"], log_weights: Float[Array, " n"], target_ess: float | Num[Array, ""]
 ) -> Float[Array, ""]:
-    """Largest exponent in (0, 1] at which `log_weights + exponent * log_likelihood` still has `target_ess` particles.
+    """Return the largest exponent in (0, 1] for which `log_weights + exponent * log_likelihood` reaches `target_ess`.
 
-    1 where the whole likelihood leaves that many. By bisection of the exponent's logarithm, right to 2e-6 of
-    itself; from even weights the effective sample size falls steadily with the exponent. Where not even `log_weights`
-    alone reaches the target, the answer is 2**-40. The exponent is a constant to differentiation.
+    The effective sample size of that sum must be at least `target_ess`; the exponent is 1 where the whole likelihood
+    fulfils this. It is found by bisection of its logarithm, to a relative error of 2e-6; from equal weights the
+    effective sample size decreases monotonically in it. Where `log_weights` alone do not reach the target, the result
+    is 2**-40. The exponent is a constant to differentiation.
     """
     log_likelihood, log_weights = jax.lax.stop_gradient((log_likelihood, log_weights))
 

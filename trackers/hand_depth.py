@@ -46,9 +46,10 @@ from jaxfilters.models.hand.skeleton import (
 from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
-from jaxfilters.particle.bootstrap import AdaptiveTempering, ParticleInfo
 from jaxfilters.particle.guided import Guidance, GuidedState, guided
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
+from jaxfilters.particle.tempering import AdaptiveTempering
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.depth_sequence import DepthSequence, from_array
 from jaxfilters.trackers.detect import nearest_hand
 from jaxfilters.trackers.tracker import HandTrack, SequenceTracker

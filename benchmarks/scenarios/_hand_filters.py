@@ -32,9 +32,10 @@ from jaxfilters.models.hand.skeleton import (
 from jaxfilters.models.hand.surface import CapsuleHand, HandSurface
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, INITIAL_VELOCITY_STD, START
 from jaxfilters.noise import StandardNormal
-from jaxfilters.particle.bootstrap import AdaptiveTempering, bootstrap
+from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.proposals import Proposal, exact
 from jaxfilters.particle.rao_blackwell import condition_on_increment, rao_blackwell_shared
+from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.trackers.hand_depth import pose_moments
 from jaxfilters.typing import AnyKey
 

@@ -25,8 +25,8 @@ from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
 from jaxfilters.math import diffusion
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState, adaptive_diffusion
-from jaxfilters.particle.bootstrap import ParticleInfo
-from jaxfilters.particle.partitioned import Partitions, consecutive, counted_once
+from jaxfilters.particle.partitioned import Partitions, consecutive, corrected
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey
 
 POSE, DEFORMATION = 6, 5
@@ -118,9 +118,9 @@ def pose_filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
     ones, keep = jnp.ones(POSE), diffusion.keep
     build = partial(_filter, num_particles=num_particles)
     return {
-        "fixed_small": build(diffusion.start(SMALL * ones, slope=0.0), learn=keep),
-        "fixed_large": build(diffusion.start(LARGE * ones, slope=0.0), learn=keep),
-        "adaptive": build(diffusion.start(ones), learn=keep),
+        "fixed_small": build(diffusion.start(SMALL * ones, slope=0.0), update_fit=keep),
+        "fixed_large": build(diffusion.start(LARGE * ones, slope=0.0), update_fit=keep),
+        "adaptive": build(diffusion.start(ones), update_fit=keep),
         "learnt": build(diffusion.start(ones)),
     }
 
@@ -132,9 +132,7 @@ def face_filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
     return {
         "one_stage": build(num_particles=num_particles),
         "halfway": build(num_particles=num_particles // 2, partitions=Partitions(groups)),
-        "halfway_once": build(
-            num_particles=num_particles // 2, partitions=Partitions(groups, stage_weights=counted_once)
-        ),
+        "halfway_once": build(num_particles=num_particles // 2, partitions=Partitions(groups, stage_weights=corrected)),
     }
 
 

@@ -25,9 +25,10 @@ from jaxfilters.filter import run as run_filter
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.noise import StandardNormal
-from jaxfilters.particle.bootstrap import ParticleInfo, ParticleState, bootstrap
+from jaxfilters.particle.bootstrap import ParticleState, bootstrap
 from jaxfilters.particle.proposals import Proposal, exact, plug_in, plug_in_corrected
 from jaxfilters.particle.rao_blackwell import MixedDynamics, RaoBlackwellState, rao_blackwell_shared
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey
 
 DT, Q_N, Q_L, R = 1 / 30, 0.3, 40.0, 0.02

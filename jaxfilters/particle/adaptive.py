@@ -1,7 +1,18 @@
-r"""Particle filter with adaptive diffusion: particles spread little while the target rests and far while it moves.
+r"""Particle filter with adaptive diffusion: process noise that is small while a target rests and large while it moves.
 
-The target coasts: it is predicted to go on with the velocity of its last estimate, in noise that grows with that
-velocity (K. Oka, Y. Sato et al. 2006, equations 15 and 18-24; Y. Sugano 2007, section 3.3).
+The target is predicted to keep the velocity of its last estimate, with noise that grows with that velocity (K. Oka,
+Y. Sato et al. 2006, equations 15 and 18-24; in English: K. Oka, Y. Sato, Y. Nakanishi and H. Koike, "Head pose
+estimation system based on particle filtering with adaptive diffusion control", IAPR Conference on Machine Vision
+Applications, 2005; Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion",
+2007, section 3.3).
+
+Example:
+    >>> import jax, jax.numpy as jnp, jaxfilters as jf
+    >>> fit = jf.math.diffusion.start(jnp.ones(2))
+    >>> log_likelihood = lambda particles, y: -jnp.sum((particles - y[:, None]) ** 2, axis=0)
+    >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2), jnp.eye(2)))
+    >>> pf = jf.adaptive_diffusion(prior, log_likelihood, fit, num_particles=100, mode_scale=jnp.ones(2))
+    >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 2)))
 """
 
 import math
@@ -11,7 +22,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
@@ -21,16 +32,18 @@ from jaxfilters.filter import Filter
 from jaxfilters.math import diffusion
 from jaxfilters.math.diffusion import DiffusionFit
 from jaxfilters.math.linalg import safe_sqrt
-from jaxfilters.particle.bootstrap import ParticleInfo, check_ensemble, resample, reweight, untempered
+from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme
-from jaxfilters.particle.partitioned import EnsembleLogLikelihood, Partitions, in_one_group, partitioned_update
+from jaxfilters.particle.partitioned import EnsembleLogLikelihood, Partitions, move_one_group, partitioned_update
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import AnyKey, ResamplingScheme, SamplePrior, as_pytree
 
 
 class AdaptiveDiffusionState(NamedTuple):
-    """Weighted particles, and where their estimate went. The first m of d coordinates coast."""
+    """Weighted particles, their estimate and its velocity. The first m of d coordinates keep their velocity."""
 
     particles: Float[Array, "d n"]
     log_weights: Float[Array, " n"]
@@ -38,17 +51,17 @@ class AdaptiveDiffusionState(NamedTuple):
     ancestors: Int32[Array, " n"]
     """Index of each particle's parent in the state before the last prediction."""
     spread: Float[Array, " d"]
-    """Standard deviations of the noise in the last prediction."""
+    """Standard deviations of the process noise of the last prediction."""
     estimate: Float[Array, " d"]
-    """Mean around the mode at the last update that explained its observation; before the first, of the prior."""
+    """Mean around the mode at the last update that explained its observation; before the first, mean of the prior."""
     velocity: Float[Array, " m"]
-    """Of the estimate, per unit of time, between the last two such updates."""
+    """Velocity of the estimate, per unit of time, between the last two such updates."""
     elapsed: Float[Array, ""]
-    """Time since `estimate`."""
+    """Time since `estimate` was made."""
     num_estimates: Int32[Array, ""]
-    """Updates that explained their observation."""
+    """Number of updates that explained their observation."""
     fit: DiffusionFit
-    """Of the changes of velocity that were seen."""
+    """Regression of the changes of velocity on the velocity."""
 
 
 @pytree_dataclass
@@ -58,7 +71,7 @@ class AdaptiveDiffusion:
     sample_prior: SamplePrior
     log_likelihood: EnsembleLogLikelihood
     fit: DiffusionFit
-    learn: Callable[[DiffusionFit, Array, Array], DiffusionFit]
+    update_fit: Callable[[DiffusionFit, Array, Array], DiffusionFit]
     low: Float[Array, " m"]
     high: Float[Array, " m"]
     steady_std: Float[Array, " d-m"]
@@ -79,60 +92,73 @@ def adaptive_diffusion(
     steady_std: Float[Array, " k"] | None = None,
     low: float | Float[Array, " m"] = 0.0,
     high: float | Float[Array, " m"] = math.inf,
-    learn: Callable[[DiffusionFit, Array, Array], DiffusionFit] = diffusion.update,
+    update_fit: Callable[[DiffusionFit, Array, Array], DiffusionFit] = diffusion.update,
     partitions: Partitions | None = None,
-    mode_distance: float = 2.0,
+    mode_distance: ArrayLike = 2.0,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
 ) -> Filter:
-    r"""Particle filter for a vector that coasts with the velocity of its estimate, in noise that adapts to it.
+    r"""Build a particle filter of a vector that keeps its velocity, with noise that adapts to that velocity.
 
-    $x_t = x'_{t-1} + \tau v_{t-1} + \omega$ with a resampled particle $x'$, $v$ the velocity of the last *estimate*,
-    which is the mean around the mode, and $\omega$ of standard deviation $\tau (A |v| + b)$ in the coordinates that
-    coast; the others, after them in the vector, keep still but for $\sqrt\tau$ times `steady_std`. The control is
-    $\tau$, the time since the last prediction; `None` is 1. An update in which no particle explains the observation
-    leaves estimate, velocity and fit as they were, as a missed frame does.
+    The transition is $x_t = x'_{t-1} + \tau v_{t-1} + \omega$ with a resampled particle $x'$, the velocity $v$ of the
+    last *estimate* (the mean around the mode), and noise $\omega$ of standard deviation $\tau (A |v| + b)$. Only the
+    first m coordinates move like this; the others perform a random walk with $\sqrt\tau$ times `steady_std`. The
+    control is $\tau$, the time since the last prediction; `None` is 1. An update in which no particle explains the
+    observation leaves estimate, velocity and fit unchanged, as a missed frame does.
 
     Args:
-        sample_prior: `key -> x`, a vector of d numbers.
-        log_likelihood: `(particles (d, n), y) -> (n,)`; `over_ensemble` makes it of `(x, y) -> log p(y | x)`.
-        fit: Diffusion at first, from `jaxfilters.diffusion.start`; its size m is the number of coordinates that coast.
-        num_particles: Size n of the ensemble.
-        mode_scale: Of each coordinate, for `jaxfilters.weights.mean_around_mode`.
-        steady_std: Of the d - m coordinates that do not coast; `None` if all do.
-        low: Lower limit of the diffusion, in each coordinate's unit per unit of time.
-        high: The upper limit.
-        learn: `diffusion.update`, `diffusion.keep`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
-        partitions: Weighs every observation in two stages; `None` in one.
-        mode_distance: For `mean_around_mode`.
-        scheme: Resampling scheme; of `jf.differentiable_resampling`, `soft`, and `transport` without `partitions`.
+        sample_prior: `key -> x`, a vector `(d,)`.
+        log_likelihood: `(particles (d, n), y) -> (n,)`; `batch_log_likelihood` makes it from `(x, y) -> log p(y | x)`.
+        fit: Initial diffusion from `jaxfilters.math.diffusion.start`; its size is m.
+        num_particles: Number n of particles.
+        mode_scale: Scale `(d,)` of each coordinate for `jaxfilters.weights.mean_around_mode`.
+        steady_std: Standard deviations `(d - m,)` of the random walks; `None` if m = d.
+        low: Lower limit of the standard deviation, in each coordinate's unit per unit of time; a number or `(m,)`.
+        high: Upper limit of the same.
+        update_fit: `diffusion.update`, `diffusion.keep`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
+        partitions: Evaluates every observation in two stages, see `Partitions`; `None` in one.
+        mode_distance: Argument `distance` of `mean_around_mode`.
+        scheme: Function of `jaxfilters.resampling`; of `jaxfilters.differentiable_resampling` also `soft(...)`, and
+            `transport(...)` without `partitions`.
+
+    Returns:
+        A filter whose state is an `AdaptiveDiffusionState` and whose info is a `ParticleInfo`.
 
     Raises:
-        ValueError: If `num_particles < 1`, a scale, a distance or a limit is out of range, or sizes do not agree.
+        TypeError: If a callback is not callable.
+        ValueError: If `num_particles < 1`, a scale, a distance or a limit is out of range, or sizes do not agree; and
+            when the filter is traced, if a callback returns an array of the wrong shape or type.
     """
-    check_ensemble(num_particles, 1.0)
-    steady_std = jnp.zeros(0) if steady_std is None else jnp.asarray(steady_std, dtype=float)
-    mode_scale = jnp.asarray(mode_scale, dtype=float)
-    low, high = (jnp.broadcast_to(jnp.asarray(limit, dtype=float), fit.scale.shape) for limit in (low, high))
-    params = AdaptiveDiffusion(
-        as_pytree(sample_prior),
-        as_pytree(log_likelihood),
-        fit,
-        as_pytree(learn),
-        low,
-        high,
-        steady_std,
-        mode_scale,
-        float(mode_distance),
-        partitions,
-        num_particles,
-        scheme,
-    )
+    checks.check_callables(sample_prior=sample_prior, log_likelihood=log_likelihood, update_fit=update_fit)
+    checks.check_ensemble(num_particles, 1.0, scheme, None)
+    if not isinstance(fit, DiffusionFit):
+        raise TypeError(f"fit must be a DiffusionFit of jaxfilters.math.diffusion.start; got {fit!r}.")
+    sizes = _Sizes(low, high, () if steady_std is None else steady_std, mode_scale).as_arrays(fit.scale.shape)
+    callbacks = (as_pytree(sample_prior), as_pytree(log_likelihood), fit, as_pytree(update_fit))
+    params = AdaptiveDiffusion(*callbacks, *sizes, mode_distance, partitions, num_particles, scheme)
     _check(params)
     return Filter(params, _init, _predict, _update)
 
 
+class _Sizes(NamedTuple):
+    """Standard deviations and scales of the coordinates, in the order of the fields of `AdaptiveDiffusion`."""
+
+    low: ArrayLike
+    high: ArrayLike
+    steady_std: ArrayLike
+    mode_scale: ArrayLike
+
+    def as_arrays(self, shape: tuple[int, ...]) -> "_Sizes":
+        """Floating-point arrays, the limits one for each coordinate that keeps its velocity."""
+        low, high, steady_std, mode_scale = (jnp.asarray(size, dtype=float) for size in self)
+        for name, limit in (("low", low), ("high", high)):
+            if limit.shape not in ((), shape):
+                raise ValueError(f"{name} must be one number or have the shape {shape}; got {limit.shape}.")
+        return _Sizes(jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), steady_std, mode_scale)
+
+
 def _init(model: AdaptiveDiffusion, key: AnyKey) -> AdaptiveDiffusionState:
     particles = sample_ensemble(key, model.sample_prior, model.num_particles)
+    checks.check_vectors("sample_prior", particles)
     if particles.shape[0] != model.mode_scale.shape[0]:
         raise ValueError(f"sample_prior must draw {model.mode_scale.shape[0]} numbers; got {particles.shape[0]}.")
     log_weights = weights.uniform(model.num_particles, particles.dtype)
@@ -154,6 +180,7 @@ def _predict(
 ) -> AdaptiveDiffusionState:
     resample_key, noise_key = jax.random.split(key)
     tau = jnp.asarray(1.0 if control is None else control, state.elapsed.dtype)
+    checks.check_shape("control", tau, (), "it is the time since the last prediction")
     tau = jnp.where(tau > 0, tau, 0.0)
     particles, log_weights, ancestors = resample(resample_key, state.particles, state.log_weights, model.scheme, 1.0)
     changing = tau * diffusion.spread(state.fit, state.velocity, low=model.low, high=model.high)
@@ -162,7 +189,7 @@ def _predict(
     noise = standard_normal(noise_key, particles.shape, particles.dtype)
     displacement = drift[:, None] + spread[:, None] * noise
     if model.partitions is not None:
-        displacement = in_one_group(displacement, model.partitions.groups)
+        displacement = move_one_group(displacement, model.partitions.groups)
     return state._replace(
         particles=particles + displacement,
         log_weights=log_weights,
@@ -178,10 +205,11 @@ def _update(
     particles, log_weights, ancestors = state.particles, state.log_weights, state.ancestors
 
     def log_likelihood(particles: Array) -> Array:
-        return model.log_likelihood(particles, observation)
+        values = model.log_likelihood(particles, observation)
+        return checks.log_likelihoods_of_ensemble(values, particles.shape[1])
 
     if model.partitions is None:
-        log_weights, info = reweight(log_weights, log_likelihood(particles), ancestors, untempered)
+        log_weights, info = reweight(log_weights, log_likelihood(particles), ancestors, no_tempering)
     else:
         particles, log_weights, ancestors, info = partitioned_update(
             key,
@@ -194,38 +222,41 @@ def _update(
             scheme=model.scheme,
         )
     state = state._replace(particles=particles, log_weights=log_weights, ancestors=ancestors)
-    return _followed(model, state, info.log_evidence > -jnp.inf), info
+    return _with_estimate(model, state, info.log_evidence > -jnp.inf), info
 
 
-def _followed(model: AdaptiveDiffusion, state: AdaptiveDiffusionState, explained: Array) -> AdaptiveDiffusionState:
-    """Estimate, velocity and fit after an update; as they were if it explained nothing."""
+def _with_estimate(model: AdaptiveDiffusion, state: AdaptiveDiffusionState, explained: Array) -> AdaptiveDiffusionState:
+    """Update estimate, velocity and fit, unless no particle explained the observation."""
     estimate = weights.mean_around_mode(
         state.particles, state.log_weights, model.mode_scale, distance=model.mode_distance
     )
-    coasting = state.velocity.shape[0]
+    m = state.velocity.shape[0]
     passed = state.elapsed > 0
-    velocity = (estimate - state.estimate)[:coasting] / jnp.where(passed, state.elapsed, 1.0)
-    # The mean of the prior is no place where the target was: the first estimate has no velocity, the second no change.
+    velocity = (estimate - state.estimate)[:m] / jnp.where(passed, state.elapsed, 1.0)
+    # The mean of the prior is not an estimate of the target, so that the first estimate has no velocity and the second
+    # one no change of velocity.
     moves = explained & passed & (state.num_estimates >= 1)
-    learns = moves & (state.num_estimates >= 2)
-    learnt = model.learn(state.fit, state.velocity, velocity - state.velocity)
+    updates = moves & (state.num_estimates >= 2)
+    fit = model.update_fit(state.fit, state.velocity, velocity - state.velocity)
     return state._replace(
         estimate=jnp.where(explained, estimate, state.estimate),
         velocity=jnp.where(moves, velocity, state.velocity),
         elapsed=jnp.where(explained, 0.0, state.elapsed),
         num_estimates=state.num_estimates + explained.astype(jnp.int32),
-        fit=jax.tree.map(lambda new, old: jnp.where(learns, new, old), learnt, state.fit),
+        fit=jax.tree.map(lambda new, old: jnp.where(updates, new, old), fit, state.fit),
     )
 
 
 def _check(model: AdaptiveDiffusion) -> None:
-    low, high = np.asarray(model.low), np.asarray(model.high)
-    coasting, steady, size = low.shape[0], model.steady_std.shape[0], model.mode_scale.shape[0]
-    diffusion.check_positive("mode_scale", model.mode_scale)
-    diffusion.check_positive("mode_distance", model.mode_distance)
-    if not np.all((low >= 0) & (high >= low)):
-        raise ValueError(f"low and high must be 0 <= low <= high; got {low} and {high}.")
-    if size != coasting + steady:
-        raise ValueError(f"mode_scale must have one number for each of {coasting} + {steady} coordinates; got {size}.")
-    if model.partitions is not None and model.partitions.groups.shape[1] != size:
-        raise ValueError(f"partitions must have groups of {size} coordinates; got {model.partitions.groups.shape[1]}.")
+    m, steady, size = model.low.shape[0], jnp.shape(model.steady_std), jnp.shape(model.mode_scale)
+    if len(steady) != 1 or size != (m + steady[0],):
+        given = f"a fit of {m} coordinates, steady_std {steady} and mode_scale {size}"
+        raise ValueError(f"mode_scale must have one number for each of {m} + {sum(steady)} coordinates; got {given}.")
+    checks.check_values("mode_scale", model.mode_scale, "positive", lambda value: value > 0)
+    checks.check_values("steady_std", model.steady_std, "at least 0", lambda value: value >= 0)
+    checks.check_scalar("mode_distance", model.mode_distance, "positive", lambda value: value > 0)
+    checks.check_values(
+        "low and high", (model.low, model.high), "0 <= low <= high", lambda v: (v[0] >= 0) & (v[1] >= v[0])
+    )
+    if model.partitions is not None:
+        checks.check_partitions(model.partitions, size[0])

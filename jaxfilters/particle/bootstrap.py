@@ -1,7 +1,6 @@
-"""Particle filters: weighted samples that are moved, weighted and resampled.
+"""Bootstrap particle filter: samples that are moved by the transition, weighted by the likelihood and resampled.
 
-The ensemble axis is the last axis of every leaf. Resampling happens at the start of a prediction, so that the state
-after an update still holds the weighted posterior: estimates are taken from it before resampling, as they should be.
+The ensemble axis is the last axis of every leaf.
 """
 
 from dataclasses import field
@@ -9,14 +8,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int32, PyTree
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.noise import random_keys
-from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Resampled
+from jaxfilters.particle import checks
+from jaxfilters.particle.differentiable_resampling import EnsembleScheme
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import (
     AnyKey,
@@ -34,38 +37,26 @@ class ParticleState(NamedTuple):
     """Weighted particles."""
 
     particles: PyTree
-    """Leaves `(..., N)`."""
+    """Leaves `(..., n)`."""
     log_weights: Float[Array, " n"]
     """After an update `logsumexp(log_weights) == 0`."""
     ancestors: Int32[Array, " n"]
     """Index of each particle's parent in the state before the last prediction."""
     noise: PyTree
-    """What will move the particles next. Drawn one step ahead: XLA would otherwise fuse the generator into the
-    transition and evaluate it without vector instructions, three times slower on a CPU."""
-
-
-class ParticleInfo(NamedTuple):
-    """Diagnostics of one update."""
-
-    log_evidence: Float[Array, ""]
-    """log p(y_t | y_1:t-1); `-inf` if no particle explains the observation."""
-    effective_sample_size: Float[Array, ""]
-    """Between 1 and N, after the update."""
-    resampled: Bool[Array, ""]
-    """Whether the prediction before this update began by resampling."""
-    num_invalid: Int32[Array, ""]
-    """Particles whose log-likelihood was NaN or `+inf`; they were given weight zero."""
+    """Randomness of the next prediction, leaves `(..., n)`. It is drawn one step ahead, because XLA would otherwise
+    fuse the random generator into the transition and evaluate it without vector instructions, three times slower on a
+    CPU."""
 
 
 @pytree_dataclass
 class Bootstrap:
-    """Parameters of a bootstrap particle filter: the user's callbacks and how to resample."""
+    """Parameters of a bootstrap particle filter: the user's callbacks, and how to resample."""
 
     sample_prior: SamplePrior
     sample_transition: SampleTransition
     log_likelihood: LogLikelihood
     temper: Temper
-    ess_threshold: float
+    ess_threshold: float | Float[Array, ""]
     num_particles: int = field(metadata={"static": True})
     noise: DrawNoise = field(metadata={"static": True})
     scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
@@ -77,48 +68,57 @@ def bootstrap(
     log_likelihood: LogLikelihood,
     *,
     num_particles: int,
-    noise: DrawNoise | None = None,
+    noise: DrawNoise = random_keys,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
-    ess_threshold: float = 0.5,
+    ess_threshold: ArrayLike = 0.5,
     temper: Temper | None = None,
 ) -> Filter:
-    """Particle filter that proposes from the transition (Gordon, Salmond and Smith 1993).
+    """Build a bootstrap particle filter (N. Gordon, D. Salmond and A. Smith, IEE Proceedings F 140, 1993).
+
+    The state of one particle is any pytree of arrays; its shapes and types must not change in a transition.
 
     Args:
         sample_prior: `key -> x`; or one of `jaxfilters.priors`, which draw all particles at once, twice as fast.
-        sample_transition: `(randomness, x, control) -> x`.
-        log_likelihood: `(x, y) -> log p(y | x)`.
-        num_particles: Size N of the ensemble.
-        noise: What `randomness` is. Default: a random key for each particle. `StandardNormal(d)` hands over `d`
-            standard normal numbers instead and is several times faster.
-        scheme: Resampling scheme, e.g. `jaxfilters.resampling.stratified`, or one of
-            `jaxfilters.differentiable_resampling`.
-        ess_threshold: Resample before a prediction if the effective sample size is below this share of N; 1 or more
+        sample_transition: `(randomness, x, control) -> x`, the state one step later with its process noise.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar.
+        num_particles: Number n of particles.
+        noise: Source of `randomness`: by default a random key for each particle. `StandardNormal(d)` passes d standard
+            normal numbers instead and is several times faster.
+        scheme: Function of `jaxfilters.resampling`, or a scheme of `jaxfilters.differentiable_resampling`.
+        ess_threshold: Resample before a prediction if the effective sample size is below this fraction of n; 1 or more
             resamples always, 0 never.
-        temper: Flattens log-likelihoods, e.g. `TemperToShare(0.2)`; the log evidence is then that of the flattened
-        ones.
+        temper: Tempering of the likelihoods, e.g. `AdaptiveTempering(0.2)`; none by default.
+
+    Returns:
+        A filter whose state is a `ParticleState` and whose info is a `ParticleInfo`.
 
     Raises:
-        ValueError: If `num_particles < 1` or `ess_threshold < 0`.
+        TypeError: If a callback is not callable.
+        ValueError: If `num_particles < 1`, or `ess_threshold` or a parameter of `temper` is out of range; and when the
+            filter is traced, if a callback returns an array of the wrong shape or type.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> move = lambda noise, x, control: 0.9 * x + 0.5 * noise
+        >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2)
+        >>> pf = jf.bootstrap(
+        ...     lambda key: jnp.zeros(1), move, log_likelihood, num_particles=1000, noise=jf.StandardNormal(1)
+        ... )
+        >>> state, (states, infos) = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)))
     """
-    check_ensemble(num_particles, ess_threshold)
-    params = Bootstrap(
-        as_pytree(sample_prior),
-        as_pytree(sample_transition),
-        as_pytree(log_likelihood),
-        as_pytree(temper or untempered),
-        float(ess_threshold),
-        num_particles,
-        noise or random_keys,
-        scheme,
-    )
-    return Filter(params, _init, _predict, _update)
+    checks.check_callables(sample_prior=sample_prior, sample_transition=sample_transition)
+    checks.check_callables(log_likelihood=log_likelihood, noise=noise)
+    checks.check_ensemble(num_particles, ess_threshold, scheme, temper)
+    callbacks = map(as_pytree, (sample_prior, sample_transition, log_likelihood, temper or no_tempering))
+    return Filter(Bootstrap(*callbacks, ess_threshold, num_particles, noise, scheme), _init, _predict, _update)
 
 
 def _init(model: Bootstrap, key: AnyKey) -> ParticleState:
     prior_key, noise_key = jax.random.split(key)
-    particles = sample_ensemble(prior_key, model.sample_prior, model.num_particles)
-    return start(particles, model.noise(noise_key, model.num_particles), model.num_particles)
+    count = model.num_particles
+    particles = sample_ensemble(prior_key, model.sample_prior, count)
+    noise = checks.checked_noise(model.noise(noise_key, count), particles)
+    return ParticleState(particles, weights.uniform(count), jnp.arange(count, dtype=jnp.int32), noise)
 
 
 def _predict(model: Bootstrap, key: AnyKey, state: ParticleState, control: PyTree) -> ParticleState:
@@ -126,7 +126,8 @@ def _predict(model: Bootstrap, key: AnyKey, state: ParticleState, control: PyTre
     particles, log_weights, ancestors = resample(
         resample_key, state.particles, state.log_weights, model.scheme, model.ess_threshold
     )
-    move = jax.vmap(model.sample_transition, in_axes=(-1, -1, None), out_axes=-1)
+    transition = checks.checked_transition(model.sample_transition)
+    move = jax.vmap(transition, in_axes=(-1, -1, None), out_axes=-1)
     return ParticleState(
         move(state.noise, particles, control), log_weights, ancestors, model.noise(noise_key, model.num_particles)
     )
@@ -136,103 +137,7 @@ def _update(
     model: Bootstrap, key: AnyKey, state: ParticleState, observation: PyTree
 ) -> tuple[ParticleState, ParticleInfo]:
     del key
-    log_likelihood = jax.vmap(model.log_likelihood, in_axes=(-1, None))(state.particles, observation)
-    log_weights, info = reweight(state.log_weights, log_likelihood, state.ancestors, model.temper)
+    log_likelihood = checks.checked_log_likelihood(model.log_likelihood)
+    log_likelihoods = jax.vmap(log_likelihood, in_axes=(-1, None))(state.particles, observation)
+    log_weights, info = reweight(state.log_weights, log_likelihoods, state.ancestors, model.temper)
     return state._replace(log_weights=log_weights), info
-
-
-def start(particles: PyTree, noise: PyTree, num_particles: int) -> ParticleState:
-    """Equally weighted particles that are their own ancestors."""
-    log_weights = weights.uniform(num_particles)
-    return ParticleState(particles, log_weights, jnp.arange(num_particles, dtype=jnp.int32), noise)
-
-
-def resample(
-    key: AnyKey,
-    particles: PyTree,
-    log_weights: Float[Array, " n"],
-    scheme: ResamplingScheme | EnsembleScheme,
-    ess_threshold: float | Float[Array, ""],
-) -> tuple[PyTree, Float[Array, " n"], Int32[Array, " n"]]:
-    """Resample where the effective sample size is below `ess_threshold * N`; keeps the total weight.
-
-    Returns particles, log weights, and the ancestor of each. The new weights keep the derivative of the old ones (their
-    value does not), which makes the gradient of the log evidence a consistent estimate of the score
-    (Scibior and Wood 2021, "Differentiable particle filtering without modifying the forward pass").
-    """
-    num_particles = log_weights.shape[0]
-    normalized, log_sum = weights.normalize(log_weights)
-    identity = jnp.arange(num_particles, dtype=jnp.int32)
-    uneven = weights.effective_sample_size(normalized) < ess_threshold * num_particles
-    uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
-    if isinstance(scheme, EnsembleScheme):
-        as_it_is = Resampled(particles, normalized, identity)
-        found = jax.lax.cond(uneven, lambda: scheme.resample(key, particles, normalized), lambda: as_it_is)
-        return found.particles, log_sum + found.log_weights, found.ancestors
-
-    def draw() -> Int32[Array, " n"]:
-        return scheme(key, jax.lax.stop_gradient(normalized))
-
-    ancestors = jax.lax.cond(uneven, draw, lambda: identity)
-    chosen = normalized[ancestors]
-    chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
-    equal = weights.uniform(num_particles, log_weights.dtype) + (chosen - jax.lax.stop_gradient(chosen))
-    return (
-        jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), particles),
-        log_sum + jnp.where(uneven, equal, normalized),
-        ancestors,
-    )
-
-
-def reweight(
-    log_weights: Float[Array, " n"],
-    log_likelihood: Float[Array, " n"],
-    ancestors: Int32[Array, " n"],
-    temper: Temper,
-) -> tuple[Float[Array, " n"], ParticleInfo]:
-    """Bayes' rule on the weights: normalised log weights, and the diagnostics of the update.
-
-    A NaN or `+inf` log-likelihood counts as `-inf` and is reported; if nothing is left, the weights become equal and
-    the log evidence is `-inf`.
-    """
-    invalid = jnp.isnan(log_likelihood) | jnp.isposinf(log_likelihood)
-    usable = jnp.where(invalid, -jnp.inf, log_likelihood)
-    normalized, log_evidence = weights.normalize(log_weights + temper(usable, log_weights))
-    info = ParticleInfo(
-        log_evidence=log_evidence,
-        effective_sample_size=weights.effective_sample_size(normalized),
-        resampled=jnp.any(ancestors != jnp.arange(ancestors.shape[0], dtype=ancestors.dtype)),
-        num_invalid=jnp.sum(invalid, dtype=jnp.int32),
-    )
-    return normalized, info
-
-
-def untempered(log_likelihood: Float[Array, " n"], log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Log-likelihoods as they are."""
-    del log_weights
-    return log_likelihood
-
-
-@pytree_dataclass
-class AdaptiveTempering:
-    """Raise the likelihood to the largest power, at most 1, that leaves a share of the effective sample size."""
-
-    share: float | Float[Array, ""]
-    """Of the effective sample size before the update, in (0, 1]."""
-
-    def __call__(self, log_likelihood: Float[Array, " n"], log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-        target = self.share * weights.effective_sample_size(log_weights)
-        exponent = weights.temper_exponent(log_likelihood, log_weights, target)
-        return jax.lax.stop_gradient(exponent) * log_likelihood
-
-
-def check_ensemble(num_particles: int, ess_threshold: float) -> None:
-    """Reject ensembles that cannot be.
-
-    Raises:
-        ValueError: If `num_particles < 1` or `ess_threshold < 0`.
-    """
-    if not isinstance(num_particles, int) or num_particles < 1:
-        raise ValueError(f"num_particles must be an integer of at least 1; got {num_particles!r}.")
-    if not ess_threshold >= 0:
-        raise ValueError(f"ess_threshold must be a share of the particles, at least 0; got {ess_threshold!r}.")

@@ -1,15 +1,15 @@
-r"""Resampling that passes derivatives in other ways: soft, and by optimal transport.
+r"""Differentiable resampling: soft resampling, and resampling by optimal transport.
 
-The schemes of `jaxfilters.resampling` choose ancestors, which have no derivative; a particle filter that uses them
-keeps the derivative of the weights instead, which makes that of its log evidence a consistent estimate of the score
-(A. Ścibior and F. Wood, "Differentiable particle filtering without modifying the forward pass", 2021). It is the
-default. What is here changes the forward pass for a derivative with less noise and more bias. `docs/gradients.md` has
-measured numbers and says when to use which.
+The schemes of `jaxfilters.resampling` choose ancestors, which have no derivative. A particle filter that uses them
+keeps the derivative of the weights instead, which makes the gradient of its log evidence a consistent estimate of the
+score (A. Ścibior and F. Wood, "Differentiable particle filtering without modifying the forward pass", 2021). This is
+the default. The schemes of this module change the forward pass to obtain a gradient with less variance and more bias.
+`docs/gradients.md` compares them with measurements.
 
-Pass it as the `scheme` of a filter. `soft` chooses ancestors and goes wherever a scheme goes. `transport` makes
-averages of particles: for `bootstrap`, and `adaptive_diffusion` without partitions, whose particles are vectors. The
-average of several particles' Gaussians is no particle's Gaussian, hence not for Rao-Blackwellized filters; and an
-average has no ancestor, hence not within `fixed_lag`.
+They are values of the argument `scheme` of a filter. `soft` chooses ancestors and is accepted by every filter.
+`transport` averages particles: it is for `bootstrap`, and for `adaptive_diffusion` without partitions. An average of
+the Gaussians of several particles is not the Gaussian of a particle, so that Rao-Blackwellized filters reject it, and
+an average has no ancestor, so that `fixed_lag` does.
 """
 
 import math
@@ -26,7 +26,7 @@ from jaxfilters.particle.resampling import systematic
 from jaxfilters.typing import AnyKey, ResamplingScheme
 
 _TOLERANCE = 1e-3
-"""Largest error of a transported weight, as a share of 1 / n."""
+"""Largest error of a transported weight, as a fraction of 1 / n."""
 _MOST_ITERATIONS = 200
 _COOLING = 0.5
 _MOST_SOLVER_ITERATIONS = 100
@@ -43,38 +43,38 @@ class Resampled(NamedTuple):
 
 @runtime_checkable
 class EnsembleScheme(Protocol):
-    """Resampling that changes particles or weights beyond choosing ancestors; hashable, for it is static."""
+    """A resampling scheme that returns particles and weights as well as ancestors; hashable, because it is static."""
 
     def resample(self, key: AnyKey, particles: PyTree, log_weights: Float[Array, " n"], /) -> Resampled: ...
 
 
 @dataclass(frozen=True)
 class Soft:
-    """Ancestors drawn from a mixture of the weights and equal ones, the weights corrected."""
+    """Ancestors drawn from a mixture of the weights and equal weights, with an importance correction."""
 
     share: float
     scheme: ResamplingScheme = systematic
 
     def resample(self, key: AnyKey, particles: PyTree, log_weights: Float[Array, " n"]) -> Resampled:
-        """The ensemble with weights `w / (share w + (1 - share) / n)`, of mean one, over n."""
+        """Return the chosen ancestors, each with the weight `w / (share w + (1 - share) / n) / n` of its parent."""
         log_n = math.log(log_weights.size)
-        alive = jnp.isfinite(log_weights)
-        finite = jnp.where(alive, log_weights, 0.0)
+        has_weight = jnp.isfinite(log_weights)
+        finite = jnp.where(has_weight, log_weights, 0.0)
         even = math.log1p(-self.share) - log_n
-        log_mixture = jnp.where(alive, jnp.logaddexp(math.log(self.share) + finite, even), even)
+        log_mixture = jnp.where(has_weight, jnp.logaddexp(math.log(self.share) + finite, even), even)
         ancestors = self.scheme(key, jax.lax.stop_gradient(log_mixture))
-        corrected = jnp.where(alive, finite - log_mixture, -jnp.inf)[ancestors] - log_n
+        corrected = jnp.where(has_weight, finite - log_mixture, -jnp.inf)[ancestors] - log_n
         return Resampled(_chosen(particles, ancestors), corrected, ancestors)
 
 
 @dataclass(frozen=True)
 class Transport:
-    """Particles moved to the means of what optimal transport brings to each of n equal places."""
+    """Particles replaced by the averages that an optimal transport plan to equal weights makes of them."""
 
     regularization: float
 
     def resample(self, key: AnyKey, particles: PyTree, log_weights: Float[Array, " n"]) -> Resampled:
-        """The ensemble with equal weights; nothing is random."""
+        """Return the averaged particles with equal weights; the result is deterministic."""
         del key
         x, unravel = _as_columns(particles)
         plan = transport_plan(x, log_weights, self.regularization)
@@ -84,15 +84,19 @@ class Transport:
 
 
 def soft(share: float, *, scheme: ResamplingScheme = systematic) -> Soft:
-    """Soft resampling: some of the weights, and with them of their derivative, is kept.
+    """Build soft resampling, which keeps part of the weights and of their derivative.
 
-    P. Karkus, D. Hsu, W. S. Lee, "Particle filter networks with application to visual localization", 2018, equation 6.
-    The log evidence stays that of an unbiased estimate of the evidence; its derivative leaves out that the draw
-    depends on the parameters.
+    The method is that of P. Karkus, D. Hsu and W. S. Lee, "Particle filter networks with application to visual
+    localization", Conference on Robot Learning, 2018, equation 6. The estimate of the evidence stays unbiased; its
+    derivative neglects that the draw depends on the parameters.
 
     Args:
-        share: Of the weights in the mixture, in (0, 1): 1 would be plain resampling, 0 none at all.
-        scheme: How ancestors are drawn.
+        share: Fraction of the weights in the mixture with equal weights, in (0, 1). At 1 this would be plain
+            resampling, at 0 ancestors would be drawn regardless of weights.
+        scheme: Function of `jaxfilters.resampling` that draws the ancestors.
+
+    Returns:
+        A value for the argument `scheme` of a filter.
 
     Raises:
         ValueError: If `share` is out of range.
@@ -103,17 +107,21 @@ def soft(share: float, *, scheme: ResamplingScheme = systematic) -> Soft:
 
 
 def transport(regularization: float = 0.5) -> Transport:
-    r"""Resampling by entropy-regularised optimal transport.
+    r"""Build resampling by entropy-regularised optimal transport.
 
-    A. Corenflos, J. Thornton, G. Deligiannidis, A. Doucet, "Differentiable particle filtering via entropy-regularized
-    optimal transport", 2021, algorithm 3. Particles become averages of each other: only for states that are vectors of
-    floating-point numbers, and never more spread than before. Smooth in parameters, but neither unbiased nor consistent
-    unless the regularisation falls as n grows. Costs n^2 numbers and some tens of passes over them; for up to a few
+    The method is algorithm 3 of A. Corenflos, J. Thornton, G. Deligiannidis and A. Doucet, "Differentiable particle
+    filtering via entropy-regularized optimal transport", International Conference on Machine Learning, 2021. Particles
+    become averages of each other, so that all leaves of the state must hold floating-point numbers, and their spread
+    does not grow. The result is smooth in parameters, but neither unbiased nor consistent unless the regularisation
+    decreases as n grows. It stores n^2 numbers and iterates over them some tens of times, which suits up to a few
     hundred particles.
 
     Args:
-        regularization: Of the cost $|x_i - x_j|^2 / 2$, for states scaled to a largest standard deviation of
-            $1 / \sqrt d$. Less is less bias, and more iterations.
+        regularization: Weight of the entropy against the cost $|x_i - x_j|^2 / 2$, for states scaled to a largest
+            standard deviation of $1 / \sqrt d$. A smaller value means less bias and more iterations.
+
+    Returns:
+        A value for the argument `scheme` of a filter.
 
     Raises:
         ValueError: If `regularization` is not positive.
@@ -126,11 +134,11 @@ def transport(regularization: float = 0.5) -> Transport:
 def transport_plan(
     x: Float[Array, "d n"], log_weights: Float[Array, " n"], regularization: float
 ) -> Float[Array, "n n"]:
-    r"""What share of each of n equal places (rows, which sum to one) comes from each weighted particle (columns).
+    r"""Return the transport plan from weighted particles (columns) to n equal weights (rows, which sum to one).
 
-    Sinkhorn's iterations on the logarithms of the scalings, the regularisation cooled from the largest cost; then two
-    Newton steps, of which the last is what is differentiated. The source differentiates one more iteration instead,
-    which can be wrong by orders of magnitude where the regularisation is small.
+    It is computed by Sinkhorn iterations on the logarithms of the scalings, with a regularisation that decreases from
+    the largest cost, and two Newton steps. The last Newton step is differentiated. Corenflos et al. differentiate one
+    more Sinkhorn iteration instead, which can be wrong by orders of magnitude where the regularisation is small.
     """
     centred = x - jnp.mean(x, axis=1, keepdims=True)
     variance = jnp.max(jnp.mean(centred**2, axis=1)) * x.shape[0]
@@ -143,7 +151,7 @@ def transport_plan(
 
 
 def _newton(cost: Array, log_weights: Array, f: Array, g: Array) -> tuple[Array, Array]:
-    """Potentials after a Newton step from constant ones, on the logarithms of the plan's sums."""
+    """Potentials after a Newton step on the logarithms of the row and column sums of the plan."""
     n = log_weights.size
     rows = f - _towards_rows(cost, log_weights, g)
     columns = g - _towards_columns(cost, f)
@@ -151,8 +159,9 @@ def _newton(cost: Array, log_weights: Array, f: Array, g: Array) -> tuple[Array,
     scaled = jnp.exp(jax.lax.stop_gradient(f[:, None] + g - cost)) * jax.lax.rsqrt(jnp.asarray(n, cost.dtype))
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
 
-    # Of the unknowns the rows' go first. What is left is symmetric, and singular: one potential may rise by what the
-    # other falls. The last term lifts that direction, of which the plan knows nothing.
+    # The unknowns of the rows are eliminated first. The remaining system is symmetric and singular, because adding a
+    # constant to one potential and subtracting it from the other leaves the plan unchanged. The last term regularises
+    # that direction.
     def matrix(b: Array) -> Array:
         return b - root_w * product(scaled.T, product(scaled, root_w * b)) + root_w * jnp.sum(root_w * b)
 
@@ -166,11 +175,11 @@ def _newton(cost: Array, log_weights: Array, f: Array, g: Array) -> tuple[Array,
 
 
 def _potentials(cost: Array, log_weights: Array) -> tuple[Array, Array]:
-    """Scalings that make the rows and the columns sum to what they should; costs are in units of the regularisation."""
+    """Logarithms of the scalings that give rows and columns their sums; costs are in units of the regularisation."""
     n = log_weights.size
     target = jnp.exp(log_weights)
 
-    def goes_on(state: tuple) -> Array:
+    def continues(state: tuple) -> Array:
         _, _, heat, error, i = state
         return ((heat > 1) | (error > _TOLERANCE / n)) & (i < _MOST_ITERATIONS)
 
@@ -186,7 +195,7 @@ def _potentials(cost: Array, log_weights: Array) -> tuple[Array, Array]:
     zeros = jnp.zeros_like(log_weights)
     hottest = jnp.maximum(jnp.max(cost), 1.0)
     start = (zeros, zeros, hottest, jnp.asarray(jnp.inf, cost.dtype), jnp.zeros((), jnp.int32))
-    f, g, *_ = jax.lax.while_loop(goes_on, iterate, start)
+    f, g, *_ = jax.lax.while_loop(continues, iterate, start)
     return f, g
 
 
@@ -199,7 +208,7 @@ def _towards_rows(cost: Array, log_weights: Array, g: Array) -> Array:
 
 
 def _as_columns(particles: PyTree) -> tuple[Array, Callable]:
-    """Every particle as a column of numbers, and the way back."""
+    """Every particle as a column of numbers, and the inverse of that mapping."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(particles):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             name = f"particles{jax.tree_util.keystr(path)}"

@@ -1,10 +1,12 @@
-r"""Rao-Blackwellized particle filter whose proposal has looked at the observation.
+r"""Rao-Blackwellized particle filter with a proposal that depends on the current observation.
 
-With many dimensions and few particles, hardly any sample of the transition lands where the likelihood is. Here a
-`guide` looks at the observation first and answers with a point and an information matrix, a Gaussian stand-in for the
-likelihood. Each particle then draws from the product of that Gaussian with its own transition, mixed with a share of
-the plain transition that bounds the weights, and every weight is corrected by the ratio of the two densities: a rough
-guide costs efficiency, never correctness (Doucet, Godsill and Andrieu 2000, section II-D; mixture: Hesterberg 1995).
+With many dimensions and few particles, hardly any sample of the transition falls where the likelihood is high. Here a
+`guide` computes from the observation a point and an information matrix: a Gaussian approximation of the likelihood.
+Each particle draws from the product of that Gaussian and its own transition, mixed with a fraction of the plain
+transition that bounds the weights (defensive mixture: T. Hesterberg, "Weighted average importance sampling and
+defensive mixture distributions", Technometrics 37, 1995), and its weight is multiplied by the ratio of transition and
+proposal density (A. Doucet, S. Godsill and C. Andrieu, "On sequential Monte Carlo sampling methods for Bayesian
+filtering", Statistics and Computing 10, 2000, section II-D). A rough guide costs efficiency, not correctness.
 """
 
 import math
@@ -20,34 +22,34 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.filter import Filter
 from jaxfilters.math.linalg import cholesky, matmul, solve_triangular
-from jaxfilters.particle import rao_blackwell
-from jaxfilters.particle.bootstrap import ParticleInfo
+from jaxfilters.particle import checks, rao_blackwell
 from jaxfilters.particle.proposals import exact
-from jaxfilters.particle.rao_blackwell import Move, RaoBlackwell, RaoBlackwellState
+from jaxfilters.particle.rao_blackwell import Increments, RaoBlackwell, RaoBlackwellState
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey, as_pytree
 
 
 class Guidance(NamedTuple):
-    """A Gaussian stand-in for the likelihood of one observation."""
+    """A Gaussian approximation of the likelihood of one observation, as a function of the nonlinear state."""
 
     point: PyTree
-    """Where it peaks: a nonlinear state."""
+    """Its maximum: a nonlinear state x."""
     information: Float[Array, "n n"]
-    """Inverse covariance in the tangent space there; zero guides nowhere."""
+    """Inverse of its covariance in the tangent space at that point; zero where it says nothing."""
 
 
 @runtime_checkable
 class Guide(Protocol):
-    """Look at the observation with the predicted ensemble (axis last) in hand."""
+    """Compute a `Guidance` from the observation and the predicted ensemble, whose axis is the last one."""
 
     def __call__(self, particles: PyTree, log_weights: Float[Array, " n"], y: PyTree, /) -> Guidance: ...
 
 
 class GuidedState(NamedTuple):
-    """The ensemble, and how the last prediction moved it."""
+    """The ensemble, and the increments by which the last prediction moved it."""
 
     ensemble: RaoBlackwellState
-    move: Move
+    increments: Increments
 
 
 @pytree_dataclass
@@ -72,56 +74,80 @@ def guided(
     local: Callable[[PyTree, PyTree], Float[Array, " n"]] = subtract,
     prior_share: float = 0.2,
 ) -> Filter:
-    """The filter `inner`, made by `rao_blackwell_shared`, with a guided proposal.
+    """Give a filter made by `rao_blackwell_shared` a proposal that depends on the current observation.
+
+    A tempered `inner` tempers the likelihood and the importance correction of the proposal together, against the
+    weights before both: see `AdaptiveTempering`.
 
     Args:
-        inner: A Rao-Blackwellized filter with a shared covariance.
-        guide: `(particles, log_weights, y) -> Guidance`.
+        inner: A filter made by `rao_blackwell_shared` with the proposal `exact`.
+        guide: `(particles, log_weights, y) -> Guidance`; leaves of `particles` have the ensemble axis last.
         local: `(x, other) -> delta`, the inverse of the filter's `retract`; subtraction by default.
-        prior_share: Share of particles drawn from the transition as if there were no guide, in (0, 1). No weight is
-            corrected by more than a factor of `1 / prior_share`.
+        prior_share: Fraction of the particles that are drawn from the transition alone, in (0, 1). No importance
+            correction is larger than `1 / prior_share`.
+
+    Returns:
+        A filter whose state is a `GuidedState` and whose info is a `ParticleInfo`.
 
     Raises:
-        ValueError: If `inner` is another kind of filter, or `prior_share` is out of range.
+        TypeError: If a callback is not callable.
+        ValueError: If `inner` is another kind of filter, or `prior_share` is out of range; and when the filter is
+            traced, if `guide` or `local` returns an array of the wrong shape.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one, R = jnp.ones((1, 1)), 0.001
+        >>> dynamics = lambda x, control: jf.MixedDynamics(x, 0.1 * one, 0.03 * one, jnp.zeros(1), one, one)
+        >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2) / R
+        >>> prior, velocity = lambda key: jnp.zeros(1), jf.Gaussian(jnp.zeros(1), one)
+        >>> inner = jf.rao_blackwell_shared(prior, velocity, dynamics, log_likelihood, num_particles=100, noise_dim=1)
+        >>> pf = jf.guided(inner, lambda particles, log_weights, y: jf.Guidance(y, one / R))
+        >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)))
     """
-    params = inner.params
+    params = getattr(inner, "params", None)
     if not isinstance(params, RaoBlackwell) or params.covariance_axis is not None or params.proposal is not exact:
         raise ValueError("inner must be a filter made by rao_blackwell_shared with the exact proposal.")
-    if not 0 < prior_share < 1:
+    checks.check_callables(guide=guide, local=local)
+    if isinstance(prior_share, bool) or not 0 < prior_share < 1:
         raise ValueError(f"prior_share must be between 0 and 1; got {prior_share!r}.")
-    return Filter(
-        Guided(inner.params, as_pytree(guide), as_pytree(local), float(prior_share)), _init, _predict, _update
-    )
+    return Filter(Guided(params, as_pytree(guide), as_pytree(local), float(prior_share)), _init, _predict, _update)
 
 
 def _init(model: Guided, key: AnyKey) -> GuidedState:
     ensemble = rao_blackwell.init(model.inner, key)
-    return GuidedState(ensemble, standing(ensemble))
+    return GuidedState(ensemble, _zero_increments(ensemble))
 
 
-def standing(ensemble: RaoBlackwellState) -> Move:
-    """No move at all: what an ensemble that was never predicted has behind it."""
-    still = jnp.zeros_like(ensemble.noise)
-    size, linear_size = still.shape[0], ensemble.linear_mean.shape[0]
-    return Move(ensemble.particles, still, still, jnp.zeros((size, size)), jnp.zeros((linear_size, size)))
+def _zero_increments(ensemble: RaoBlackwellState) -> Increments:
+    """The increments of an ensemble that was never predicted."""
+    zeros = jnp.zeros_like(ensemble.noise)
+    size, linear_size = zeros.shape[0], ensemble.linear_mean.shape[0]
+    return Increments(ensemble.particles, zeros, zeros, jnp.zeros((size, size)), jnp.zeros((linear_size, size)))
 
 
 def _predict(model: Guided, key: AnyKey, state: GuidedState, control: PyTree) -> GuidedState:
-    return GuidedState(*rao_blackwell.move(model.inner, key, state.ensemble, control))
+    return GuidedState(*rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, control))
 
 
 def _update(model: Guided, key: AnyKey, state: GuidedState, observation: PyTree) -> tuple[GuidedState, ParticleInfo]:
-    ensemble, moved = state
+    ensemble, predicted = state
     guidance = model.guide(ensemble.particles, ensemble.log_weights, observation)
-    towards = jax.vmap(model.local, in_axes=(-1, None), out_axes=-1)(moved.origin, guidance.point) - moved.drift
-    delta, log_ratio = draw(key, moved.spread, guidance.information, towards, model.prior_share)
+    size = predicted.delta.shape[0]
+    checks.check_guidance(guidance, jax.tree.map(lambda leaf: leaf[..., 0], ensemble.particles), size)
+
+    def to_point(origin: PyTree, point: PyTree) -> Array:
+        delta = model.local(origin, point)
+        checks.check_shape("the result of local", delta, (size,), "noise_dim of inner")
+        return delta
+
+    towards = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)(predicted.origin, guidance.point) - predicted.drift
+    delta, log_ratio = draw(key, predicted.spread, guidance.information, towards, model.prior_share)
     ensemble = ensemble._replace(
-        particles=jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)(moved.origin, moved.drift + delta),
-        linear_mean=ensemble.linear_mean + moved.gain @ (delta - moved.delta),
-        log_weights=ensemble.log_weights + log_ratio,
+        particles=jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)(predicted.origin, predicted.drift + delta),
+        linear_mean=ensemble.linear_mean + predicted.gain @ (delta - predicted.delta),
     )
-    ensemble, info = rao_blackwell.weigh(model.inner, ensemble, observation)
-    return GuidedState(ensemble, moved._replace(delta=delta)), info
+    ensemble, info = rao_blackwell.update_ensemble(model.inner, ensemble, observation, log_ratio)
+    return GuidedState(ensemble, predicted._replace(delta=delta)), info
 
 
 def draw(
@@ -131,20 +157,30 @@ def draw(
     towards: Float[Array, "n k"],
     prior_share: float,
 ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
-    r"""Increments from the mixture of transition and guide, and their log importance weights.
+    r"""Draw increments from the mixture of transition and guide.
 
-    Draws from $\alpha N(0, N) + (1 - \alpha) N(\mu_i, C)$ with $C = (N^{-1} + \Lambda)^{-1}$, $\mu_i = C \Lambda t_i$,
-    where `spread` is $N$, `information` $\Lambda$, and `towards` holds the increments $t_i$ that would reach the
-    guide's point; the weight is the ratio of $N(0, N)$ to the mixture. Worked in coordinates whitened by $N$, where $C$
-    is $(I + L^T \Lambda L)^{-1}$: float32 holds however unequal the units of the state are.
+    The mixture is $\alpha N(0, N) + (1 - \alpha) N(\mu_i, C)$ with $C = (N^{-1} + \Lambda)^{-1}$ and
+    $\mu_i = C \Lambda t_i$. It is computed in coordinates whitened by $N = L L^T$, where $C$ is
+    $(I + L^T \Lambda L)^{-1}$, so that float32 suffices however different the units of the components are.
+
+    Args:
+        key: Random key.
+        spread: Covariance N of the increments given the past.
+        information: Information matrix Lambda of the guide.
+        towards: Increments t_i that would move each of the k particles to the point of the guide.
+        prior_share: Fraction alpha of draws from the transition alone.
+
+    Returns:
+        Increments `(n, k)`, and the logarithms `(k,)` of the ratio of N(0, N) to the mixture there.
     """
     choice_key, noise_key = jax.random.split(key)
     noise = standard_normal(noise_key, towards.shape)
     root = cholesky(spread)
     precision_root = cholesky(jnp.eye(root.shape[0], dtype=root.dtype) + root.T @ information @ root)
 
-    # LAPACK solves for many right-hand sides with threads of its own, which get in the way of a renderer that keeps all
-    # cores busy: for 512 particles 30 ms against 0.1 ms. No root is smaller than one, so its inverse is harmless.
+    # LAPACK solves for many right-hand sides with threads of its own, which compete with a likelihood that keeps all
+    # cores busy: 30 ms for 512 particles, against 0.1 ms for a product with the inverse. The diagonal of the root is at
+    # least one, so that its inverse is well conditioned.
     inverse_root = solve_triangular(precision_root, jnp.eye(root.shape[0], dtype=root.dtype))
     center = matmul(inverse_root.T, matmul(inverse_root, root.T @ (information @ towards)))
     plain = jax.random.uniform(choice_key, noise.shape[-1:]) < prior_share

@@ -1,10 +1,11 @@
-r"""Layered sampling: one observation weighs the particles twice, first after rough moves, then after fine ones.
+r"""Partitioned sampling in two stages: one observation weights the particles after a large and after a small move.
 
-In many dimensions few particles that move in all of them at once land well. Halfway partitioned sampling lets each
-particle move in one group of coordinates only, half of them in the pose, half of them in the deformation; those that
-landed well in either are drawn and moved a little in all coordinates, without drift, and weighed again
-(Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion", 2007, section 3.3.2;
-after J. MacCormick and M. Isard, "Partitioned sampling", 2000). It costs two likelihoods a particle.
+In many dimensions few particles that move in all of them at once come close to the target. In the first stage each
+particle moves in one group of coordinates only, for example one half of the particles in the pose and the other half in
+the deformation. Those that are close in either are resampled, moved a little in all coordinates without drift, and
+weighted again (Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion", 2007,
+section 3.3.2; after J. MacCormick and M. Isard, "Partitioned sampling, articulated objects, and interface-quality hand
+tracking", European Conference on Computer Vision, 2000). It costs two evaluations of the likelihood a particle.
 """
 
 from collections.abc import Callable
@@ -18,9 +19,11 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
-from jaxfilters.particle.bootstrap import ParticleInfo, resample, reweight, untempered
+from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transport
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, as_pytree
 
 
@@ -31,66 +34,84 @@ class EnsembleLogLikelihood(Protocol):
     def __call__(self, particles: Float[Array, "d n"], y: PyTree, /) -> Float[Array, " n"]: ...
 
 
-def over_ensemble(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood:
-    """The log-likelihood of all particles from that of one; built again from the same function it compiles nothing."""
-    return jax.tree_util.Partial(_mapped, as_pytree(log_likelihood))
+def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood:
+    """Map the log-likelihood of one particle over all particles.
+
+    Args:
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar.
+
+    Returns:
+        `(particles (d, n), y) -> (n,)`. Two results for the same function are equal, so that a filter built again is
+        not compiled again.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.particle.partitioned import batch_log_likelihood
+        >>> batch_log_likelihood(lambda x, y: -jnp.sum((x - y) ** 2))(jnp.zeros((2, 5)), jnp.ones(2)).shape
+        (5,)
+    """
+    checks.check_callables(log_likelihood=log_likelihood)
+    return jax.tree_util.Partial(_map_over_particles, as_pytree(log_likelihood))
 
 
-def _mapped(log_likelihood, particles, y):
-    return jax.vmap(log_likelihood, in_axes=(-1, None))(particles, y)
+def _map_over_particles(log_likelihood, particles, y):
+    return jax.vmap(checks.checked_log_likelihood(log_likelihood), in_axes=(-1, None))(particles, y)
 
 
 @runtime_checkable
 class StageWeights(Protocol):
-    """Log weights of the second stage from the log-likelihood there and that of the parent in the first."""
+    """Compute log weights of the second stage from the log-likelihoods of child (second stage) and parent (first)."""
 
     def __call__(self, child: Float[Array, " n"], parent: Float[Array, " n"], /) -> Float[Array, " n"]: ...
 
 
-def counted_twice(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`L(child)`, as published: the observation counts in both stages, and the spread comes out too small."""
+def uncorrected(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Weight by `L(child)`, as published: the observation counts in both stages, and the posterior is too narrow."""
     del parent
     return child
 
 
-def counted_once(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`L(child) / L(parent)`: the observation counts once.
+def corrected(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Weight by `L(child) / L(parent)`: the observation counts once.
 
-    The particles then follow the posterior of where the rough and the fine moves lead: of a prior that is still too
-    narrow, because each particle has moved in one group only.
+    The particles then approximate the posterior for the prior that the two moves make up. That prior is narrower than
+    the transition of the model, because each particle makes the large move in one group only.
     """
     return child - jnp.where(jnp.isfinite(parent), parent, 0.0)
 
 
 @pytree_dataclass
 class Partitions:
-    """How a layered filter splits its moves."""
+    """How partitioned sampling splits the move of a prediction into two stages."""
 
     groups: Bool[Array, "g d"]
-    """Which coordinates move together in the first stage; `consecutive(6, 5)` are the first six and the other five."""
+    """Coordinates that move together in the first stage, one group a row; `consecutive(6, 5)` makes two groups of the
+    first six coordinates and the next five."""
     jitter: float | Float[Array, ""] = 0.25
-    """Standard deviation of the fine moves as a share of that of the rough ones."""
-    stage_weights: StageWeights = field(default=counted_twice, metadata={"static": True})
-    """`counted_twice` as published; `counted_once` where the spread of the particles is of interest."""
+    """Standard deviation of the small move of the second stage, as a fraction of that of the first."""
+    stage_weights: StageWeights = field(default=uncorrected, metadata={"static": True})
+    """`uncorrected` as published; `corrected` where the spread of the particles is of interest."""
 
 
 def consecutive(*sizes: int) -> Bool[Array, "g d"]:
-    """Groups of coordinates one behind the other, a row each.
+    """Make groups of consecutive coordinates with the given sizes, a row each.
 
     Raises:
-        ValueError: If there is no size, or one below 1.
+        ValueError: If there is no size, or one that is not an integer of at least 1.
     """
-    if not sizes or min(sizes) < 1:
-        raise ValueError(f"consecutive needs sizes of at least 1; got {sizes}.")
+    if not sizes:
+        raise ValueError("sizes of consecutive must be one or more; got none.")
+    for size in sizes:
+        checks.check_num_particles(size, name="sizes of consecutive")
     group = np.repeat(np.arange(len(sizes)), sizes)
     return jnp.asarray(group == np.arange(len(sizes))[:, None])
 
 
-def in_one_group(displacement: Float[Array, "d n"], groups: Bool[Array, "g d"]) -> Float[Array, "d n"]:
-    """The displacements of each particle in one group of coordinates, zero in the others.
+def move_one_group(displacement: Float[Array, "d n"], groups: Bool[Array, "g d"]) -> Float[Array, "d n"]:
+    """Keep the displacement of each particle in one group of coordinates, and set it to zero in the others.
 
-    The groups take turns along the ensemble: resampled particles lie beside their siblings, so that each parent's
-    children spread over all groups.
+    The groups alternate along the ensemble. Resampled particles with the same parent are neighbours, so that the
+    children of every parent move in different groups.
     """
     turn = jnp.arange(displacement.shape[1]) % groups.shape[0]
     return jnp.where(groups[turn].T, displacement, 0.0)
@@ -104,40 +125,43 @@ def partitioned_update(
     log_likelihood: Callable[[Float[Array, "d n"]], Float[Array, " n"]],
     jitter: Float[Array, " d"],
     *,
-    stage_weights: StageWeights = counted_twice,
+    stage_weights: StageWeights = uncorrected,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
 ) -> tuple[Float[Array, "d n"], Float[Array, " n"], Int32[Array, " n"], ParticleInfo]:
-    """Particles, log weights and ancestors after weighing, resampling, fine moves and weighing again.
+    """Weight predicted particles, resample them, move them a little and weight them again.
 
-    The log evidence is that of the first stage, whose particles are drawn before the observation is seen; it is `-inf`
-    if in either stage no particle explains the observation. The effective sample size is that after the second stage;
-    invalid likelihoods of both count.
+    The log evidence is that of the first stage, whose particles do not depend on the observation; it is `-inf` if in
+    either stage no particle explains the observation. The effective sample size is that after the second stage, and
+    invalid likelihoods of both stages are counted.
 
     Args:
         key: Random key.
-        particles: Predicted particles.
-        log_weights: Their log weights.
-        ancestors: Their parents before the prediction.
-        log_likelihood: `particles -> (n,)`, log p(y | x) of the observation at hand.
-        jitter: Standard deviations of the fine moves.
-        stage_weights: How the second stage weighs: `counted_twice` or `counted_once`.
+        particles: Predicted particles `(d, n)`.
+        log_weights: Log weights `(n,)` of the predicted particles.
+        ancestors: Index of each particle's parent before the prediction.
+        log_likelihood: `particles -> (n,)`, log p(y | x) of the current observation.
+        jitter: Standard deviations `(d,)` of the small move.
+        stage_weights: Weights of the second stage: `uncorrected` or `corrected`.
         scheme: Resampling scheme between the stages.
 
+    Returns:
+        Particles, log weights, ancestors before the prediction, and the diagnostics.
+
     Raises:
-        ValueError: If `scheme` is transport: what it makes are averages, of which no likelihood was evaluated.
+        ValueError: If `scheme` is transport: it makes averages of particles, whose likelihoods were not evaluated.
     """
     if isinstance(scheme, Transport):
         raise ValueError("scheme must choose ancestors between the stages; transport averages particles.")
     resample_key, noise_key = jax.random.split(key)
     first_likelihood = log_likelihood(particles)
-    log_weights, first = reweight(log_weights, first_likelihood, ancestors, untempered)
+    log_weights, first = reweight(log_weights, first_likelihood, ancestors, no_tempering)
     (particles, first_likelihood), log_weights, chosen = resample(
         resample_key, (particles, first_likelihood), log_weights, scheme, 1.0
     )
     noise = standard_normal(noise_key, particles.shape, particles.dtype)
     particles = particles + jitter[:, None] * noise
     second_likelihood = stage_weights(log_likelihood(particles), first_likelihood)
-    log_weights, second = reweight(log_weights, second_likelihood, ancestors, untempered)
+    log_weights, second = reweight(log_weights, second_likelihood, ancestors, no_tempering)
     unexplained = second.log_evidence == -jnp.inf
     info = second._replace(
         log_evidence=jnp.where(unexplained, -jnp.inf, first.log_evidence),

@@ -1,10 +1,11 @@
-r"""How a Rao-Blackwellized particle filter draws the nonlinear state.
+r"""Proposals of a Rao-Blackwellized particle filter: how the increment of the nonlinear state is drawn.
 
-The quantity drawn is the innovation $\delta = z - A_n m$: what the nonlinear state does beyond what the mean $m$ of the
-linear state predicts. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, because the linear state is
-uncertain (Schön, Gustafsson and Nordlund 2005). Each proposal is `(noise, N, Q_n) -> (delta, log_correction)`, where
-`noise` is standard normal and `log_correction` is the log ratio of that density to the one drawn from, to be added to
-the log weight.
+A proposal draws $\delta = z - A_n m$, the deviation of the increment $z$ from its prediction by the mean $m$ of the
+linear state. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, where $P$ is the covariance of the
+linear state (T. Schön, F. Gustafsson and P.-J. Nordlund, "Marginalized particle filters for mixed linear/nonlinear
+state-space models", IEEE Transactions on Signal Processing 53, 2005). Each proposal is
+`(noise, N, Q_n) -> (delta, log_correction)`, where `noise` is standard normal and `log_correction` is the logarithm of
+the ratio of this density to the one that was drawn from, to be added to the log weight.
 """
 
 from typing import Protocol, runtime_checkable
@@ -17,7 +18,7 @@ from jaxfilters.math.linalg import cholesky, solve_triangular
 
 @runtime_checkable
 class Proposal(Protocol):
-    """Draw the innovation of the nonlinear state from standard normal noise."""
+    """Draw the deviation `(n,)` of the increment from standard normal noise; returns it and its log correction."""
 
     def __call__(
         self, noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"], /
@@ -27,7 +28,7 @@ class Proposal(Protocol):
 def exact(
     noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Draw from N(0, N), the transition with the linear state integrated out: no correction is due."""
+    """Draw from N(0, N), the transition with the linear state integrated out, which needs no correction."""
     del Q_n
     return cholesky(N) @ noise, jnp.zeros((), noise.dtype)
 
@@ -35,10 +36,11 @@ def exact(
 def plug_in(
     noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Draw from N(0, Q_n) without correction, as Kajihara and Tanaka, eqs. 49-54.
+    """Draw from N(0, Q_n) without correction, with the mean of the linear state in place of its true value.
 
-    It treats the mean of the linear state as its true value: what it filters is a model in which one noise drives both
-    states, and its posterior is too narrow.
+    The proposal is that of Kajihara and Tanaka, "A method for 3D hand pose tracking using a Rao-Blackwellized particle
+    filter", equations 49-54. The result is the filter of a model in which one noise drives both states; for the given
+    model its posterior is too narrow.
     """
     del N
     return cholesky(Q_n) @ noise, jnp.zeros((), noise.dtype)
@@ -47,7 +49,7 @@ def plug_in(
 def plug_in_corrected(
     noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Draw from N(0, Q_n) and correct the weight to N(0, N): consistent, with more variable weights than `exact`."""
+    """Draw from N(0, Q_n) and correct the weight to N(0, N): consistent, with weights of larger variance."""
     root_Q, root_N = cholesky(Q_n), cholesky(N)
     delta = root_Q @ noise
     whitened = solve_triangular(root_N, delta)

@@ -1,20 +1,23 @@
-r"""Rao-Blackwellized particle filter for mixed linear/nonlinear models.
+r"""Rao-Blackwellized particle filter for models that are linear and Gaussian given a nonlinear part of the state.
 
-The model is the triangular "model 2" of Schön, Gustafsson and Nordlund 2005, with the nonlinear state on any manifold:
+The model is triangular, with the nonlinear state $x$ on any manifold (T. Schön, F. Gustafsson and P.-J. Nordlund,
+"Marginalized particle filters for mixed linear/nonlinear state-space models", IEEE Transactions on Signal Processing
+53, 2005, there called model 2):
 
 $$x_t = f_n(x_{t-1}) \boxplus (A_n l_{t-1} + w_n),\quad l_t = f_l(x_{t-1}) + A_l l_{t-1} + w_l,\quad
   y_t \sim p(y_t \mid x_t)\ \text{or}\ y_t = h(x_t) + C l_t + e.$$
 
-Only `x` is sampled. The linear state `l` given the path of `x` is Gaussian: each particle carries its mean, and either
-its own covariance or, where the matrices do not depend on the particle, one that all of them share.
+Only $x$ is sampled. The linear state $l$ given the path of $x$ is Gaussian: each particle carries its mean, and either
+its own covariance or, where the matrices do not depend on the particle, one that all particles share.
 """
 
 from collections.abc import Callable
-from dataclasses import field
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
@@ -28,46 +31,33 @@ from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.linalg import cholesky, matmul, solve_triangular
 from jaxfilters.noise import StandardNormal
-from jaxfilters.particle.bootstrap import ParticleInfo, check_ensemble, resample, reweight, untempered
+from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transport
+from jaxfilters.particle.mixed_model import LinearObservation as LinearObservation
+from jaxfilters.particle.mixed_model import MixedDynamics as MixedDynamics
 from jaxfilters.particle.proposals import Proposal, exact
 from jaxfilters.particle.resampling import systematic
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree
 
 
-class MixedDynamics(NamedTuple):
-    """One step of the model for one particle, about its nonlinear state."""
-
-    f_n: PyTree
-    """Where the nonlinear state goes by itself, a point like `x`."""
-    A_n: Float[Array, "n l"]
-    Q_n: Float[Array, "n n"]
-    f_l: Float[Array, " l"]
-    A_l: Float[Array, "l l"]
-    Q_l: Float[Array, "l l"]
-
-
-class LinearObservation(NamedTuple):
-    """y = h + C l + e with e ~ N(0, R), for one particle."""
-
-    h: Float[Array, " m"]
-    C: Float[Array, "m l"]
-    R: Float[Array, "m m"]
-
-
 class RaoBlackwellState(NamedTuple):
-    """Weighted particles of the nonlinear state, each with a Gaussian over the linear one."""
+    """Weighted particles of the nonlinear state, each with a Gaussian belief about the linear one."""
 
     particles: PyTree
-    """Leaves `(..., N)`."""
+    """Leaves `(..., n)`."""
     linear_mean: Float[Array, "l n"]
+    """Mean of the linear state of each particle."""
     covariance: Float[Array, "..."]
-    """Of the linear state: `(l, l, N)`, or `(l, l)` where all particles share it."""
+    """Covariance of the linear state: `(l, l, n)`, or `(l, l)` where all particles share it."""
     log_weights: Float[Array, " n"]
     """After an update `logsumexp(log_weights) == 0`."""
     ancestors: Int32[Array, " n"]
+    """Index of each particle's parent in the state before the last prediction."""
     noise: Float[Array, "d n"]
+    """Standard normal numbers of the next prediction, drawn one step ahead."""
 
 
 @pytree_dataclass
@@ -80,7 +70,7 @@ class RaoBlackwell:
     retract: Callable
     condition: Callable
     temper: Temper
-    ess_threshold: float
+    ess_threshold: float | Float[Array, ""]
     num_particles: int = field(metadata={"static": True})
     noise: StandardNormal = field(metadata={"static": True})
     proposal: Proposal = field(metadata={"static": True})
@@ -90,7 +80,7 @@ class RaoBlackwell:
 
 
 def add(x: Float[Array, " n"], delta: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Move a point of a vector space."""
+    """Move a point of a vector space by an increment."""
     return x + delta
 
 
@@ -106,86 +96,158 @@ def rao_blackwell(
     retract: Callable[[PyTree, Array], PyTree] = add,
     proposal: Proposal = exact,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
-    ess_threshold: float = 0.5,
+    ess_threshold: ArrayLike = 0.5,
     temper: Temper | None = None,
 ) -> Filter:
-    """Rao-Blackwellized particle filter in which every particle has its own covariance.
+    """Build a Rao-Blackwellized particle filter in which every particle has its own covariance.
 
     Args:
         sample_prior: `key -> x`, the nonlinear state.
-        linear_prior: Belief about the linear state before the first observation, the same for all particles.
+        linear_prior: Belief about the linear state `(l,)` before the first observation, the same for all particles.
         dynamics: `(x, control) -> MixedDynamics`.
-        log_likelihood: `(x, y) -> log p(y | x)`, for observations that do not see the linear state.
-        num_particles: Size N of the ensemble.
-        noise_dim: Dimension n of the tangent space of the nonlinear state.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar, for observations that do not depend on the linear state.
+        num_particles: Number n of particles.
+        noise_dim: Dimension of the tangent space of the nonlinear state.
         observe: `x -> LinearObservation`, for observations that do. Exactly one of the two must be given.
-        retract: `(x, delta) -> x`, how an increment moves the nonlinear state; addition by default.
-        proposal: How the nonlinear state is drawn: `exact` (default), `paper` or `paper_corrected` of
-            `jaxfilters.proposals`.
-        scheme: Resampling scheme; of `jaxfilters.differentiable_resampling`, `soft`.
-        ess_threshold: Resample before a prediction if the effective sample size is below this share of N.
-        temper: Flattens log-likelihoods, e.g. `TemperToShare(0.2)`.
+        retract: `(x, delta) -> x`, moves the nonlinear state by an increment; addition by default.
+        proposal: How the nonlinear state is drawn: `exact`, `plug_in` or `plug_in_corrected` of `jaxfilters.proposals`.
+        scheme: Function of `jaxfilters.resampling`, or `jaxfilters.differentiable_resampling.soft(...)`.
+        ess_threshold: Resample before a prediction if the effective sample size is below this fraction of n.
+        temper: Tempering of the likelihoods, e.g. `AdaptiveTempering(0.2)`; none by default.
+
+    Returns:
+        A filter whose state is a `RaoBlackwellState` and whose info is a `ParticleInfo`.
 
     Raises:
+        TypeError: If a callback is not callable, or `linear_prior` is not a `Gaussian` of floating-point numbers.
         ValueError: If an argument is out of range, not exactly one of `log_likelihood` and `observe` is given, or
-            `scheme` is transport, which would average Gaussians of different particles.
+            `scheme` is transport, which would average Gaussians of different particles; and when the filter is
+            traced, if a callback returns an array of the wrong shape or type.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one = jnp.ones((1, 1))  # the position x is driven by an unknown velocity l
+        >>> dynamics = lambda x, dt: jf.MixedDynamics(x, dt * one, 0.01 * one, jnp.zeros(1), one, 0.1 * one)
+        >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2) / 0.1
+        >>> prior = lambda key: jnp.zeros(1)
+        >>> velocity = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> pf = jf.rao_blackwell(prior, velocity, dynamics, log_likelihood, num_particles=100, noise_dim=1)
+        >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), jnp.full(5, 0.1))
     """
-    check_ensemble(num_particles, ess_threshold)
+    callbacks = (sample_prior, linear_prior, dynamics, retract, _condition_on(log_likelihood, observe), temper)
+    return _build(callbacks, ess_threshold, num_particles, noise_dim, proposal, scheme)
+
+
+def rao_blackwell_shared(
+    sample_prior: SamplePrior,
+    linear_prior: Gaussian,
+    dynamics: Callable[[PyTree, PyTree], MixedDynamics],
+    log_likelihood: LogLikelihood | None = None,
+    *,
+    num_particles: int,
+    noise_dim: int,
+    observe: Callable[[PyTree], LinearObservation] | None = None,
+    retract: Callable[[PyTree, Array], PyTree] = add,
+    proposal: Proposal = exact,
+    scheme: ResamplingScheme | EnsembleScheme = systematic,
+    ess_threshold: ArrayLike = 0.5,
+    temper: Temper | None = None,
+) -> Filter:
+    """Build a Rao-Blackwellized particle filter whose particles share one covariance of the linear state.
+
+    For models whose matrices `A_n`, `Q_n`, `A_l`, `Q_l`, `C` and `R` do not depend on the nonlinear state. Every
+    particle would carry the same covariance, so that one small matrix recursion a step replaces n of them.
+
+    Args:
+        sample_prior: `key -> x`, the nonlinear state.
+        linear_prior: Belief about the linear state `(l,)` before the first observation, the same for all particles.
+        dynamics: `(x, control) -> MixedDynamics`, whose matrices must not depend on x.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar, for observations that do not depend on the linear state.
+        num_particles: Number n of particles.
+        noise_dim: Dimension of the tangent space of the nonlinear state.
+        observe: `x -> LinearObservation`, for observations that do, whose `C` and `R` must not depend on x.
+        retract: `(x, delta) -> x`, moves the nonlinear state by an increment; addition by default.
+        proposal: As for `rao_blackwell`.
+        scheme: As for `rao_blackwell`.
+        ess_threshold: As for `rao_blackwell`.
+        temper: As for `rao_blackwell`.
+
+    Returns:
+        A filter whose state is a `RaoBlackwellState` and whose info is a `ParticleInfo`.
+
+    Raises:
+        TypeError: As `rao_blackwell`.
+        ValueError: As `rao_blackwell`; and when the filter is traced, if one of the matrices depends on x.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one, velocity = jnp.ones((1, 1)), jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> dynamics = lambda x, dt: jf.MixedDynamics(x, dt * one, 0.01 * one, jnp.zeros(1), one, 0.1 * one)
+        >>> pf = jf.rao_blackwell_shared(
+        ...     lambda key: jnp.zeros(1), velocity, dynamics, lambda x, y: -jnp.sum((y - x) ** 2),
+        ...     num_particles=100, noise_dim=1,
+        ... )
+        >>> jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), jnp.full(5, 0.1))[0].covariance.shape
+        (1, 1)
+    """
+    callbacks = (sample_prior, linear_prior, dynamics, retract, _condition_on(log_likelihood, observe), temper)
+    own = _build(callbacks, ess_threshold, num_particles, noise_dim, proposal, scheme)
+    return replace(own, params=replace(own.params, covariance_axis=None))
+
+
+def _build(
+    callbacks: tuple,
+    ess_threshold: ArrayLike,
+    num_particles: int,
+    noise_dim: int,
+    proposal: Proposal,
+    scheme: ResamplingScheme | EnsembleScheme,
+) -> Filter:
+    sample_prior, linear_prior, dynamics, retract, condition, temper = callbacks
+    checks.check_callables(sample_prior=sample_prior, dynamics=dynamics, retract=retract, proposal=proposal)
+    checks.check_ensemble(num_particles, ess_threshold, scheme, temper)
+    checks.check_num_particles(noise_dim, name="noise_dim")
+    checks.check_gaussian("linear_prior", linear_prior)
     if isinstance(scheme, Transport):
         raise ValueError("scheme must choose ancestors: transport averages particles, and so their Gaussians.")
-    return Filter(
-        RaoBlackwell(
-            as_pytree(sample_prior),
-            linear_prior,
-            as_pytree(dynamics),
-            as_pytree(retract),
-            _condition_on(log_likelihood, observe),
-            as_pytree(temper or untempered),
-            float(ess_threshold),
-            num_particles,
-            StandardNormal(noise_dim),
-            proposal,
-            scheme,
-            -1,
-        ),
-        init,
-        _predict,
-        _update,
+    params = RaoBlackwell(
+        as_pytree(sample_prior),
+        linear_prior,
+        as_pytree(dynamics),
+        as_pytree(retract),
+        condition,
+        as_pytree(temper or no_tempering),
+        ess_threshold,
+        num_particles,
+        StandardNormal(noise_dim),
+        proposal,
+        scheme,
+        covariance_axis=-1,
     )
+    return Filter(params, init, _predict, _update)
 
 
-def rao_blackwell_shared(*args: PyTree, **options: PyTree) -> Filter:
-    """Rao-Blackwellized particle filter whose particles share one covariance; arguments as `rao_blackwell`.
-
-    For models whose matrices `A_n, Q_n, A_l, Q_l, C, R` do not depend on the particle, where every particle would carry
-    the same covariance: one small matrix recursion a frame instead of N. A model that breaks the rule is rejected when
-    it is traced.
-    """
-    own = rao_blackwell(*args, **options)
-    fields = {name: getattr(own.params, name) for name in own.params.__dataclass_fields__}
-    return Filter(RaoBlackwell(**{**fields, "covariance_axis": None}), init, _predict, _update)
-
-
-class Move(NamedTuple):
-    """How one prediction moved the particles: what a proposal needs that looks at the observation and draws again."""
+class Increments(NamedTuple):
+    """How one prediction moved the particles: what `guided` needs to draw the increments again."""
 
     origin: PyTree
-    """Where the nonlinear state would go by itself, `f_n`."""
-    drift: Float[Array, "d n"]
-    """Mean of its increment, A_n m."""
-    delta: Float[Array, "d n"]
-    """What was drawn beyond the mean."""
+    """The next nonlinear state for a zero increment, `f_n`; leaves `(..., k)` for k particles."""
+    drift: Float[Array, "d k"]
+    """Mean of the increment, A_n m for the mean m of the linear state."""
+    delta: Float[Array, "d k"]
+    """Deviation from that mean that was drawn."""
     spread: Float[Array, "..."]
-    """Covariance of the increment given the past, N [26]."""
+    """Covariance N of the increment given the past, `(d, d)` or `(d, d, k)`; see `condition_on_increment`."""
     gain: Float[Array, "..."]
-    """What one unit of `delta` adds to the mean of the linear state, A_l K = L [27]."""
+    """Gain L: what one unit of `delta` adds to the mean of the linear state, `(l, d)` or `(l, d, k)`."""
 
 
 def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics) -> tuple[Array, Array, Array]:
-    r"""Spread $N$, gain $L$ and next covariance of the linear state, eqs. [26], [27] (corrected) and [29].
+    r"""Covariance $N$ of the increment, gain $L$, and covariance of the linear state one step later.
 
-    Conditions on $z = A_n l + w_n$ with gain $P A_n^T N^{-1}$, in Joseph form, then propagates through $A_l$: the same
-    as the general recursion of Schön, Gustafsson and Nordlund 2005, without its cancellation.
+    With $z = A_n l + w_n$ the increment and $P$ the covariance of $l$: $N = A_n P A_n^T + Q_n$, $L = A_l P A_n^T
+    N^{-1}$, and the next covariance is $(A_l - L A_n) P (A_l - L A_n)^T + L Q_n L^T + Q_l$. This is the recursion of
+    Schön, Gustafsson and Nordlund 2005 for independent noises, in Joseph form to avoid cancellation.
     """
     ahead = matmul(step.A_n, covariance)
     spread = matmul(ahead, step.A_n.T) + step.Q_n
@@ -197,13 +259,13 @@ def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics)
 
 
 def propagate(belief: Gaussian, delta: Float[Array, " n"], step: MixedDynamics) -> Gaussian:
-    r"""Belief about the linear state one step on, given $\delta = z - A_n m$ of the nonlinear one [28], [29]."""
+    r"""Belief about the linear state one step later, given the deviation $\delta = z - A_n m$ of the increment."""
     _, gain, covariance = condition_on_increment(belief.covariance, step)
     return Gaussian(step.f_l + step.A_l @ belief.mean + gain @ delta, covariance)
 
 
 def init(model: RaoBlackwell, key: AnyKey) -> RaoBlackwellState:
-    """Ensemble drawn from the prior."""
+    """Draw the ensemble from the prior."""
     prior_key, noise_key = jax.random.split(key)
     count = model.num_particles
     prior = model.linear_prior
@@ -222,84 +284,106 @@ def init(model: RaoBlackwell, key: AnyKey) -> RaoBlackwellState:
 
 
 def _predict(model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree) -> RaoBlackwellState:
-    return move(model, key, state, control)[0]
+    return predict_ensemble(model, key, state, control)[0]
 
 
-def move(model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree) -> tuple[RaoBlackwellState, Move]:
-    """Predict one step, and say how."""
+@checks.names_matrices_that_cannot_be_shared
+def predict_ensemble(
+    model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree
+) -> tuple[RaoBlackwellState, Increments]:
+    """Predict one step; returns the ensemble and the increments that moved it."""
     resample_key, noise_key = jax.random.split(key)
     axis = model.covariance_axis
     carried = (state.particles, state.linear_mean, None if axis is None else state.covariance)
     (particles, linear_mean, covariance), log_weights, ancestors = resample(
         resample_key, carried, state.log_weights, model.scheme, model.ess_threshold
     )
-    # Gathered in rows of one particle each; to be turned round once.
+    # The gather writes one particle after another; materialising transposes its result once, not in every use.
     linear_mean = materialized(linear_mean)
     covariance = state.covariance if axis is None else materialized(covariance)
     step_axes = MixedDynamics._make((-1, axis, axis, -1, axis, axis))
     small = max(state.linear_mean.shape[0], *state.noise.shape[:-1]) <= factor.UNROLLED
     mapped = last_axis.vmap if small else jax.vmap
-    steps = mapped(model.dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
+    dynamics = checks.checked_dynamics(model.dynamics, model.noise.shape, state.linear_mean.shape[0])
+    steps = mapped(dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
 
     def advance(step: MixedDynamics, mean: Array, covariance: Array, noise: Array) -> tuple:
         spread, gain, covariance = condition_on_increment(covariance, step)
         delta, log_correction = model.proposal(noise, spread, step.Q_n)
         drift = step.A_n @ mean
         mean = step.f_l + step.A_l @ mean + gain @ delta
-        x = model.retract(step.f_n, drift + delta)
-        return x, mean, covariance, log_correction, Move(step.f_n, drift, delta, spread, gain)
+        x = checks.like("the result of retract", model.retract(step.f_n, drift + delta), step.f_n, "x")
+        return x, mean, covariance, log_correction, Increments(step.f_n, drift, delta, spread, gain)
 
-    particles, linear_mean, covariance, log_correction, moved = mapped(
-        advance, in_axes=(step_axes, -1, axis, -1), out_axes=(-1, -1, axis, -1, Move._make((-1, -1, -1, axis, axis)))
+    increments_axes = Increments._make((-1, -1, -1, axis, axis))
+    particles, linear_mean, covariance, log_correction, increments = mapped(
+        advance, in_axes=(step_axes, -1, axis, -1), out_axes=(-1, -1, axis, -1, increments_axes)
     )(steps, linear_mean, covariance, state.noise)
     noise = model.noise(noise_key, model.num_particles)
     log_weights = log_weights + log_correction
-    return RaoBlackwellState(particles, linear_mean, covariance, log_weights, ancestors, noise), moved
+    return RaoBlackwellState(particles, linear_mean, covariance, log_weights, ancestors, noise), increments
 
 
 def _update(
     model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, observation: PyTree
 ) -> tuple[RaoBlackwellState, ParticleInfo]:
     del key
-    return weigh(model, state, observation)
+    return update_ensemble(model, state, observation)
 
 
-def weigh(model: RaoBlackwell, state: RaoBlackwellState, observation: PyTree) -> tuple[RaoBlackwellState, ParticleInfo]:
-    """Condition every particle's linear state on the observation, and weight it by the evidence of that."""
+@checks.names_matrices_that_cannot_be_shared
+def update_ensemble(
+    model: RaoBlackwell, state: RaoBlackwellState, observation: PyTree, log_ratio: Float[Array, " n"] | None = None
+) -> tuple[RaoBlackwellState, ParticleInfo]:
+    """Condition every particle's linear state on the observation, and multiply its weight by the resulting evidence.
+
+    Args:
+        model: Parameters of the filter.
+        state: Predicted ensemble.
+        observation: The observation.
+        log_ratio: Log importance ratios of a proposal that depends on the observation; tempered with the evidence.
+    """
 
     def condition(mean: Array, covariance: Array, x: PyTree) -> tuple[Array, Array, Array]:
         belief, log_likelihood = model.condition(Gaussian(mean, covariance), x, observation)
         return belief.mean, belief.covariance, log_likelihood
 
     axis = model.covariance_axis
-    # The likelihood of an image is not arithmetic on small arrays.
+    # `last_axis.vmap` pays for small arrays only, not for the likelihood of an image.
     small = sum(map(jnp.size, jax.tree.leaves(observation))) <= factor.UNROLLED**2
     mapped = last_axis.vmap if small else jax.vmap
     linear_mean, covariance, log_likelihood = mapped(condition, in_axes=(-1, axis, -1), out_axes=(-1, axis, -1))(
         state.linear_mean, state.covariance, state.particles
     )
-    log_weights, info = reweight(state.log_weights, log_likelihood, state.ancestors, model.temper)
+    log_factor = log_likelihood if log_ratio is None else log_likelihood + log_ratio
+    log_weights, info = reweight(state.log_weights, log_factor, state.ancestors, model.temper)
     return state._replace(linear_mean=linear_mean, covariance=covariance, log_weights=log_weights), info
 
 
 def _condition_on(log_likelihood: LogLikelihood | None, observe: Callable | None) -> Callable:
+    checks.check_callables(log_likelihood=log_likelihood, observe=observe)
     if log_likelihood is not None and observe is None:
-        return jax.tree_util.Partial(_unseen, as_pytree(log_likelihood))
+        return jax.tree_util.Partial(_by_log_likelihood, as_pytree(log_likelihood))
     if observe is not None and log_likelihood is None:
-        return jax.tree_util.Partial(_seen, as_pytree(observe))
-    raise ValueError("Exactly one of log_likelihood and observe must be given: whether the linear state is seen.")
+        return jax.tree_util.Partial(_by_linear_observation, as_pytree(observe))
+    raise ValueError(
+        "Exactly one of log_likelihood (of the nonlinear state alone) and observe (linear in the linear state) must be "
+        f"given; got {'neither' if observe is None else 'both'}."
+    )
 
 
-def _unseen(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTree) -> tuple[Gaussian, Array]:
-    return belief, log_likelihood(x, y)
+def _by_log_likelihood(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTree) -> tuple[Gaussian, Array]:
+    return belief, checks.scalar_log_density("log_likelihood", log_likelihood(x, y))
 
 
-def _seen(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
-    h, C, R = observe(x)
-    given = batch_last(_given) if max(C.shape) <= factor.UNROLLED else _given
-    return given(belief, y - h, C, R)
+def _by_linear_observation(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
+    linear = observe(x)
+    checks.check_linear_observation(linear, y, belief.mean.shape[0])
+    h, C, R = linear
+    condition = batch_last(_condition) if max(C.shape) <= factor.UNROLLED else _condition
+    return condition(belief, y - h, C, R)
 
 
-def _given(belief: Gaussian, read: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
-    found = arithmetic.joseph.condition(belief.covariance, C, R, read - C @ belief.mean)
+def _condition(belief: Gaussian, y: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
+    found = arithmetic.joseph.condition(belief.covariance, C, R, y - C @ belief.mean)
     return Gaussian(belief.mean + found.shift, found.covariance), found.log_density

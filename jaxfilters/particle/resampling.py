@@ -1,12 +1,19 @@
-"""Ancestors drawn in proportion to their weights: systematic, stratified, multinomial, residual.
+"""Resampling schemes, which draw ancestors in proportion to their weights.
 
-Every scheme takes `(key, log_weights (n,))` and returns n sorted int32 indices in [0, n). Expected counts are n times
-the normalised weights. Log weights need not be normalised; NaN counts as `-inf`, and if nothing has any weight all
-are drawn evenly. A particle without weight is never drawn.
+Every scheme takes `(key, log_weights (n,))` and returns n sorted int32 indices in [0, n). The expected number of copies
+of a particle is n times its normalised weight. Log weights need not be normalised; NaN counts as `-inf`, and if no
+particle has any weight all are equally likely. Otherwise a particle without weight is never drawn. Every scheme raises
+a `ValueError` where `log_weights` is not a vector, and a `TypeError` where it does not hold floating-point numbers. The
+schemes are those of A. Doucet and A. Johansen, "A tutorial on particle filtering and smoothing: fifteen years later",
+2009, section 3.4.
 
-Nothing is searched. The grid is regular, so the number of grid points below a running total is arithmetic on its
-whole number and fraction; a histogram of these numbers, summed, is the list of ancestors (A. Doucet, A. Johansen,
-"A tutorial on particle filtering and smoothing", 2009, section 3.4, for the schemes). The histogram is of integers.
+No binary search is needed. The grid is regular, so that the number of grid points below a cumulative weight follows
+from its integer and fractional part; the cumulative sum of a histogram of these numbers is the list of ancestors.
+
+Example:
+    >>> import jax, jax.numpy as jnp, jaxfilters as jf
+    >>> jf.resampling.systematic(jax.random.key(0), jnp.log(jnp.array([0.0, 0.5, 0.5, 0.0]))).tolist()
+    [1, 1, 2, 2]
 """
 
 import jax
@@ -15,12 +22,13 @@ from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from jaxfilters import weights
 from jaxfilters._xla import prefix
+from jaxfilters.particle import checks
 
 Key = PRNGKeyArray | Array
 
 
 def systematic(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
-    """Ancestors by one uniform number on a grid of n: particle i comes floor(n w_i) or ceil(n w_i) times."""
+    """Draw ancestors by a grid of n points with a common offset: particle i is copied floor or ceil of n w_i times."""
     n = log_weights.size
     whole, fraction = prefix.positions(_relative(log_weights), n)
     offset = jax.random.uniform(key, (), log_weights.dtype)
@@ -28,7 +36,7 @@ def systematic(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
 
 
 def stratified(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
-    """Ancestors by one uniform number in each of n equal parts: counts within 2 of n w_i."""
+    """Draw ancestors by one point in each of n equal intervals: the number of copies is within 2 of n w_i."""
     n = log_weights.size
     whole, fraction = prefix.positions(_relative(log_weights), n)
     offsets = jax.random.uniform(key, (n,), log_weights.dtype)
@@ -36,17 +44,17 @@ def stratified(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
 
 
 def multinomial(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
-    """Ancestors by n independent draws."""
+    """Draw n ancestors independently."""
     n = log_weights.size
     return _ancestors(_draws_below(key, _relative(log_weights), jnp.int32(n)), n)
 
 
 def residual(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
-    """Ancestors by floor(n w_i) certain copies of each particle and independent draws from what remains."""
+    """Copy each particle floor(n w_i) times and draw the other ancestors independently from the remaining weights."""
     n = log_weights.size
     relative = _relative(log_weights)
     expected = relative * (n / jnp.sum(relative))
-    # An expected count that is whole must be met exactly, though it may come out rounded to just below.
+    # An expected number of copies that is an integer may be rounded to just below it.
     copies = jnp.floor(expected * (1 + 4 * jnp.finfo(expected.dtype).eps))
     remainder = jnp.maximum(expected - copies, 0.0)
     remainder = jnp.where(jnp.sum(remainder) > 0, remainder, relative)
@@ -55,24 +63,25 @@ def residual(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
 
 
 def _relative(log_weights: Array) -> Array:
-    """Weights in rows, after the last one zeros."""
+    """Weights relative to the largest one, in rows, padded with zeros."""
+    checks.check_log_weights(log_weights)
     frozen = jax.lax.stop_gradient(log_weights)
     padded = jnp.pad(frozen, (0, -frozen.size % prefix.ROW), constant_values=-jnp.inf)
-    alive = jnp.arange(padded.size) < frozen.size
-    return prefix.in_rows(jnp.where(alive, weights.relative(padded), 0.0))
+    exists = jnp.arange(padded.size) < frozen.size
+    return prefix.in_rows(jnp.where(exists, weights.relative(padded), 0.0))
 
 
 def _ancestors(ends: Int32[Array, "rows 32"], n: int) -> Int32[Array, " n"]:
-    """Ancestor of each slot, when particle i fills the slots from `ends[i - 1]` to `ends[i]`: how many have ended."""
+    """Ancestor of each of n places, of which particle i fills those from `ends[i - 1]` to `ends[i]`."""
     ended = jnp.zeros(ends.size, jnp.int32).at[ends.reshape(-1)].add(1, mode="drop", indices_are_sorted=True)
     return prefix.running_count(prefix.in_rows(ended)).reshape(-1)[:n]
 
 
 def _draws_below(key: Key, weights: Float[Array, "rows 32"], draws: Int32[Array, ""]) -> Int32[Array, "rows 32"]:
-    """How many of `draws` independent points, uniform on the sum of the weights, lie below each running total.
+    """Number of `draws` independent points, uniform on [0, sum of the weights), below each cumulative weight.
 
-    The points come sorted: they are running totals of exponential gaps, one more than there are points
-    (L. Devroye, "Non-uniform random variate generation", 1986, section V.3.1).
+    The points are generated in order, as the cumulative sums of exponential gaps, one more than there are points
+    (L. Devroye, "Non-Uniform Random Variate Generation", 1986, section V.3.1).
     """
     n = weights.size
     total = draws.astype(weights.dtype)
@@ -81,7 +90,7 @@ def _draws_below(key: Key, weights: Float[Array, "rows 32"], draws: Int32[Array,
     point_whole, point_fraction = (axis.reshape(-1) for axis in prefix.positions(gaps, total))
     whole, fraction = prefix.positions(weights, total)
 
-    # Points per unit interval; of the interval in which a running total falls, the few points are counted singly.
+    # The points are counted by unit intervals; those of the interval that holds a cumulative weight, one by one.
     occupied = jnp.zeros(gaps.size, jnp.int32).at[point_whole].add(1, indices_are_sorted=True)
     occupied = prefix.in_rows(occupied)
     before = (prefix.running_count(occupied) - occupied).reshape(-1)

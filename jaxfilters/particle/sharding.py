@@ -1,19 +1,20 @@
-r"""Particles spread over devices: by placement alone, or as islands that seldom exchange.
+r"""Particles distributed over devices: by placement of arrays alone, or as islands that rarely exchange particles.
 
-Two ways, for one machine or for the processes of `jax.distributed`:
+There are two ways, for one machine or for the processes of `jax.distributed`:
 
-- **Placement.** `placement` says where each array of a filter's state belongs. A run that starts from a state that
-  lies there is the same program, divided by XLA: same key, same ancestors, same numbers up to rounding. Every
+- **Placement.** `placement` returns the device layout of each array of a filter's state. A run that starts from a state
+  with this layout is the same program, partitioned by XLA: same key, same ancestors, same numbers up to rounding. Every
   resampling gathers the whole ensemble on every device.
-- **Islands.** `sharded` makes of a filter one whose every device keeps its N / D particles and resamples among them. An
-  island keeps its share of the weight, whatever it resamples, so that all expectations and the evidence stay unbiased
+- **Islands.** `sharded` makes a filter in which each of D devices keeps N / D particles and resamples among them. An
+  island keeps its share of the weight when it resamples, so that all expectations and the evidence stay unbiased
   (C. Vergé, C. Dubarry, P. Del Moral, E. Moulines, "On parallel implementation of sequential Monte Carlo methods: the
   island particle model", 2015; N. Whiteley, A. Lee, K. Heine, "On the role of interaction in sequential Monte Carlo
-  algorithms", 2016, for when to let them interact). A step moves five numbers of each device. Only when the islands'
-  shares have become uneven, by the effective number of islands, every island sends an equal part of its particles to
-  every other. That is a permutation of weighted particles: it changes no estimate, and leaves equal shares.
+  algorithms", 2016, for when to let them interact). A step communicates five numbers of each device. Only when the
+  shares of the islands have become uneven, as measured by the effective number of islands, every island sends an equal
+  part of its particles to every other one. That is a permutation of weighted particles: it changes no estimate, and the
+  islands then have equal shares.
 
-`spread_sequences` is for batches of sequences: `jax.vmap` of a run then filters each where its readings lie.
+`spread_sequences` is for batches of sequences: `jax.vmap` of a run then filters each on the device of its observations.
 """
 
 import math
@@ -30,39 +31,50 @@ from jaxtyping import Array, Int32, PyTree, Shaped
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.particle.bootstrap import ParticleInfo, resample, untempered
+from jaxfilters.particle import checks
+from jaxfilters.particle.tempering import no_tempering
+from jaxfilters.particle.weighting import ParticleInfo, resample
 from jaxfilters.typing import AnyKey
 
 AXIS = "particles"
-"""What the axis of the mesh is called unless the caller says otherwise."""
+"""Default name of the axis of the mesh."""
 
 
 @pytree_dataclass
 class Sharded:
-    """Parameters of a filter whose particles are spread over the devices of a mesh."""
+    """Parameters of a filter whose particles are distributed over the devices of a mesh."""
 
     island: Filter
-    """What runs on each device, with N / D particles."""
+    """The filter that runs on each of D devices, with N / D particles."""
     island_threshold: float
     mesh: Mesh = field(metadata={"static": True})
     axis: str = field(metadata={"static": True})
     specs: tuple[P, ...] = field(metadata={"static": True})
-    """How each leaf of the state is divided."""
+    """How each leaf of the state is partitioned."""
 
 
 def placement(filter: Filter, mesh: Mesh, *, axis: str = AXIS) -> PyTree[NamedSharding]:
-    """Where the state of a particle filter belongs, as a tree like the state.
+    """Return the device layout of the state of a particle filter, as a pytree like the state.
 
-    `run(filter, key, observations, state=jax.device_put(state, placement(filter, mesh)))` gives the numbers of one
-    device, up to rounding, and leaves them spread.
+    `run(filter, key, observations, state=jax.device_put(state, placement(filter, mesh)))` computes the same numbers as
+    one device, up to rounding, and returns a state with this layout.
 
     Args:
         filter: Made by `bootstrap`, `rao_blackwell` or `rao_blackwell_shared`.
         mesh: The devices.
-        axis: The axis of `mesh` along which the particles lie; along others they are repeated.
+        axis: The axis of `mesh` along which the particles are distributed; along other axes they are replicated.
 
     Raises:
-        ValueError: If the mesh has no such axis, or its length does not divide the number of particles.
+        TypeError: If `filter` is not a `Filter` or `mesh` is not a `jax.sharding.Mesh`.
+        ValueError: If the filter is of another kind, the mesh has no such axis, or the length of that axis does not
+            divide the number of particles.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, move = lambda key: jnp.zeros(1), lambda key, x, control: x + jax.random.normal(key, (1,))
+        >>> pf = jf.bootstrap(prior, move, lambda x, y: -jnp.sum((x - y) ** 2), num_particles=100)
+        >>> mesh = jax.sharding.Mesh(jax.devices(), ("particles",))
+        >>> state = jax.device_put(jf.init(pf, jax.random.key(0)), jf.sharding.placement(pf, mesh))
     """
     _share(filter, mesh, axis)
     structure, specs = _specs(filter, axis)
@@ -70,54 +82,67 @@ def placement(filter: Filter, mesh: Mesh, *, axis: str = AXIS) -> PyTree[NamedSh
 
 
 def sharded(filter: Filter, mesh: Mesh, *, axis: str = AXIS, island_threshold: float = 0.5) -> Filter:
-    """A particle filter whose particles live on the devices of a mesh, as islands; used like any other.
+    """Distribute the particles of a filter over the devices of a mesh, as islands.
 
-    Its state is that of `filter`, its leaves with an ensemble axis spread along that axis. An island resamples by the
-    scheme and the `ess_threshold` of `filter`, counted among its own particles.
+    The result is used like any other filter. Its state is that of `filter`, with the ensemble axis of each leaf
+    distributed. An island resamples by the scheme and the `ess_threshold` of `filter`, applied to its own particles.
 
     Args:
-        filter: Made by `bootstrap`, `rao_blackwell` or `rao_blackwell_shared`, without tempering: particles of
-            different islands would be flattened differently.
+        filter: Made by `bootstrap`, `rao_blackwell` or `rao_blackwell_shared`, without tempering, which would
+            choose another power on every island.
         mesh: The devices, of one process or of several.
-        axis: The axis of `mesh` along which the particles lie; along others they are repeated.
-        island_threshold: Exchange before a prediction if the effective number of islands, `1 / sum(share**2)`, is below
-            this share of D. 1 or more exchanges always, 0 never.
+        axis: The axis of `mesh` along which the particles are distributed; along other axes they are replicated.
+        island_threshold: Exchange particles before a prediction if the effective number of islands,
+            `1 / sum(share**2)`, is below this fraction of D; 1 or more exchanges always, 0 never.
 
     Raises:
+        TypeError: If `filter` is not a `Filter` or `mesh` is not a `jax.sharding.Mesh`.
         ValueError: If the mesh has no such axis, its length does not divide the number of particles, the filter is
             tempered or no particle filter, or `island_threshold < 0`.
     """
-    if not island_threshold >= 0:
-        raise ValueError(f"island_threshold must be a share of the devices, at least 0; got {island_threshold!r}.")
+    condition = "a fraction of the number of devices, at least 0"
+    checks.check_scalar("island_threshold", island_threshold, condition, lambda value: value >= 0)
     share = _share(filter, mesh, axis)
     temper = filter.params.temper
-    if getattr(temper, "func", temper) is not untempered:
-        raise ValueError("filter must not be tempered: each island would flatten likelihoods by a power of its own.")
+    if getattr(temper, "func", temper) is not no_tempering:
+        raise ValueError("filter must not be tempered: each island would raise likelihoods to a power of its own.")
     island = _with_particles(filter, share)
     _, specs = _specs(filter, axis)
     return Filter(Sharded(island, float(island_threshold), _automatic(mesh), axis, specs), _init, _predict, _update)
 
 
 def spread_sequences(sequences: PyTree, mesh: Mesh, *, axis: str) -> PyTree:
-    """Sequences along the first axis of every leaf, an equal part of them on every device.
+    """Place an equal part of a batch of sequences on every device.
 
-    `jax.jit(jax.vmap(loglikelihood, (None, None, 0)))(filter, key, spread)` then runs without communication.
+    `jax.jit(jax.vmap(log_evidence, (None, None, 0)))(filter, key, spread)` then runs without communication.
+
+    Args:
+        sequences: Pytree whose leaves have the sequences along their first axis.
+        mesh: The devices.
+        axis: The axis of `mesh` along which the sequences are distributed.
+
+    Returns:
+        The same arrays, on the devices of the mesh.
 
     Raises:
+        TypeError: If `mesh` is not a `jax.sharding.Mesh`.
         ValueError: If the mesh has no such axis, or its length does not divide the number of sequences.
     """
     num_devices = _length(mesh, axis)
     for path, leaf in jax.tree_util.tree_leaves_with_path(sequences):
-        if leaf.shape[0] % num_devices:
+        length = jnp.shape(leaf)[:1]
+        if length == () or length[0] % num_devices:
             raise ValueError(
-                f"sequences{jax.tree_util.keystr(path)} must be a multiple of the {num_devices} devices along "
-                f"{axis!r}; got {leaf.shape[0]}."
+                f"sequences{jax.tree_util.keystr(path)} must have a first axis that is a multiple of the {num_devices} "
+                f"devices along {axis!r}; got the shape {jnp.shape(leaf)}."
             )
     return jax.device_put(sequences, NamedSharding(_automatic(mesh), P(axis)))
 
 
 def _share(filter: Filter, mesh: Mesh, axis: str) -> int:
-    """Particles of each device."""
+    """Number of particles of each device."""
+    if not isinstance(filter, Filter):
+        raise TypeError(f"filter must be a Filter; got {filter!r}.")
     names = {one.name for one in fields(filter.params)} if is_dataclass(filter.params) else set()
     if not {"num_particles", "scheme", "temper"} <= names:
         raise ValueError(
@@ -131,13 +156,15 @@ def _share(filter: Filter, mesh: Mesh, axis: str) -> int:
 
 
 def _length(mesh: Mesh, axis: str) -> int:
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh must be a jax.sharding.Mesh; got {mesh!r}.")
     if axis not in mesh.shape:
-        raise ValueError(f"axis must be one of the mesh's, {', '.join(mesh.axis_names)}; got {axis!r}.")
+        raise ValueError(f"axis must be one of those of the mesh, {', '.join(mesh.axis_names)}; got {axis!r}.")
     return mesh.shape[axis]
 
 
 def _automatic(mesh: Mesh) -> Mesh:
-    """The mesh with XLA to choose how what is computed lies: nothing of a filter's says it step by step."""
+    """The same devices, with the layout of intermediate results left to XLA."""
     return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
 
 
@@ -146,7 +173,7 @@ def _with_particles(filter: Filter, num_particles: int) -> Filter:
 
 
 def _specs(filter: Filter, axis: str) -> tuple[Any, tuple[P, ...]]:
-    """Structure of the state, and the partition of each leaf: one that grows with the ensemble has it as last axis."""
+    """Structure of the state, and the partition of each leaf: those that grow with the ensemble have its axis last."""
     leaves, structure = jax.tree.flatten(_state_shapes(filter))
     twice = _state_shapes(_with_particles(filter, 2 * filter.params.num_particles))
 
@@ -208,9 +235,9 @@ def _predict(model: Sharded, key: AnyKey, state: PyTree, control: PyTree) -> PyT
 def _exchange(
     model: Sharded, island: Filter, key: AnyKey, state: PyTree, origin: Int32[Array, " n"]
 ) -> tuple[PyTree, Int32[Array, " n"]]:
-    """Every island resamples, then sends an equal part of its particles to every island."""
+    """Resample on every island, then send an equal part of its particles to every island."""
     specs = jax.tree.unflatten(jax.tree.structure(state), model.specs)
-    # What will move the particles is independent of them, and stays.
+    # The noise of the next prediction is independent of the particles and need not be exchanged.
     which = jax.tree.leaves(specs._replace(log_weights=None, ancestors=None, noise=None))
     leaves, structure = jax.tree.flatten(state._replace(log_weights=None, ancestors=None, noise=None))
     moving = [i for i, spec in enumerate(which) if spec != P()]
@@ -226,7 +253,7 @@ def _exchange(
 
 
 def _mix(leaf: Shaped[Array, "... n"], *, axis: str, num_devices: int) -> Shaped[Array, "... n"]:
-    """Particles 0, D, 2 D, ... of every island go to the first, 1, D + 1, ... to the second; what is over stays."""
+    """Send particles 0, D, 2 D, ... of every island to the first, 1, D + 1, ... to the second; the remainder stays."""
     *shape, count = leaf.shape
     part = count // num_devices
     if part == 0:
@@ -239,7 +266,7 @@ def _mix(leaf: Shaped[Array, "... n"], *, axis: str, num_devices: int) -> Shaped
 def _update(model: Sharded, key: AnyKey, state: PyTree, observation: PyTree) -> tuple[PyTree, ParticleInfo]:
     def update(key: AnyKey, island: Filter, state: PyTree, observation: PyTree) -> tuple[PyTree, ParticleInfo]:
         ancestors = state.ancestors
-        # To the island an ancestor of its own is one of its first N / D.
+        # The filter of an island numbers its own particles from 0.
         state = state._replace(ancestors=ancestors - _first(ancestors.shape[0], model.axis))
         state, info = island.update(island.params, _own(key, model.axis), state, observation)
         infos = jax.lax.all_gather(jnp.stack([jnp.asarray(one, info.log_evidence.dtype) for one in info]), model.axis)
@@ -262,10 +289,10 @@ def _update(model: Sharded, key: AnyKey, state: PyTree, observation: PyTree) -> 
 
 
 def _own(key: AnyKey, axis: str) -> AnyKey:
-    """A key of this device alone."""
+    """A random key for this device."""
     return jax.random.fold_in(key, jax.lax.axis_index(axis))
 
 
 def _first(share: int, axis: str) -> Int32[Array, ""]:
-    """Index of this device's first particle among all."""
+    """Index of this device's first particle in the whole ensemble."""
     return jnp.asarray(jax.lax.axis_index(axis) * share, jnp.int32)

@@ -1,10 +1,8 @@
-r"""States given the whole sequence, from a particle filter: lineages, and backward simulation.
+r"""Smoothing by a particle filter: ancestral trajectories, and backward sampling.
 
-    _, history = run(pf, key, observations, collect=keep_history)
-    paths = backward_simulate(key, history, log_transition, num_paths=100)
-
-The lineages cost nothing, but early on all of them go through a few particles, or one. Backward simulation draws
-whole paths that need not be lineages, for which it must know the density of the transition.
+Both start from the ensembles of a whole run, `run(..., collect=keep_history)`. The ancestral trajectories of the last
+particles cost next to nothing, but in early frames they coincide in a few particles. Backward sampling draws
+trajectories that need not be ancestral, for which it evaluates the density of the transition.
 """
 
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -14,38 +12,66 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
+from jaxfilters.particle import checks
 from jaxfilters.typing import AnyKey
 
 
 class History(NamedTuple):
-    """Ensembles of a particle filter, time first, the particles last."""
+    """Ensembles of a particle filter, with time as the first axis and the particles along the last one."""
 
     particles: PyTree
     """Leaves `(t, ..., n)`."""
     log_weights: Float[Array, "t n"]
     ancestors: Int32[Array, "t n"]
-    """Index of each particle's parent, one frame earlier."""
+    """Index of each particle's parent in the frame before."""
 
 
 @runtime_checkable
 class LogTransition(Protocol):
-    r"""Evaluate $\log p(x_t \mid x_{t-1}, u_t)$, but for a constant; `-inf` means impossible."""
+    r"""Evaluate $\log p(x_t \mid x_{t-1}, u_t)$ up to a constant; `-inf` means impossible."""
 
     def __call__(self, x_next: PyTree, x: PyTree, control: PyTree, /) -> Float[Array, ""]: ...
 
 
 def keep_history(state: PyTree, info: PyTree) -> History:
-    """Collect what smoothing needs of every step: `run(..., collect=keep_history)`."""
+    """Collect the ensemble of every step; for `run(..., collect=keep_history)`."""
     del info
     return History(state.particles, state.log_weights, state.ancestors)
 
 
-@jax.jit
 def trajectories(history: History) -> PyTree:
-    """Path of every particle of the last frame, leaves `(t, ..., n)`: with its weights, a smoothed ensemble.
+    """Return the ancestral trajectory of every particle of the last frame.
 
-    G. Kitagawa, "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models", 1996, section 4.
+    With the weights of the last frame the trajectories are a smoothed ensemble (G. Kitagawa, "Monte Carlo filter and
+    smoother for non-Gaussian nonlinear state space models", Journal of Computational and Graphical Statistics 5, 1996,
+    section 4).
+
+    Args:
+        history: Ensembles that `run` collected with `keep_history`.
+
+    Returns:
+        Particles along the trajectories, leaves `(t, ..., n)`.
+
+    Raises:
+        TypeError: If `history` is not a `History`.
+        ValueError: If its leaves do not agree in the numbers of frames and particles.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> pf = jf.bootstrap(
+        ...     lambda key: jnp.zeros(1), lambda e, x, u: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     num_particles=100, noise=jf.StandardNormal(1),
+        ... )
+        >>> _, history = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.smoothing.keep_history)
+        >>> jf.smoothing.trajectories(history).shape
+        (5, 1, 100)
     """
+    checks.check_history(history)
+    return _trajectories(history)
+
+
+@jax.jit
+def _trajectories(history: History) -> PyTree:
     indices = jnp.arange(history.ancestors.shape[1], dtype=jnp.int32)
 
     def parents(indices: Array, ancestors: Array) -> tuple[Array, Array]:
@@ -58,28 +84,37 @@ def trajectories(history: History) -> PyTree:
 def backward_sampling(
     key: AnyKey, history: History, log_transition: LogTransition, controls: PyTree = None, *, num_paths: int
 ) -> PyTree:
-    """Paths drawn from the smoothed ensemble, equally weighted, leaves `(t, ..., num_paths)`.
+    """Draw equally weighted trajectories from the smoothing distribution.
 
-    From the last frame back, a particle is drawn by its weight times the density of the transition to the next one of
-    the path (S. Godsill, A. Doucet, M. West, "Monte Carlo smoothing for nonlinear time series", 2004, algorithm 1).
-    Every frame costs n densities for every path.
+    From the last frame to the first, a particle is drawn with probability proportional to its weight times the density
+    of the transition to the next state of the trajectory (S. Godsill, A. Doucet and M. West, "Monte Carlo smoothing for
+    nonlinear time series", Journal of the American Statistical Association 99, 2004, algorithm 1). Every frame costs n
+    densities for every trajectory.
 
     Args:
         key: Random key.
-        history: What `run` collected with `keep_history`.
-        log_transition: `(x_next, x, control) -> log p(x_next | x)`. Compared by identity.
-        controls: As `run` had them, time first.
-        num_paths: How many paths.
+        history: Ensembles that `run` collected with `keep_history`.
+        log_transition: `(x_next, x, control) -> log p(x_next | x)`, a scalar. Compared by identity.
+        controls: The controls of `run`, with time as the first axis.
+        num_paths: Number of trajectories.
+
+    Returns:
+        States along the trajectories, leaves `(t, ..., num_paths)`.
 
     Raises:
-        ValueError: If `num_paths < 1`, or `controls` has another length than `history`.
+        TypeError: If `history` is not a `History` or `log_transition` is not callable.
+        ValueError: If `num_paths < 1`, `controls` has another length than `history`, or `log_transition` does not
+            return a scalar.
     """
-    length = history.log_weights.shape[0]
-    lengths = {leaf.shape[0] for leaf in jax.tree.leaves(controls)}
-    if num_paths < 1:
-        raise ValueError(f"num_paths must be at least 1; got {num_paths}.")
-    if not lengths <= {length}:
-        raise ValueError(f"controls must be as long as history, {length}; got {sorted(lengths)}.")
+    checks.check_history(history)
+    checks.check_callables(log_transition=log_transition)
+    checks.check_num_particles(num_paths, name="num_paths")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(controls):
+        if jnp.shape(leaf)[:1] != history.log_weights.shape[:1]:
+            raise ValueError(
+                f"controls{jax.tree_util.keystr(path)} must have as many frames as history, "
+                f"{history.log_weights.shape[0]}; got the shape {jnp.shape(leaf)}."
+            )
     return _simulate(key, history, jax.tree_util.Partial(log_transition), controls, jnp.zeros(num_paths))
 
 
@@ -90,15 +125,17 @@ def _simulate(
     length = history.log_weights.shape[0]
     points = jax.random.uniform(key, (length, paths.size), history.log_weights.dtype)
     last = jax.tree.map(lambda leaf: leaf[-1], history)
-    chosen = jax.vmap(_drawn, in_axes=(None, 0))(last.log_weights, points[-1])
+    chosen = jax.vmap(_draw_index, in_axes=(None, 0))(last.log_weights, points[-1])
     end = _of(last.particles, chosen)
 
     def step(following: PyTree, inputs: tuple) -> tuple[PyTree, Array]:
         particles, log_weights, control, points = inputs
 
         def one(x_next: PyTree, point: Array) -> Array:
-            moves = jax.vmap(lambda x: log_transition(x_next, x, control), in_axes=-1)(particles)
-            return _drawn(log_weights + moves, point)
+            def log_density(x: PyTree) -> Array:
+                return checks.scalar_log_density("log_transition", log_transition(x_next, x, control))
+
+            return _draw_index(log_weights + jax.vmap(log_density, in_axes=-1)(particles), point)
 
         chosen = jax.vmap(one, in_axes=(-1, 0))(following, points)
         return _of(particles, chosen), chosen
@@ -109,11 +146,11 @@ def _simulate(
     return _along(history.particles, jnp.concatenate([before, chosen[None]]))
 
 
-def _drawn(log_weights: Array, point: Array) -> Array:
-    """The index where the running total of the weights passes a share of the whole."""
+def _draw_index(log_weights: Array, point: Array) -> Array:
+    """The index at which the cumulative sum of the weights exceeds the fraction `point` of the total."""
     totals = jnp.cumsum(weights.relative(log_weights))
     index = jnp.sum(totals <= point * totals[-1], dtype=jnp.int32)
-    # Rounding may let the point be the total: the last particle with any weight is meant.
+    # Rounding may make the point equal to the total, which belongs to the last particle with any weight.
     return jnp.minimum(index, jnp.argmax(totals == totals[-1]).astype(jnp.int32))
 
 

@@ -16,7 +16,7 @@ from jaxfilters.models.face.pose import rotation
 from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.shape_model import FaceModel, rigid
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
-from jaxfilters.particle.bootstrap import ParticleInfo
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.estimate import Estimate, around_mode
 from jaxfilters.trackers.head.recent import nothing_changed

@@ -16,7 +16,7 @@ from jaxfilters.models.face.rig import CameraRig, jacobian
 from jaxfilters.models.face.rigid import remove_motion
 from jaxfilters.models.face.shape_model import FaceModel, shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
-from jaxfilters.particle.bootstrap import ParticleInfo
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head import learning
 from jaxfilters.trackers.head.estimate import Estimate, around_mode, refined
 from jaxfilters.trackers.head.recent import latest_templates

@@ -15,7 +15,7 @@ from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
-from jaxfilters.particle.bootstrap import ParticleInfo
+from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.near_mode import spread
 from jaxfilters.trackers.head.recent import latest_templates
 from jaxfilters.trackers.head.search import KAPPA, Searches, at, gathered, score_at

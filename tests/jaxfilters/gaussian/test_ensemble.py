@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.filter import init, run, update
+from jaxfilters.filter import init, log_evidence, run, update
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.ensemble import ensemble_kalman
+from jaxfilters.gaussian.ensemble import _in_cheaper_order, ensemble_kalman
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.noise import StandardNormal
 from jaxfilters.priors import gaussian_prior
 
+KEY = jax.random.key(5)
 RNG = np.random.default_rng(0)
 F = 0.9 * np.linalg.qr(RNG.normal(size=(3, 3)))[0]
 H = RNG.normal(size=(2, 3))
@@ -35,7 +36,7 @@ def transition(x, control):
 
 
 def make(num_particles, **options):
-    prior, noise = gaussian_prior(PRIOR), StandardNormal(3)
+    prior, noise = gaussian_prior(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), PRIOR)), StandardNormal(3)
     return ensemble_kalman(prior, move, observe, R, num_particles=num_particles, noise=noise, **options)
 
 
@@ -87,6 +88,34 @@ def test_a_state_far_larger_than_the_ensemble_follows_its_few_readings_and_has_a
     (_, state), slope = jax.value_and_grad(evidence, has_aux=True)(1.0)
     np.testing.assert_allclose(jnp.mean(state.particles, axis=1), 2 * shape, atol=0.1)
     assert np.isfinite(slope)
+
+
+def test_memory_grows_as_the_ensemble_not_as_its_square():
+    """The arrays of the compiled update have 3 or 2 rows, so 1 kB a particle is plenty; N x N would be 160 kB."""
+    count = 40_000
+    shapes = jax.eval_shape(make(count).init, make(count).params, KEY)
+    compiled = update.lower(make(count), KEY, shapes, jnp.zeros(2)).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes < 1000 * count
+
+
+@pytest.mark.parametrize(("n", "m", "count"), [(30, 20, 10), (3, 2, 50)])
+def test_both_orders_of_the_product_are_the_same(x64, n, m, count):
+    a, b, c = (np.random.default_rng(6).normal(size=(rows, count)) for rows in (n, m, m))
+    np.testing.assert_allclose(_in_cheaper_order(*map(jnp.asarray, (a, b, c))), a @ b.T @ c, rtol=1e-10, atol=1e-10)
+
+
+def test_the_gradient_in_inflation_is_that_of_finite_differences(x64):
+    """Central differences of step h = 1e-5 in float64 err by h^2 and by 1e-16 / h: 1e-6 of the slope is safe."""
+    ys, controls = jnp.asarray(YS), jnp.linspace(-1.0, 1.0, 6)
+
+    @jax.jit
+    def evidence(inflation):
+        return log_evidence(make(40, inflation=inflation), KEY, ys, controls)
+
+    slope = jax.grad(evidence)(1.1)
+    difference = (evidence(1.1 + 1e-5) - evidence(1.1 - 1e-5)) / 2e-5
+    assert abs(slope) > 0.1
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

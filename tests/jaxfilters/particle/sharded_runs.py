@@ -18,9 +18,10 @@ from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.noise import StandardNormal
-from jaxfilters.particle.bootstrap import AdaptiveTempering, bootstrap
+from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell_shared
 from jaxfilters.particle.sharding import placement, sharded, spread_sequences
+from jaxfilters.particle.tempering import AdaptiveTempering
 
 DT, Q_N, Q_L = 0.1, 0.3, 4.0
 NUM_RUNS = 800

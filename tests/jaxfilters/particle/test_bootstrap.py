@@ -11,7 +11,9 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import keep_info, log_evidence, run
 from jaxfilters.noise import StandardNormal
 from jaxfilters.particle import resampling
-from jaxfilters.particle.bootstrap import AdaptiveTempering, bootstrap, reweight, untempered
+from jaxfilters.particle.bootstrap import bootstrap
+from jaxfilters.particle.tempering import AdaptiveTempering, no_tempering
+from jaxfilters.particle.weighting import reweight
 
 RATE, PROCESS_STD, PRIOR_STD = 0.9, 0.5, 1.0
 
@@ -107,7 +109,7 @@ def test_score_matches_the_exact_one():
 def test_nan_and_infinite_likelihoods_are_dropped_and_counted():
     log_weights = weights.uniform(5)
     log_likelihood = jnp.array([0.0, jnp.nan, jnp.inf, -jnp.inf, 0.0])
-    normalized, info = reweight(log_weights, log_likelihood, jnp.arange(5, dtype=jnp.int32), untempered)
+    normalized, info = reweight(log_weights, log_likelihood, jnp.arange(5, dtype=jnp.int32), no_tempering)
     np.testing.assert_allclose(np.exp(normalized), [0.5, 0, 0, 0, 0.5], atol=1e-7)
     assert info.num_invalid == 2
     assert not info.resampled

@@ -9,8 +9,9 @@ from jax.scipy.stats import norm
 from jaxfilters import weights
 from jaxfilters.filter import keep_info, log_evidence, run
 from jaxfilters.noise import StandardNormal
-from jaxfilters.particle.bootstrap import bootstrap, resample
+from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.differentiable_resampling import soft, transport, transport_plan
+from jaxfilters.particle.weighting import resample
 
 KEY = jax.random.key(5)
 RNG = np.random.default_rng(7)

@@ -17,7 +17,7 @@ from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.differentiable_resampling import transport
 from jaxfilters.particle.fixed_lag import fixed_lag, fixed_lag_rts
 from jaxfilters.particle.guided import Guidance, guided
-from jaxfilters.particle.partitioned import Partitions, consecutive, over_ensemble
+from jaxfilters.particle.partitioned import Partitions, batch_log_likelihood, consecutive
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell_shared
 from jaxfilters.particle.smoothing import keep_history, trajectories
 from jaxfilters.priors import gaussian_prior
@@ -110,7 +110,7 @@ def any_window_and_history(state, info):
 def layered():
     prior, flat = (
         gaussian_prior(Gaussian(jnp.zeros(2), jnp.eye(2))),
-        over_ensemble(lambda x, y: norm.logpdf(y[0], x[0])),
+        batch_log_likelihood(lambda x, y: norm.logpdf(y[0], x[0])),
     )
     return adaptive_diffusion(
         prior,

@@ -1,0 +1,119 @@
+"""Weights of particles: Bayes' rule on them, and resampling where they have become uneven.
+
+The ensemble axis is the last axis of every leaf. Resampling belongs to the start of a prediction, so that the state
+after an update holds the weighted posterior: estimates taken before resampling have less variance.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32, PyTree
+
+from jaxfilters import weights
+from jaxfilters.particle import checks
+from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Resampled
+from jaxfilters.typing import AnyKey, ResamplingScheme, Temper
+
+
+class ParticleInfo(NamedTuple):
+    """Diagnostics of one update of a particle filter."""
+
+    log_evidence: Float[Array, ""]
+    """log p(y_t | y_1:t-1); `-inf` if no particle explains the observation."""
+    effective_sample_size: Float[Array, ""]
+    """Of the weights after the update, between 1 and N."""
+    resampled: Bool[Array, ""]
+    """Whether the prediction before this update began by resampling."""
+    num_invalid: Int32[Array, ""]
+    """Number of particles whose log-likelihood was NaN or `+inf`; they were given weight zero."""
+
+
+def resample(
+    key: AnyKey,
+    particles: PyTree,
+    log_weights: Float[Array, " n"],
+    scheme: ResamplingScheme | EnsembleScheme,
+    ess_threshold: float | Float[Array, ""],
+) -> tuple[PyTree, Float[Array, " n"], Int32[Array, " n"]]:
+    """Resample where the effective sample size is below `ess_threshold * n`; the total weight stays the same.
+
+    The new weights keep the derivative of the old ones, though not their values, which makes the gradient of the log
+    evidence a consistent estimate of the score (A. Scibior and F. Wood, "Differentiable particle filtering without
+    modifying the forward pass", 2021).
+
+    Args:
+        key: Random key.
+        particles: Leaves `(..., n)`.
+        log_weights: Log weights `(n,)`, not necessarily normalised.
+        scheme: Resampling scheme.
+        ess_threshold: Threshold as a fraction of n; 1 or more resamples always, 0 never.
+
+    Returns:
+        Particles, log weights, and the index `(n,)` of the ancestor of each particle.
+
+    Raises:
+        ValueError: If the scheme returns something other than n integers.
+    """
+    num_particles = log_weights.shape[0]
+    normalized, log_sum = weights.normalize(log_weights)
+    identity = jnp.arange(num_particles, dtype=jnp.int32)
+    uneven = weights.effective_sample_size(normalized) < ess_threshold * num_particles
+    uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
+    if isinstance(scheme, EnsembleScheme):
+        unchanged = Resampled(particles, normalized, identity)
+        result = jax.lax.cond(uneven, lambda: scheme.resample(key, particles, normalized), lambda: unchanged)
+        return result.particles, log_sum + result.log_weights, result.ancestors
+
+    def draw() -> Int32[Array, " n"]:
+        ancestors = scheme(key, jax.lax.stop_gradient(normalized))
+        checks.check_ancestors(ancestors, num_particles)
+        return jnp.asarray(ancestors, jnp.int32)
+
+    ancestors = jax.lax.cond(uneven, draw, lambda: identity)
+    chosen = normalized[ancestors]
+    chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
+    equal = weights.uniform(num_particles, log_weights.dtype) + (chosen - jax.lax.stop_gradient(chosen))
+    return (
+        jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), particles),
+        log_sum + jnp.where(uneven, equal, normalized),
+        ancestors,
+    )
+
+
+def reweight(
+    log_weights: Float[Array, " n"],
+    log_factor: Float[Array, " n"],
+    ancestors: Int32[Array, " n"],
+    temper: Temper,
+) -> tuple[Float[Array, " n"], ParticleInfo]:
+    """Multiply the weights by the factors of an update, which are tempered first.
+
+    A factor whose logarithm is NaN or `+inf` counts as zero and is reported. If no factor is left, the weights become
+    equal and the log evidence is `-inf`.
+
+    Args:
+        log_weights: Log weights `(n,)` before the update.
+        log_factor: Log-likelihoods `(n,)`, plus the log importance ratios of the proposal where it depends on the
+            observation.
+        ancestors: Ancestor of each particle in the last prediction, for the diagnostics.
+        temper: `(log_factor, log_weights) -> log_factor`.
+
+    Returns:
+        Normalised log weights `(n,)`, and the diagnostics of the update.
+
+    Raises:
+        ValueError: If `temper` returns another shape than `(n,)`.
+    """
+    invalid = jnp.isnan(log_factor) | jnp.isposinf(log_factor)
+    usable = jnp.where(invalid, -jnp.inf, log_factor)
+    tempered = temper(usable, log_weights)
+    checks.check_shape("the result of temper", tempered, log_weights.shape, "that of its arguments")
+    normalized, log_evidence = weights.normalize(log_weights + tempered)
+    info = ParticleInfo(
+        log_evidence=log_evidence,
+        effective_sample_size=weights.effective_sample_size(normalized),
+        resampled=jnp.any(ancestors != jnp.arange(ancestors.shape[0], dtype=ancestors.dtype)),
+        num_invalid=jnp.sum(invalid, dtype=jnp.int32),
+    )
+    return normalized, info
