@@ -99,7 +99,7 @@ def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequen
     assert joint_errors_mm(track, np.concatenate([sequence[1][:2], sequence[1]])[:CHUNK])[2:].mean() < 15
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("options", [{"filter": "pf"}, {"guide": False}])
 def test_the_other_filters_follow_too(sequence, options):
     tracker = hand_depth.build(kinect_v2(), HandDepthConfig(num_particles=256, **options))
@@ -125,7 +125,7 @@ def test_settings_that_cannot_be_are_named(options, named):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_real_hand_is_followed(data_dir):
     # A loose fist that opens within half a second; its truth is itself a model fit, 6 mm off the depth in the median.
     recording = open_depth(data_dir / "hpx_hand_rgbd" / "hpx.npz")

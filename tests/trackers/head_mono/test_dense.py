@@ -56,7 +56,7 @@ def begun(face68, rig, points, misplaced_mm=0.0):
     return first, start_densely(face68, rig, first, dense_of(points, misplaced_mm), PRIOR)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_faces_are_as_large_as_they_are_on_average(face68, rig):
     """People drawn from the model: the size is claimed as well as it is known, and it is not always too small."""
     deviations = []
