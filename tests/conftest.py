@@ -1,9 +1,27 @@
+"""Settings of every test run, the border between quick and system tests, and fixtures for all of them."""
+
 import gc
 import os
+import resource
+import sys
+import time
 from pathlib import Path
 
-import jax
 import pytest
+
+# JAX reads these variables when it is imported, and worker processes inherit them from the process that starts them.
+# Most of the time of a test is compilation. XLA's newer emitters take twice as long for the same programs, and pieces
+# of a program compiled in parallel take a fifth longer where no core is idle. Threads of OpenBLAS spin while they wait,
+# on the core of the other worker.
+assert "jax" not in sys.modules, "JAX was imported before tests/conftest.py could set how its programs are compiled."
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+
+PROCESSOR_SECONDS = pytest.StashKey[float]()
+"""Processor time of the set-up and the call of a test."""
 
 MANY_MAPPINGS = 40_000
 """Linux ends a process that maps 65530 regions (`vm.max_map_count`); every compiled program holds several, and no file
@@ -16,6 +34,54 @@ gc.set_threshold(100_000, 20, 100)
 
 QUICK = "jax_disable_most_optimizations"
 """JAX's own option; where its variable in the environment is set, that decides for all tests."""
+
+
+def pytest_addoption(parser):
+    help = "fail a test that is not marked `system` and takes more than this many seconds of processor time"
+    parser.addoption("--processor-limit", type=float, metavar="SECONDS", help=help)
+
+
+def processor_s():
+    """Processor time of this process, all its threads, and the processes that it started and waited for, in seconds."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport(item, call):
+    """Holds the border of `system`: processor time, because wall time depends on what else the machine does.
+
+    A fixture that several tests share counts for the first of them.
+    """
+    report = yield
+    now = processor_s()
+    if call.when == "call":
+        taken, limit = now - item.stash[PROCESSOR_SECONDS], item.config.getoption("processor_limit")
+        report.user_properties.append(("processor_s", round(taken, 3)))
+        if limit is not None and taken > limit and report.passed and item.get_closest_marker("system") is None:
+            report.outcome = "failed"
+            report.longrepr = (
+                f"{item.nodeid} took {taken:.1f} s of processor time: mark it `system`, or make it smaller."
+            )
+    return report
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Lists the tests that took most of the processor, where `--durations` asks for the slowest."""
+    count = terminalreporter.config.getoption("durations")
+    if not count:
+        return
+    reports = [report for group in ("passed", "failed") for report in terminalreporter.stats.get(group, [])]
+    taken = {report.nodeid: dict(report.user_properties).get("processor_s", 0.0) for report in reports}
+    terminalreporter.section(f"processor time, {sum(taken.values()):.0f} s in all")
+    for name in sorted(taken, key=taken.get, reverse=True)[:count]:
+        terminalreporter.write_line(f"{taken[name]:8.2f} s {name}")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item):
+    item.stash[PROCESSOR_SECONDS] = processor_s()
+    return (yield)
 
 
 @pytest.hookimpl(tryfirst=True)

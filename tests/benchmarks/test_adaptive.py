@@ -39,7 +39,7 @@ def test_metrics_are_root_mean_squares_in_units_of_the_noise():
         assert face[f"error_{group}_b"].value == pytest.approx(np.sqrt((20 + 19 * 9 + 36) / 40))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_adaptive_filters_beat_fixed_ones_and_two_stages_one(tmp_path, monkeypatch):
     monkeypatch.setattr(adaptive, "NUM_FRAMES", 120)
     metrics = adaptive.run(quick=True, seed=0, out=tmp_path)

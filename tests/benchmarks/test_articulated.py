@@ -18,7 +18,7 @@ def test_consistency_is_measured_as_it_should_be():
     assert paper.coverage(errors, covariances) == pytest.approx(0.9545, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
     """As many seeds and frames of the held pose as of the moving hand: the same compiled filters."""
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)

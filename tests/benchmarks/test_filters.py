@@ -119,7 +119,7 @@ def test_tasks_compute_in_the_precision_that_is_asked_for():
     assert double["resampler_n1e6_mismatch_searchsorted"][0] < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_all_tasks_without_peers():
     found = measure(TINY._replace(tasks=filters.GAUSSIAN + filters.REST))
     of_peers = {name for name in NAMES_OTHERS_RELY_ON if name.endswith(("smcx", "dynamax"))}
@@ -127,7 +127,7 @@ def test_all_tasks_without_peers():
     assert all(np.isfinite(value) for value, _, _ in found.values())
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("what", ["ekf", "pf"])
 def test_first_calls_are_timed(what):
     found = measure(TINY._replace(tasks=[f"first_call {what} ours"]))

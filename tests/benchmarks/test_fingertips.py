@@ -47,7 +47,7 @@ def test_without_the_recording_nothing_is_said_of_it(monkeypatch, capsys):
     assert "JAXFILTERS_DATA" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_every_metric_has_its_name(monkeypatch):
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     metrics = fingertips.run(quick=True, seed=0, out=None)

@@ -10,7 +10,7 @@ from jaxfilters.benchmarks.scenarios import fit_ranges
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.skipif("JAXFILTERS_DATA" not in os.environ, reason="needs plaza_range_slam in JAXFILTERS_DATA")
 def test_what_is_learnt_of_the_first_ranges_places_the_robot_better():
     recording = fit_ranges.read(recording_folder("plaza_range_slam") / "Plaza1_.mat").part(slice(600))

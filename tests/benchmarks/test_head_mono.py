@@ -64,7 +64,7 @@ def test_wider_turns_make_better_starts():
     assert metrics["start_spread_1_reprojection"].value < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_short_video_is_followed_by_several_trackers():
     made = talking_head(3, 40)
     face = default_face_model().model

@@ -66,7 +66,7 @@ def test_a_real_face_is_found_and_followed(monkeypatch, data_dir):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_modelled_person_is_followed_while_the_head_turns(monkeypatch, data_dir):
     monkeypatch.setenv("JAXFILTERS_DATA", str(data_dir))
     metrics = head_real.modelled_metrics(True, 0)

@@ -166,7 +166,7 @@ def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
         assert np.any(np.all(np.abs(image.astype(int) - color) < 12, axis=-1))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
     """Few particles and frames; all parts share two trackers, frame by frame: every other one takes long to compile."""
     usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0, chunk=1) for mode in ("modern", "paper")}

@@ -24,7 +24,7 @@ def test_the_kalman_filter_reaches_the_steady_spread_of_the_specification():
     np.testing.assert_allclose(np.sqrt(truth.variance[-1]), [0.113, 2.27], rtol=0.004)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_every_filter_has_its_row(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(linear_gaussian, "NUM_FRAMES", 5)
     metrics = linear_gaussian.run(quick=True, seed=0, out=tmp_path)

@@ -31,7 +31,7 @@ def test_the_exact_log_evidence_is_that_of_the_joint_gaussian(x64):
     np.testing.assert_allclose(exact_log_evidence(jnp.asarray(AT), ys), expected, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_ways_have_their_rows(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(particle_gradients, "NUM_FRAMES", 3)
     monkeypatch.setattr(particle_gradients, "QUICK_SIZES", {8: 4})

@@ -82,7 +82,7 @@ def test_every_metric_of_a_setup_is_there(monkeypatch, capsys):
     assert "no real cameras: JAXFILTERS_DATA is not set" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.usefixtures("half_size")
 def test_nobody_is_lost_between_four_cameras(monkeypatch):
     monkeypatch.setattr(people_cameras, "SETUPS", {name: SETUPS[name] for name in ("_narrow", "_rates")})
@@ -95,7 +95,7 @@ def test_nobody_is_lost_between_four_cameras(monkeypatch):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_two_real_cameras_agree_with_the_published_method(data_dir):
     metrics = _pom.pom_metrics(data_dir / "pom_lab_2cam")
     assert metrics["pom_agreement"].value > 0.5

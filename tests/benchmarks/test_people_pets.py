@@ -142,7 +142,7 @@ def test_the_recording_is_read_as_it_lies(data_dir):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_people_are_followed_from_the_first_frames_on(monkeypatch, data_dir, tmp_path):
     monkeypatch.setenv("JAXFILTERS_DATA", str(data_dir))
     monkeypatch.setattr(people_pets, "PeopleConfig", lambda: PeopleConfig(capacity=8))

@@ -20,7 +20,7 @@ def test_people_in_the_crowd_keep_apart():
     assert np.all((places > low + 0.5) & (places < high - 0.5))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_every_metric_is_there_and_everybody_is_followed(monkeypatch):
     monkeypatch.setattr(people_speed, "QUICK_SHAPES", ("160x120",))
     monkeypatch.setattr(people_speed, "QUICK_COUNTS", (1, 8))

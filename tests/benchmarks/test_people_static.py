@@ -178,7 +178,7 @@ def test_the_smallest_safe_gap_is_above_every_exchange(first, monkeypatch):
     np.testing.assert_allclose(calls, [0.1, 0.15, 0.2, 0.25])
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_the_modern_tracker_places_people_and_every_metric_has_its_name(monkeypatch):
     """Three places of each group, one gap and one distance of the start."""
     monkeypatch.setattr(people_static, "GROUPS", {name: points[:3] for name, points in GROUPS.items()})

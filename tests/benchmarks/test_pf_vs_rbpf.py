@@ -123,7 +123,7 @@ def test_the_wide_filter_spreads_like_the_rao_blackwellized_one():
     np.testing.assert_allclose(hand.spread_of_increments(setting)[0], dt * settled + q_n, rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_tiny_comparison_has_every_metric_of_the_issue(tmp_path, monkeypatch):
     """Times and errors from recordings of one length: the same compiled simulation."""
     num_frames = 3 * _step_time._Tracker.chunk

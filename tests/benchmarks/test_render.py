@@ -27,7 +27,7 @@ def test_fine_capsules_have_the_volume_of_capsules():
     np.testing.assert_allclose([solid.volume for solid in render.fine_capsules(one)], expected, rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_every_metric_is_there(monkeypatch):
     pytest.importorskip("embreex")
     monkeypatch.setattr(render, "NUM_POSES", 8)

@@ -22,7 +22,7 @@ def test_transport_has_its_time_with_and_without_a_derivative():
     assert set(scale.transported(0, 12, 1)) == {"transport_ms_n12", "transport_gradient_ms_n12"}
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_two_devices_are_asked_in_a_process_of_their_own():
     metrics = scale.on_two_devices(0, 64, 1)
     assert {"sharded_wall_ms_one_n64", "sharded_wall_ratio_two_n64", "sharded_wall_ratio_exchanging_n64"} <= set(

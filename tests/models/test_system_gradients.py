@@ -114,7 +114,7 @@ SYSTEMS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("evidence", "theta"), SYSTEMS, ids=[system.__name__ for system, _ in SYSTEMS])
 def test_derivatives_are_finite_and_something(evidence, theta):
     theta = jax.tree.map(jnp.float32, theta)

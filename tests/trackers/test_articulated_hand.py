@@ -53,6 +53,7 @@ def keypoints():
     return sequence, states, hand
 
 
+@pytest.mark.system
 def test_the_papers_sequence_is_followed_as_its_filter_says():
     sequence = tracker.synthetic_sequence(0)
     track = follow(sequence)
@@ -65,6 +66,7 @@ def test_the_papers_sequence_is_followed_as_its_filter_says():
     assert all(np.all(np.isfinite(leaf)) for leaf in track)
 
 
+@pytest.mark.system
 def test_keypoints_need_no_start(keypoints):
     sequence, states, hand = keypoints
     track = follow(sequence)
@@ -81,6 +83,7 @@ def test_keypoints_need_no_start(keypoints):
     assert error[10:].mean() < 0.5 * flat[10:].mean()
 
 
+@pytest.mark.system
 def test_a_hand_that_was_gone_is_found_again(keypoints):
     sequence, _, _ = keypoints
     y = sequence.y.copy()

@@ -45,6 +45,7 @@ def track(tracker, sequence):
     return follow(tracker, sequence[0])
 
 
+@pytest.mark.system
 def test_a_moving_hand_is_followed_from_an_automatic_start(track, sequence):
     errors = joint_errors_mm(track, sequence[1])
     assert np.all(track.status == TRACKING)
@@ -55,18 +56,21 @@ def test_a_moving_hand_is_followed_from_an_automatic_start(track, sequence):
     np.testing.assert_allclose(np.linalg.norm(track.pose[:, 3:7], axis=1), 1, atol=1e-5)
 
 
+@pytest.mark.system
 def test_the_same_key_gives_the_same_track(tracker, track, sequence):
     again = follow(tracker, sequence[0])
     for name in track._fields:
         np.testing.assert_array_equal(getattr(again, name), getattr(track, name), err_msg=name)
 
 
+@pytest.mark.system
 def test_what_comes_later_changes_nothing_before(tracker, track, sequence):
     depth = sequence[0].copy()
     depth[7:] = np.nan
     np.testing.assert_array_equal(follow(tracker, depth[:CHUNK]).joints[:7], track.joints[:7])
 
 
+@pytest.mark.system
 def test_a_hand_that_leaves_and_returns_is_said_lost_and_found_again(tracker, sequence):
     depth, joints = sequence
     away = slice(5, 14)
@@ -88,6 +92,7 @@ def test_without_any_hand_the_tracker_searches(tracker, value):
     assert np.all(np.isnan(track.joints))
 
 
+@pytest.mark.system
 def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequence):
     blank = np.full((424, 512), 3.0, np.float32)
     state = tracker.start(jax.random.key(0), blank)
@@ -99,7 +104,7 @@ def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequen
     assert joint_errors_mm(track, np.concatenate([sequence[1][:2], sequence[1]])[:CHUNK])[2:].mean() < 15
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("options", [{"filter": "pf"}, {"guide": False}])
 def test_the_other_filters_follow_too(sequence, options):
     tracker = hand_depth.build(kinect_v2(), HandDepthConfig(num_particles=256, **options))
@@ -125,7 +130,7 @@ def test_settings_that_cannot_be_are_named(options, named):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_real_hand_is_followed(data_dir):
     # A loose fist that opens within half a second; its truth is itself a model fit, 6 mm off the depth in the median.
     recording = open_depth(data_dir / "hpx_hand_rgbd" / "hpx.npz")

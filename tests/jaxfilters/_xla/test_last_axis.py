@@ -95,6 +95,7 @@ def assert_same(found, expected, rtol=2e-5, atol=2e-6):
         np.testing.assert_allclose(one, other, rtol, atol)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", OF_VECTOR)
 def test_values_are_those_of_vmap(name: str) -> None:
     function = OF_VECTOR[name]
@@ -211,6 +212,7 @@ def tracked(readings, arithmetic, scale=1.0):
     return log_evidence(filter, jax.random.key(0), readings)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     "arithmetic", [arithmetics.joseph, arithmetics.fast, arithmetics.square_root], ids=["joseph", "fast", "root"]
 )

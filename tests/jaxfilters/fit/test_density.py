@@ -113,7 +113,7 @@ def test_the_gradient_of_the_log_evidence_agrees_with_differences():
     assert fit.check_gradient(density, THETA, LIMITS).error < 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_truth_lies_within_three_standard_errors():
     runs = 100
     truth = {"rate": 0.8, "drift": 0.5, "noise": 0.4}

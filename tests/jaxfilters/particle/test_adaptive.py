@@ -92,7 +92,7 @@ def test_estimates_are_those_of_a_kalman_filter_that_coasts_and_learns():
         assert np.max(np.abs(z)) < 4
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_large_ensemble_has_the_variance_and_the_evidence_of_the_kalman_filter():
     ys, taus = simulate(1)
     estimates, variances, log_evidence = run(make_filter(400_000), jax.random.key(1), ys, taus, collect=keep_belief)[1]

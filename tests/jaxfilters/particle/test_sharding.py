@@ -139,7 +139,7 @@ def test_the_example_of_the_page_runs(root):
     assert abs(pose - 1) < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_two_processes_give_the_same_posterior():
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -75,7 +75,7 @@ def diverged(truth, means):
     return ~np.all(np.rad2deg(np.abs((means - truth)[:, -15:, LAYOUT.angles])) <= 45, axis=(1, 2))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("shape", [1, 2])
 def test_the_recommended_filter_finds_the_lengths_and_knows_how_well(recommended_runs, shape):
     truth, means, covariances = recommended_runs[shape]
@@ -87,7 +87,7 @@ def test_the_recommended_filter_finds_the_lengths_and_knows_how_well(recommended
     assert np.mean(np.abs(errors) <= 2 * deviations) >= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_two_hands_are_told_apart_from_the_same_start_and_a_seed_decides_the_run(hand, limits, recommended_runs):
     finals = [means[:, -1, 30].mean() for _, means, _ in recommended_runs.values()]
     assert abs(finals[1] - finals[0] - 5) <= 1.5
@@ -95,14 +95,14 @@ def test_two_hands_are_told_apart_from_the_same_start_and_a_seed_decides_the_run
     np.testing.assert_array_equal(again, recommended_runs[1][1])
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_without_limits_the_papers_filter_does_not_resolve_depth(hand, limits):
     far = replace(limits.constraints, lower=jnp.full(24, -jnp.inf), upper=jnp.full(24, jnp.inf))
     truth, means, _ = ten_runs(filters.literal, hand, limits._replace(constraints=far), 1)
     assert diverged(truth, means).mean() >= 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_the_literal_filter_is_sure_of_what_is_wrong(hand, limits):
     sequences = jax.vmap(synthetic.simulate_paper)(jax.random.split(jax.random.key(1), 6))
     means, covariances, _ = filtered(filters.literal, hand, limits, sequences)
@@ -111,7 +111,7 @@ def test_the_literal_filter_is_sure_of_what_is_wrong(hand, limits):
     assert np.mean(np.abs(errors) <= 2 * deviations) < 0.7
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_a_pose_that_is_held_teaches_nothing_more(hand, limits):
     sequences = jax.vmap(lambda key: synthetic.simulate_held(key, 1, num_frames=150, frame=10))(
         jax.random.split(jax.random.key(5), 4)
@@ -261,7 +261,7 @@ def _update_of_a_bank(hand, limits, prior, look):
     return jax.vmap(filters.belief_of)(state.components).mean, info
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_hypotheses_are_more_before_the_critical_pose_and_one_after_it():
     # E4 over its 37 frames: the paper's filter holds several about frame 18 and is of one mind a few frames on.
     hand, num_seeds = synthetic.paper_hand(synthetic.PAPER_EXPERIMENT), 12

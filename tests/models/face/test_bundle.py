@@ -68,6 +68,7 @@ def views_of(bundle, std=1.0, noise=None):
     return Views(uv, covariance, jnp.ones((NUM, 10), bool))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_landmarks_give_back_the_face_and_where_it_is(x64, seed):
     """Oracle 12: without a prior, from the preset start."""

@@ -58,6 +58,7 @@ def scenes():
     return [Scene(seed) for seed in range(3)]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("px", "plain", "coarse"), [(4.0, 1.0, 1.0), (6.0, 0.95, 1.0), (8.0, 0.6, 0.9)])
 def test_blur_widens_the_range_from_which_landmarks_are_found(scenes, px, plain, coarse):
     """Share of 30 landmarks that end within 0.5 mm; at 8 px a third of them without blur, and nearly all with it."""

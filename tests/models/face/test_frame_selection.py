@@ -104,6 +104,7 @@ def held(face):
     return 1e-6 * np.eye(11) + np.block([[np.zeros((6, 6)), np.zeros((6, 5))], [np.zeros((5, 6)), inverse]])
 
 
+@pytest.mark.system
 def test_what_a_frame_tells_is_the_schur_complement(x64, scene):
     face, rig, view, frame = scene
     found = told(face, rig, view, frame, Prior(1.0, 0.8))
@@ -130,6 +131,7 @@ def test_hidden_landmarks_tell_less(x64, scene):
     assert np.trace(more) > np.trace(less)
 
 
+@pytest.mark.system
 def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scene):
     """Of the least energy over pose and expression as a function of the person, by central differences.
 

@@ -48,7 +48,7 @@ def solved(views, start):
     return adjust(face(), rig(), views, start, *numbers, steps=(10, 40))[0]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_strangers_are_not_taken_for_smaller_than_they_are(x64):
     """Whatever counts in squared millimetres makes faces small, and the likeliest face is then some per cent too near.
 

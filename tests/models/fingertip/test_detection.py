@@ -58,7 +58,7 @@ def test_counts_and_places_are_right(num_fingers, shape, blur):
     check_accuracy(num_fingers, shape, blur, 15)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("num_fingers", range(6))
 @pytest.mark.parametrize("blur", [1.0, 2.2])
 @pytest.mark.parametrize("shape", [SMALL, LARGE])

@@ -127,7 +127,7 @@ def test_what_cannot_be_learnt_is_refused():
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.system
 def test_mid_air_symbols_of_people_it_has_never_seen(data_dir: Path):
     with np.load(data_dir / "midair_leap_gestures" / "midair_leap.npz") as archive:
         recorded = dict(archive)

@@ -34,7 +34,7 @@ def stills(shape=(48, 48), stride=4):
     return StillsDensity(hand_geometry(), cameras, jnp.stack(observed), jnp.stack(starts), jnp.asarray(SPREAD))
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.optimised
 def test_size_and_noise_of_a_rendered_hand_are_learnt_through_the_renderer():
     theta = HandStills(AVERAGE, jnp.float32(0.01), jnp.zeros((2, 21)))

@@ -74,6 +74,7 @@ def errors(hands, report, case):
     return apart[report.is_tip[case]]
 
 
+@pytest.mark.system
 def test_counting_is_better_with_correspondence_than_without(hands, reports):
     """Section 4.2: A falls from one to five fingers, B is above it; the two frames of confirmation count as wrong."""
     detected = accuracy(hands, np.asarray(hands.observed.is_tip).sum(axis=-1))
@@ -85,6 +86,7 @@ def test_counting_is_better_with_correspondence_than_without(hands, reports):
         assert np.all(found > detected + 1)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", METHODS)
 def test_fingers_keep_their_names_and_places(hands, reports, name):
     """Section 4.2: at most 2 identities a finger, and some 3 pixels root mean square, coasting included."""
@@ -96,6 +98,7 @@ def test_fingers_keep_their_names_and_places(hands, reports, name):
     assert np.sqrt(squared.mean()) <= (3.5 if name == "published" else 2)
 
 
+@pytest.mark.system
 def test_the_thumb_is_known_and_with_it_the_mode(hands, reports):
     report = reports["modern"]
     is_open = np.asarray(hands.fingers)[:, 0]
@@ -108,6 +111,7 @@ def test_the_thumb_is_known_and_with_it_the_mode(hands, reports):
     assert np.median(apart) < 2
 
 
+@pytest.mark.system
 def test_turning_the_scene_changes_nothing_but_places(hands, reports, modern):
     """Oracle 14: a quarter turn about a place leaves names, thumbs and counts; direction codes advance by four."""
     turn, shift = jnp.asarray([[0.0, 1.0], [-1.0, 0.0]]), jnp.asarray([40.0, 700.0])

@@ -120,6 +120,7 @@ def gains(window, new, options, face):
     return np.array([0.5 * (log_det(matrix) - log_det(all_of_them)) for matrix in exchanged])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
 def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     """Of the first one too if it may: it is made the one that tells least."""
@@ -221,6 +222,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     assert np.abs(z).max() < 4.5
 
 
+@pytest.mark.system
 def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, seen):
     rng = np.random.default_rng(5)
     state = state_of(rig, face, seen, PAPER)
@@ -238,11 +240,13 @@ def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, seen
     assert 0.01 < way.max() <= REACH.identity * (1 + 1e-4)
 
 
+@pytest.mark.system
 def test_the_usual_person_is_the_adjusted_one(moved):
     _, after, _ = moved
     np.testing.assert_array_equal(after.person.identity, after.identities[0])
 
 
+@pytest.mark.system
 def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     _, after, place = moved
     window = after.window
@@ -255,6 +259,7 @@ def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     np.testing.assert_array_equal(after.search.estimate, mean)
 
 
+@pytest.mark.system
 def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, moved):
     """They are exact: what is left is what the prior pulls."""
     before, after, place = moved
@@ -265,6 +270,7 @@ def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, mov
     assert not np.allclose(uv, before.window.views.uv[place], atol=5.0)
 
 
+@pytest.mark.system
 def test_an_adjustment_keeps_the_covariance_of_the_pose(moved):
     before, after, _ = moved
     old, new = before.belief.covariance, after.belief.covariance
@@ -276,6 +282,7 @@ def test_an_adjustment_keeps_the_covariance_of_the_pose(moved):
     np.testing.assert_allclose(spread(after.model, new), expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.system
 def test_particles_go_with_the_estimate(moved):
     before, after, _ = moved
     apart_before = np.asarray(before.search.particles - before.belief.mean[:, None])
@@ -286,6 +293,7 @@ def test_particles_go_with_the_estimate(moved):
     np.testing.assert_array_equal(after.search.velocity, before.search.velocity)
 
 
+@pytest.mark.system
 def test_what_frames_leave_behind_never_stops_an_adjustment(rig, face, seen):
     """Each tells nothing of some directions, but for rounding: in single precision the sum has no Cholesky root."""
     options = replace(USUAL, past="marginalised")

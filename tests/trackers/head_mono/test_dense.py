@@ -56,7 +56,7 @@ def begun(face68, rig, points, misplaced_mm=0.0):
     return first, start_densely(face68, rig, first, dense_of(points, misplaced_mm), PRIOR)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_faces_are_as_large_as_they_are_on_average(face68, rig):
     """People drawn from the model: the size is claimed as well as it is known, and it is not always too small."""
     deviations = []
@@ -82,6 +82,7 @@ def claimed(face, many):
     return np.sqrt(slope @ np.linalg.solve(precision, slope))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("misplaced_mm", [0.0, 1.0])
 def test_what_is_kept_leads_to_the_same_person(face68, rig, misplaced_mm):
     """The least of the energy of the prior and of what is kept, which is all that is left of the detections."""
@@ -100,6 +101,7 @@ def test_what_is_kept_leads_to_the_same_person(face68, rig, misplaced_mm):
     np.testing.assert_allclose(start.uv, points[:, list(FROM_68)], atol=3.0)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("misplaced_mm", [0.0, 1.5])
 def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(x64, face68, rig, misplaced_mm):
     """With a detector's part of the offset of every landmark as parameters of their own."""
@@ -145,6 +147,7 @@ def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(
     np.testing.assert_allclose(pull, expected_pull, rtol=1e-3, atol=1e-3 * np.abs(expected_pull).max())
 
 
+@pytest.mark.system
 def test_what_a_detector_misplaces_is_no_part_of_the_face(face68, rig):
     points, _ = somebody(face68, rig, 2)
     beside = np.random.default_rng(0).normal(0, 3.0, (68, 2))
@@ -156,6 +159,7 @@ def test_what_a_detector_misplaces_is_no_part_of_the_face(face68, rig):
     assert trace(loose) < 0.5 * trace(exact)
 
 
+@pytest.mark.system
 def test_no_detection_counts_for_more_than_a_model_knows_of_faces(face68, rig):
     """To .05 px instead of .5, of what the model leaves of a face: .68 px at 650 mm."""
     points, _ = somebody(face68, rig, 4)

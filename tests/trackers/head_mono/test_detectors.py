@@ -46,7 +46,7 @@ def test_no_vertex_is_two_landmarks_of_one_side():
     assert all(0 <= vertex < 478 for vertices in (*MESH_68, *IRISES) for vertex in vertices)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_the_mesh_is_where_the_cascades_see_a_face(data_dir):
     if importlib.util.find_spec("mediapipe") is None:
         pytest.skip("mediapipe is not installed: `pip install jaxfilters[mediapipe]`")

@@ -18,6 +18,7 @@ def followed(rig, face, talking, detected, share):
     return session
 
 
+@pytest.mark.system
 def test_a_wrong_focal_length_is_put_right(rig, face, talking, detected):
     """Assumed a third too short, whatever the size of the face: at least half of the way back, within its deviation."""
     found = followed(rig, face, talking, detected, 0.7).focal_length()
@@ -28,6 +29,7 @@ def test_a_wrong_focal_length_is_put_right(rig, face, talking, detected):
     assert float(found.log_std) < LOG_STD
 
 
+@pytest.mark.system
 def test_one_image_does_not_tell(rig, face, talking):
     made, images = talking
     session = MonoSession(rig, face, points=np.asarray(made.uv[0, 0], float))

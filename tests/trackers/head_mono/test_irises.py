@@ -45,6 +45,7 @@ def iris_px(face, rig, begun):
     return np.array(widths)
 
 
+@pytest.mark.system
 def test_narrow_irises_mean_a_large_face_far_away(face, rig, begun, iris_px):
     _, start = begun
     larger, std = measured(face, rig, start, jnp.asarray(iris_px, float))
@@ -57,6 +58,7 @@ def test_narrow_irises_mean_a_large_face_far_away(face, rig, begun, iris_px):
     )
 
 
+@pytest.mark.system
 def test_the_size_moves_as_far_as_the_irises_are_trusted(face, rig, begun, iris_px):
     points, start = begun
     after, past = with_irises(face, rig, start, detected(points, 1.0), None, iris_px, PRIOR)

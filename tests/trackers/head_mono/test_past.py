@@ -49,6 +49,7 @@ def window_of(face, rig, views, bundle, prior):
     return informed(face, rig, empty, bundle.person, prior)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("who", ["stranger", "remembered"])
 def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     """The past's Gaussian has the gradient of the frames that it replaces: nothing moves, but for rounding.
@@ -77,6 +78,7 @@ def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     np.testing.assert_allclose(with_past.poses[:, 2], together.poses[:KEPT, 2], atol=0.1)
 
 
+@pytest.mark.system
 def test_a_past_is_about_the_same_faces_whoever_it_is_told_to(x64, rig, scene):
     """Differences of its energy, for two faces written once about the stranger and once about the other."""
     stranger, known, views, truth = scene

@@ -34,6 +34,7 @@ def process(session, images, times, size=16):
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
+@pytest.mark.system
 def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, taught, talking, detected):
     face, shapes = taught
     made, images = talking
@@ -51,6 +52,7 @@ def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, 
     assert apart.mean() < 1.0
 
 
+@pytest.mark.system
 def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     """The ten others are remembered."""
     _, shapes = taught
@@ -63,6 +65,7 @@ def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     assert session.remembered is not None
 
 
+@pytest.mark.system
 def test_somebody_who_was_followed_is_recognised_by_a_later_session(rig, face, talking, detected):
     """With what the first session learnt, its size included."""
     made, images = talking
@@ -77,6 +80,7 @@ def test_somebody_who_was_followed_is_recognised_by_a_later_session(rig, face, t
     np.testing.assert_allclose(known.offset[0], before.offset[-1], atol=1e-5)
 
 
+@pytest.mark.system
 def test_somebody_who_was_lost_is_known_when_found_elsewhere(rig, face, talking, detected):
     """By the next detections, as in a session that searches for itself."""
     made, images = talking
@@ -90,6 +94,7 @@ def test_somebody_who_was_lost_is_known_when_found_elsewhere(rig, face, talking,
     assert np.abs(apart).max() < 0.3
 
 
+@pytest.mark.system
 def test_frames_of_a_camera_need_not_wait_for_a_face_that_comes_back(rig, face, talking, detected):
     """What asks whether it is the same one is compiled by then."""
     made, images = talking
@@ -104,6 +109,7 @@ def test_frames_of_a_camera_need_not_wait_for_a_face_that_comes_back(rig, face, 
     assert recognised._cache_size() == 1
 
 
+@pytest.mark.system
 def test_shares_of_the_prior(taught):
     face, shapes = taught
     alone, with_two = people(face, None), people(face, remember(face, shapes[:2]))

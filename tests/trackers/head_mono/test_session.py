@@ -39,6 +39,7 @@ def followed(rig, face, talking, detected):
     return session, track
 
 
+@pytest.mark.system
 def test_a_face_is_followed_from_detections_on(followed, talking):
     made, _ = talking
     session, track = followed
@@ -56,6 +57,7 @@ def test_a_face_is_followed_from_detections_on(followed, talking):
     assert np.all(track.score[START:] > 0.8)
 
 
+@pytest.mark.system
 def test_the_face_is_adjusted_while_it_is_followed(followed):
     session, track = followed
     assert track.is_adjusted[START:].sum() >= 5
@@ -65,6 +67,7 @@ def test_the_face_is_adjusted_while_it_is_followed(followed):
     assert np.abs(track.offset[-1]).max() > 0.01
 
 
+@pytest.mark.system
 def test_no_landmark_counts_for_more_than_a_model_knows_of_faces(followed, talking):
     """By how far so many millimetres across the line of sight are in pixels, at the distance that is believed."""
     made, _ = talking
@@ -78,6 +81,7 @@ def test_no_landmark_counts_for_more_than_a_model_knows_of_faces(followed, talki
     assert np.all(share > 0.88)
 
 
+@pytest.mark.system
 def test_standard_deviations_hold_what_is_not_known_of_the_person(followed, talking):
     made, _ = talking
     _, track = followed
@@ -87,6 +91,7 @@ def test_standard_deviations_hold_what_is_not_known_of_the_person(followed, talk
     assert within.mean() > 0.9
 
 
+@pytest.mark.system
 def test_a_lost_face_is_reported_and_found_again(rig, face, talking, detected):
     made, images = talking
     session = MonoSession(rig, face, detections=detected)
@@ -108,6 +113,7 @@ def test_a_lost_face_is_reported_and_found_again(rig, face, talking, detected):
     assert apart.max() < 0.5
 
 
+@pytest.mark.system
 def test_a_known_distance_of_the_eyes_sets_the_scale(rig, face, detected):
     """The same landmarks with the eyes said to be 5 % farther apart: a face so much larger and farther away."""
     points = jnp.asarray(detected.points, float)
@@ -118,6 +124,7 @@ def test_a_known_distance_of_the_eyes_sets_the_scale(rig, face, detected):
         assert float(eyes_apart(face, start.bundle.person)) == pytest.approx(apart, abs=1.5)
 
 
+@pytest.mark.system
 def test_the_tracker_of_the_thesis_runs_and_averages_identities(rig, face, talking, detected):
     made, images = talking
     session = MonoSession(rig, face, PUBLISHED, detections=detected)
@@ -131,6 +138,7 @@ def test_the_tracker_of_the_thesis_runs_and_averages_identities(rig, face, talki
     assert np.all(track.pose_std[START:, 2] < 400)
 
 
+@pytest.mark.system
 def test_points_of_the_first_image_are_a_start(rig, face, talking):
     made, images = talking
     session = MonoSession(rig, face, points=np.asarray(made.uv[0, 0], float))
@@ -139,6 +147,7 @@ def test_points_of_the_first_image_are_a_start(rig, face, talking):
     np.testing.assert_array_equal(track.status[1:], DEFORMABLE)
 
 
+@pytest.mark.system
 def test_68_landmarks_are_a_start_of_which_ten_are_followed(rig, face, face68, spread, talking):
     made, images = talking
     whole = [project_shape(rig, jnp.asarray(spread @ made.shapes[0], float), jnp.asarray(made.poses[0], float))[0][0]]

@@ -13,6 +13,7 @@ def room():
     return demo_room(3, cameras=2, frames=240)
 
 
+@pytest.mark.system
 def test_images_are_those_of_the_seed(room):
     first = room.image(1, 40)
     assert first.shape == (*SHAPE, 3)

@@ -89,6 +89,7 @@ def found(camera, draw, floor):
     return run, frame, np.bincount(who[who >= 0], minlength=3)
 
 
+@pytest.mark.system
 def test_everybody_is_found_where_drawn_though_two_overlap(found):
     """A pixel at the farthest is 0.12 m in depth, 150 px * 3 m / (7.2 m)^2 to the metre, and 0.05 m sideways."""
     run, _, pixels = found

@@ -135,6 +135,7 @@ def run(scene, state, mask, frames=8):
     return state, report
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("steps_m", "most"), [((0.05,) * 3, 0.06), (STEP_HALVING, 0.03)])
 def test_people_who_are_ellipsoids_are_found(steps_m, most):
     """Oracle 13: on average within 0.06 m, with step halving (prototype .019) within 0.03 m."""

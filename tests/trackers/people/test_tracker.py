@@ -52,6 +52,7 @@ def followed(scene, frames):
     return history
 
 
+@pytest.mark.system
 def test_who_walks_in_is_found_confirmed_and_followed(room, followed):
     """The first walker is on the floor from frame 8 on; somebody tall in mid-stride is seen 0.1 m too short."""
     first = followed[25][1]
@@ -67,6 +68,7 @@ def test_who_walks_in_is_found_confirmed_and_followed(room, followed):
     assert 0 < report.sd_lateral[slot] < report.sd_radial[slot] < 0.5
 
 
+@pytest.mark.system
 def test_a_full_house_follows_those_it_has(room, followed):
     """Three are in view at the end, and two slots."""
     assert room.present(FRAMES - 1).sum() > SLOTS
@@ -78,12 +80,14 @@ def test_a_full_house_follows_those_it_has(room, followed):
     assert len(set(off.argmin(axis=1))) == SLOTS
 
 
+@pytest.mark.system
 def test_what_is_said_is_finite_and_covariances_are_positive(followed):
     for people, report in followed:
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((people, report)))
         assert np.linalg.eigvalsh(people.belief.covariance).min() > 0
 
 
+@pytest.mark.system
 def test_nobody_stays_nobody(scene, frames):
     frame = (frames[0][0]._replace(foreground=np.zeros_like(frames[0][0].foreground)),)
     people, report = step(scene, start(scene), frame, DT)
@@ -92,6 +96,7 @@ def test_nobody_stays_nobody(scene, frames):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((people, report)))
 
 
+@pytest.mark.system
 def test_without_a_camera_people_go_on_as_they_went_and_are_less_certain(scene, frames, followed):
     """What the image of an absent camera holds does not matter."""
     people, _ = followed[-1]
@@ -109,6 +114,7 @@ def test_without_a_camera_people_go_on_as_they_went_and_are_less_certain(scene, 
     assert np.isfinite(report.nis).all()
 
 
+@pytest.mark.system
 def test_whoever_is_unseen_for_long_is_no_longer_followed(scene, frames, followed):
     people, absent = followed[-1][0], (frames[-1][0]._replace(present=np.bool_(False)),)
     for _ in range(4):
@@ -116,6 +122,7 @@ def test_whoever_is_unseen_for_long_is_no_longer_followed(scene, frames, followe
     assert not np.any(report.mode == TRACKED)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("dt", [0.0, -1.0, 1e6])
 def test_time_that_stands_still_or_jumps_harms_nothing(scene, frames, followed, dt):
     people, report = step(scene, followed[-1][0], frames[-1], np.float32(dt))
@@ -125,6 +132,7 @@ def test_time_that_stands_still_or_jumps_harms_nothing(scene, frames, followed, 
         assert np.all(report.mode == TRACKED)
 
 
+@pytest.mark.system
 def test_outlines_surround_the_silhouettes(scene, frames, followed):
     """The middle of each lies within the foreground of the last frame."""
     (seen,) = outlines(scene, followed[-1][0])

@@ -207,7 +207,7 @@ def test_wrong_arguments_exit_with_two(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_the_real_tracker_finds_the_lengths_of_the_synthetic_hand(tmp_path):
     assert run("--out", tmp_path / "out", "--no-video") == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())

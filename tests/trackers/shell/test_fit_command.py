@@ -34,7 +34,7 @@ def fit(*arguments):
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.system
 def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     assert fit("--out", tmp_path / "model.npz") == 0
     told = capsys.readouterr().out
@@ -98,7 +98,7 @@ def test_a_folder_of_people_is_the_same_as_a_file(tmp_path, shapes):
     assert np.argwhere(~sets.observed).tolist() == [[2, 6]]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_heads_that_moved_are_aligned(tmp_path, shapes):
     turned = shapes @ np.array([[0.96, -0.28, 0], [0.28, 0.96, 0], [0, 0, 1]]) + (3, 40, 600)
     # The first person's neutral face says which way faces look.

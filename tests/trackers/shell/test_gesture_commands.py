@@ -75,7 +75,7 @@ def test_without_data_symbols_are_drawn(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.system
 def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     assert run("fit", "gestures", "--out", tmp_path / "model.npz") == 0
     assert "24 symbols" in capsys.readouterr().out
