@@ -109,7 +109,10 @@ def from_probabilities(initial: Any, transition: Any, emission: Emission | None 
 
 
 def from_topology(
-    allowed: Bool[np.ndarray, "q q"], emission: Emission | None = None, *, initial: Bool[np.ndarray, " q"] | None = None
+    allowed: Bool[np.ndarray, "..."],
+    emission: Emission | None = None,
+    *,
+    initial: Bool[np.ndarray, "..."] | None = None,
 ) -> HiddenMarkovModel:
     """A model in which all allowed transitions of a state, and all allowed initial states, are equally probable.
 

@@ -69,10 +69,9 @@ def _update(
     del key
     log_likelihood = observation if model.emission is None else model.emission.log_likelihood(observation)
     if jnp.shape(log_likelihood) != model.log_initial.shape:
-        name = (
-            "observation, log-likelihoods without an emission," if model.emission is None else "emission.log_likelihood"
-        )
-        raise ValueError(f"{name} must be {model.log_initial.shape}, (Q,); got {jnp.shape(log_likelihood)}.")
+        name = "observation, without an emission," if model.emission is None else "emission.log_likelihood"
+        expected = model.log_initial.shape
+        raise ValueError(f"{name} must be log-likelihoods {expected}, (Q,); got {jnp.shape(log_likelihood)}.")
     after, log_evidence = weights.normalize(state.log_probabilities + log_likelihood)
     after = jnp.where(log_evidence > -jnp.inf, after, state.log_probabilities)
     return state._replace(log_probabilities=after), ChainInfo(log_evidence, jnp.argmax(after).astype(jnp.int32))

@@ -67,8 +67,8 @@ def pad(sequences: Sequence[PyTree], length: int | None = None) -> tuple[PyTree,
 def baum_welch(
     model: HiddenMarkovModel,
     observations: PyTree,
-    lengths: Int[Array, " n"] | None = None,
-    mask: Bool[Array, "t n"] | None = None,
+    lengths: Int[Array, " n"] | Int[np.ndarray, " n"] | None = None,
+    mask: Bool[Array, "t n"] | Bool[np.ndarray, "t n"] | None = None,
     *,
     max_iterations: int = 30,
     tolerance: float | Float[Array, ""] = 1e-4,
@@ -264,9 +264,7 @@ def _emission(model: HiddenMarkovModel) -> Emission:
     return model.emission
 
 
-def _check_training(
-    model: HiddenMarkovModel, observations: PyTree, lengths: Array | None, mask: Array | None
-) -> tuple[int, int]:
+def _check_training(model: HiddenMarkovModel, observations: PyTree, lengths: Any, mask: Any) -> tuple[int, int]:
     """The numbers of frames and sequences, after checks of shapes and, unless they are traced, values."""
     check_model(model)
     emission = _emission(model)
