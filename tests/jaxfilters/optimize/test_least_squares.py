@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose
 
-from jaxfilters.optimize.box_steps import Model, boxed
+from jaxfilters.optimize.box_steps import QuadraticModel, bounded_step
 from jaxfilters.optimize.least_squares import BoxAdjoint, BoxLevenbergMarquardt, bounds_of, cauchy, covariance, huber
 from jaxfilters.optimize.shared_least_squares import schur
 
@@ -114,13 +114,13 @@ def test_a_step_stops_at_a_bound_and_the_others_answer():
     lower, upper = np.full(4, -9.0), np.full(4, 9.0)
     upper[0], lower[0] = max(0.3 * free_step[0], 0.0), min(0.3 * free_step[0], 0.0)
     N = jnp.asarray(J.T @ J)
-    model = Model(jnp.zeros(4), jnp.asarray(r), jnp.asarray(J.T @ r), lambda step: N @ step, jnp.asarray(0.1))
+    model = QuadraticModel(jnp.zeros(4), jnp.asarray(r), jnp.asarray(J.T @ r), lambda step: N @ step, jnp.asarray(0.1))
 
     def solve(rest, free):
         masked = jnp.where(free[:, None] & free, N, jnp.diag(jnp.where(free, 0.0, 1.0)))
         return -jnp.linalg.solve(masked, jnp.where(free, rest, 0.0))
 
-    step, leads = boxed(solve, model, jnp.ones(4, bool), (jnp.asarray(lower), jnp.asarray(upper)))
+    step, leads = bounded_step(solve, model, jnp.ones(4, bool), (jnp.asarray(lower), jnp.asarray(upper)))
     assert bool(leads)
     assert_allclose(step, scipy.optimize.lsq_linear(J, -r, (lower, upper), tol=1e-14).x, atol=1e-8)
     assert np.abs(step[1:] - free_step[1:]).max() > 0.01
