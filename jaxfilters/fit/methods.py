@@ -231,7 +231,13 @@ def adam(
         max_steps: Upper bound on the number of steps.
         tolerance: Least decrease of the smoothed loss that counts as an improvement.
         patience: Number of steps without an improvement that ends the search.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    if not learning_rate > 0:
+        raise ValueError(f"learning_rate must be positive; got {learning_rate}.")
+    _check_options(max_steps, tolerance, patience)
     return FirstOrder(optax.adam(learning_rate), max_steps, tolerance, patience)
 
 
@@ -245,7 +251,11 @@ def first_order(
         max_steps: Upper bound on the number of steps.
         tolerance: Least decrease of the smoothed loss that counts as an improvement.
         patience: Number of steps without an improvement that ends the search.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance, patience)
     return FirstOrder(transformation, max_steps, tolerance, patience)
 
 
@@ -255,7 +265,11 @@ def bfgs(*, max_steps: int = 200, tolerance: float = 1e-5) -> Bfgs:
     Args:
         max_steps: Upper bound on the number of evaluations of the loss and its gradient.
         tolerance: Predicted gain of the log density, in nats, below which the search has converged.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return Bfgs(max_steps, tolerance)
 
 
@@ -265,7 +279,11 @@ def lbfgsb(*, max_steps: int = 100, tolerance: float = 1e-3) -> Lbfgsb:
     Args:
         max_steps: Upper bound on the number of iterations.
         tolerance: Largest component of the projected gradient at convergence.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return Lbfgsb(max_steps, tolerance)
 
 
@@ -275,5 +293,16 @@ def least_squares(*, max_steps: int = 50, tolerance: float = 1e-6) -> LeastSquar
     Args:
         max_steps: Upper bound on the number of steps.
         tolerance: Relative step, or largest component of the projected gradient, at convergence.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return LeastSquares(max_steps, tolerance)
+
+
+def _check_options(max_steps: int, tolerance: float, patience: int = 1) -> None:
+    if max_steps < 1 or patience < 1:
+        raise ValueError(f"max_steps and patience must be at least 1; got {max_steps} and {patience}.")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must not be negative; got {tolerance}.")

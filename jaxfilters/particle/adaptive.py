@@ -101,7 +101,7 @@ def adaptive_diffusion(
         steady_std: Of the d - m coordinates that do not coast; `None` if all do.
         low: Lower limit of the diffusion, in each coordinate's unit per unit of time.
         high: The upper limit.
-        learn: `diffusion.update`, `diffusion.keep`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
+        learn: `diffusion.update`, `diffusion.fixed`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
         partitions: Weighs every observation in two stages; `None` in one.
         mode_distance: For `mean_around_mode`.
         scheme: Resampling scheme; of `jf.differentiable_resampling`, `soft`, and `transport` without `partitions`.
@@ -156,7 +156,7 @@ def _predict(
     tau = jnp.asarray(1.0 if control is None else control, state.elapsed.dtype)
     tau = jnp.where(tau > 0, tau, 0.0)
     particles, log_weights, ancestors = resample(resample_key, state.particles, state.log_weights, model.scheme, 1.0)
-    changing = tau * diffusion.spread(state.fit, state.velocity, low=model.low, high=model.high)
+    changing = tau * diffusion.velocity_change_std(state.fit, state.velocity, low=model.low, high=model.high)
     spread = jnp.concatenate([changing, safe_sqrt(tau) * model.steady_std])
     drift = jnp.pad(tau * state.velocity, (0, model.steady_std.shape[0]))
     noise = standard_normal(noise_key, particles.shape, particles.dtype)
