@@ -109,10 +109,10 @@ def from_probabilities(initial: Any, transition: Any, emission: Emission | None 
 
 
 def from_topology(
-    allowed: Bool[np.ndarray, "..."],
+    allowed: Bool[np.ndarray, "q q"],
     emission: Emission | None = None,
     *,
-    initial: Bool[np.ndarray, "..."] | None = None,
+    initial: Bool[np.ndarray, " q"] | None = None,
 ) -> HiddenMarkovModel:
     """A model in which all allowed transitions of a state, and all allowed initial states, are equally probable.
 

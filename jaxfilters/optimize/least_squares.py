@@ -194,6 +194,12 @@ def bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Float[Array, " n"], F
         ValueError: If a bound does not have the structure and shapes of `y`, or, unless it is traced, a lower bound
             exceeds the upper one or is NaN.
     """
+    numbers = options.get("lower"), options.get("upper")
+    lowest, highest = (
+        n if isinstance(n, int | float) else none for n, none in zip(numbers, (-np.inf, np.inf), strict=True)
+    )
+    if not lowest <= highest:
+        raise ValueError(f"lower must be at most upper; got {numbers[0]} and {numbers[1]}.")
     lower = _flat_bound("lower", options.get("lower"), y, -jnp.inf)
     upper = _flat_bound("upper", options.get("upper"), y, jnp.inf)
     if not isinstance(lower, jax.core.Tracer) and not isinstance(upper, jax.core.Tracer):
