@@ -231,7 +231,7 @@ def _check_lengths(observations: PyTree, controls: PyTree, mask: Array | np.ndar
 
 
 def explain_not_finite(log_density: Callable, theta: PyTree) -> str:
-    """Why a log density is not finite at `theta`, as far as it can be told: a clause for an error message, or ''."""
+    """Why a log density is not finite at `theta`: a clause for an error message, or '' if the cause is unknown."""
     if isinstance(log_density, WithPrior):
         prior = float(log_density.log_prior(theta))
         return (
