@@ -112,14 +112,14 @@ def learnt(streams: Streams) -> Network:
     blank = hmm.DiagonalGaussian(jnp.zeros(size), jnp.ones(size), MIN_VARIANCE)
     groups = [(f"{label:02}", np.flatnonzero(streams.gestures == label)) for label in range(NUM_GESTURES)]
     models = trained(blank, features, np.asarray(lengths), groups).models
-    return hmm.side_by_side([jax.tree.map(lambda leaf, i=i: leaf[i], models) for i in range(NUM_GESTURES)])
+    return hmm.parallel_composition([jax.tree.map(lambda leaf, i=i: leaf[i], models) for i in range(NUM_GESTURES)])
 
 
 def spotted(network: Network, sequences: list[Float[np.ndarray, "_ 20 7"]]) -> list[list[Segment]]:
     """Gestures found in each sequence, frame by frame."""
     # The filter is given what the frames say, tempered.
     bare = replace(network, model=replace(network.model, emission=None))
-    filter = hmm.spotter(bare, margin=MARGIN, patience=PATIENCE, shortest=SHORTEST)
+    filter = hmm.spotter(bare, margin=MARGIN, patience=PATIENCE, min_frames=SHORTEST)
     found = []
     for sequence in sequences:
         features = hand_features(sequence)

@@ -115,7 +115,7 @@ def _observation(size: int) -> np.ndarray:
 
 def pose_filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
     """The filters of the first problem by name."""
-    ones, keep = jnp.ones(POSE), diffusion.keep
+    ones, keep = jnp.ones(POSE), diffusion.fixed
     build = partial(_filter, num_particles=num_particles)
     return {
         "fixed_small": build(diffusion.start(SMALL * ones, slope=0.0), update_fit=keep),

@@ -1,1 +1,1 @@
-"""How programs are written so that XLA compiles them well. Private: nothing here changes a result."""
+"""Formulations of programs that XLA compiles to faster code. This package is private and changes no results."""

@@ -1,9 +1,9 @@
-"""`vmap` that keeps the batch on the last axis of whatever is computed in between.
+"""A `vmap` that keeps the batch on the last axis of all intermediate results.
 
-The rules of `jax.vmap` move a batch to the front wherever arrays are broadcast, reshaped or joined, and leave a loop
-over the three or six numbers of a small matrix as the innermost one. With the batch on the last axis of every array
-that loop runs over the batch, by vector instructions. Functions are traced; operations for which there is no rule here
-are left to `jax.vmap`, which is right but may be slow.
+The batching rules of `jax.vmap` move the batch axis to the front where arrays are broadcast, reshaped or concatenated,
+so that the innermost loop runs over the few elements of a small matrix. With the batch on the last axis of every array
+the innermost loop runs over the batch and uses vector instructions. Functions are traced; operations without a rule in
+this module are left to `jax.vmap`, with correct results that may be slow to compute.
 """
 
 from collections.abc import Callable
@@ -20,34 +20,34 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
 _UNROLLED = 8
-"""Sums of up to so many terms are written out."""
+"""Largest number of terms of a sum that is written out."""
 
 _ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
     complex conj convert_element_type copy cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt igamma
     igammac imag integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or polygamma
     pow real reduce_precision rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor"""
-_OF_LEADING_AXES = """argmax argmin cumlogsumexp cummax cummin cumprod cumsum materialized reduce_and reduce_max
+_LEADING_AXES_ONLY = """argmax argmin cumlogsumexp cummax cummin cumprod cumsum materialized reduce_and reduce_max
     reduce_min reduce_or reduce_prod reduce_xor rev squeeze"""
-"""Operations on one array whose parameters name axes from the front: one axis more at the end changes nothing."""
+"""Operations on one array whose parameters count axes from the front, so that they admit a further last axis."""
 
 
 class _Value(NamedTuple):
     array: Any
     batched: bool
-    """Whether the last axis is that of the batch."""
+    """Whether the last axis is the batch axis."""
 
 
 def vmap(fun: Callable, in_axes: PyTree = -1, out_axes: PyTree = -1) -> Callable:
-    """As `jax.vmap`, with the batch on the last axis of arguments, results and all that is computed between them.
+    """As `jax.vmap`, with the batch on the last axis of arguments, results and all intermediate results.
 
     Args:
-        fun: Function of one element.
+        fun: Function of one element of the batch.
         in_axes: For each argument, as a prefix of its pytree: -1, or `None` where all elements share it.
         out_axes: -1, or `None` for results that do not depend on the element.
 
     Raises:
-        ValueError: If nothing has a batch axis, if lengths differ, or if a result with the axis `None` depends on the
-            element.
+        ValueError: If no argument has a batch axis, if batch sizes differ, or if a result with the axis `None` depends
+            on the element.
     """
 
     @wraps(fun)
@@ -62,23 +62,23 @@ def vmap(fun: Callable, in_axes: PyTree = -1, out_axes: PyTree = -1) -> Callable
         size = sizes.pop()
         result, structure = _mapped(lambda *flat: fun(*jax.tree.unflatten(tree, flat)), size, values)
         whole = jax.tree.unflatten(structure, [value.array for value in result])
-        wanted = _mapped_leaves(out_axes, whole)
-        for (path, _), value, flag in zip(jax.tree.leaves_with_path(whole), result, wanted, strict=True):
+        expected = _mapped_leaves(out_axes, whole)
+        for (path, _), value, flag in zip(jax.tree.leaves_with_path(whole), result, expected, strict=True):
             if value.batched and not flag:
                 raise ValueError(
                     f"out_axes must be -1 for results that depend on the element; got None for the result"
                     f"{jax.tree_util.keystr(path)}, which does."
                 )
-        arrays = [_full(value, size) if flag else value.array for value, flag in zip(result, wanted, strict=True)]
+        arrays = [_full(value, size) if flag else value.array for value, flag in zip(result, expected, strict=True)]
         return jax.tree.unflatten(structure, arrays)
 
     return mapped
 
 
 def batch_last(fun: Callable) -> Callable:
-    """The same function, of which `jax.vmap` keeps the batch on the last axis of whatever it computes.
+    """The same function, whose intermediate results under `jax.vmap` have the batch on their last axis.
 
-    For functions of small arrays, up to about eight rows: large matrices are better left to `jax.vmap`.
+    It is meant for functions of small arrays, up to about eight rows; `jax.vmap` is faster for larger ones.
     """
 
     @wraps(fun)
@@ -88,7 +88,7 @@ def batch_last(fun: Callable) -> Callable:
         closed, shapes = jax.make_jaxpr(lambda *flat: fun(*jax.tree.unflatten(tree, flat)), return_shape=True)(*leaves)
         if closed.effects:
             return fun(*args)
-        # What the function closes over may be traced, too: it is handed over.
+        # Constants that the function closes over may be tracers, so they become arguments.
         jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
         result = _batch_last_p.bind(*closed.consts, *leaves, jaxpr=ClosedJaxpr(jaxpr, ()))
         return jax.tree.unflatten(jax.tree.structure(shapes), result)
@@ -97,7 +97,7 @@ def batch_last(fun: Callable) -> Callable:
 
 
 def _mapped_leaves(axes, tree):
-    """Which leaves have the axis of the batch, where `axes` is a prefix of the tree."""
+    """Whether each leaf has a batch axis, where `axes` is a prefix of the tree."""
     flags = jax.tree.map(
         lambda axis, branch: jax.tree.map(lambda _: axis is not None, branch),
         axes,
@@ -108,19 +108,19 @@ def _mapped_leaves(axes, tree):
 
 
 def _mapped(fun, size, values):
-    """The results of a function of flat arguments, flat, and their structure."""
+    """The flat results of a function of flat arguments, and their tree structure."""
     one = [jax.ShapeDtypeStruct(_shape(value), value.array.dtype) for value in values]
     closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*one)
     return _evaluate(closed, size, values), jax.tree.structure(shapes)
 
 
 def _shape(value):
-    """The shape for one element."""
+    """The shape of one element of the batch."""
     return np.shape(value.array)[: np.ndim(value.array) - value.batched]
 
 
 def _full(value, size):
-    """The array with its batch axis, repeated along it where all elements share it."""
+    """The array with a batch axis, broadcast if all elements share it."""
     if value.batched:
         return value.array
     return lax.broadcast_in_dim(value.array, (*np.shape(value.array), size), range(np.ndim(value.array)))
@@ -144,7 +144,7 @@ def _apply(eqn: JaxprEqn, size: int, values: list[_Value]) -> list[_Value]:
     if any(value.batched for value in values):
         if name in _CALLS:
             return _CALLS[name](eqn, size, values)
-        result = _RULES.get(name, _left_alone)(eqn, size, values)
+        result = _RULES.get(name, _no_rule)(eqn, size, values)
         if result is NotImplemented:
             axes = [-1 if value.batched else None for value in values]
             result = jax.vmap(partial(_bind, eqn), axes, -1)(*(value.array for value in values))
@@ -158,7 +158,7 @@ def _bind(eqn, *args):
     return eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(eqn.params))
 
 
-def _left_alone(eqn, size, values):
+def _no_rule(eqn, size, values):
     del eqn, size, values
     return NotImplemented
 
@@ -169,13 +169,13 @@ def _elementwise(eqn, size, values):
     def fitted(value):
         if len(_shape(value)) == len(shape):
             return _full(value, size)
-        # A number beside arrays.
+        # A scalar operand among arrays.
         return lax.broadcast_in_dim(value.array, (*shape, size), (len(shape),)) if value.batched else value.array
 
     return _bind(eqn, *map(fitted, values))
 
 
-def _of_leading_axes(eqn, size, values):
+def _leading_axes_only(eqn, size, values):
     del size
     return _bind(eqn, *(value.array for value in values))
 
@@ -219,7 +219,7 @@ def _stack(eqn, size, values):
 def _reduce_sum(eqn, size, values):
     axes, x = sorted(eqn.params["axes"], reverse=True), values[0].array
     if not 0 < np.prod([x.shape[axis] for axis in axes], dtype=int) <= _UNROLLED:
-        return _of_leading_axes(eqn, size, values)
+        return _leading_axes_only(eqn, size, values)
     for axis in axes:
         x = reduce(add, (lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])))
     return x
@@ -247,7 +247,7 @@ def _call(eqn, size, values):
 
 
 def _custom_jvp_call(eqn, size, values):
-    """The function over the batch, and as its derivative that of one element over the batch."""
+    """The batched function, with the custom derivative of one element batched likewise."""
     inexact = [jnp.issubdtype(var.aval.dtype, jnp.inexact) for var in eqn.invars]
     smooth = [jnp.issubdtype(var.aval.dtype, jnp.inexact) for var in eqn.outvars]
     flags = [value.batched for value in values]
@@ -278,24 +278,26 @@ def _custom_jvp_call(eqn, size, values):
 
 
 def _like(value, batched, size):
-    """The array with a batch axis or without; what does not depend on the element is the same for all."""
+    """The array with or without a batch axis; without one, all elements are equal and the first is taken."""
     return _full(value, size) if batched else value.array[..., 0] if value.batched else value.array
 
 
 def _depends(closed, flags):
-    """Which results depend on the element, as `_evaluate` finds them."""
+    """Whether each result depends on the element of the batch, as `_evaluate` determines it."""
     known = dict(zip(closed.jaxpr.invars, flags, strict=True))
     read = lambda var: not isinstance(var, Literal) and known.get(var, False)
     for eqn in closed.jaxpr.eqns:
-        given = [read(var) for var in eqn.invars]
+        inputs = [read(var) for var in eqn.invars]
         inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr")) if eqn.primitive.name in _CALLS else None
         known |= dict(
-            zip(eqn.outvars, _depends(inner, given) if inner else [any(given)] * len(eqn.outvars), strict=True)
+            zip(eqn.outvars, _depends(inner, inputs) if inner else [any(inputs)] * len(eqn.outvars), strict=True)
         )
     return [read(var) for var in closed.jaxpr.outvars]
 
 
-_RULES = dict.fromkeys(_ELEMENTWISE.split(), _elementwise) | dict.fromkeys(_OF_LEADING_AXES.split(), _of_leading_axes)
+_RULES = dict.fromkeys(_ELEMENTWISE.split(), _elementwise) | dict.fromkeys(
+    _LEADING_AXES_ONLY.split(), _leading_axes_only
+)
 _RULES |= {
     "broadcast_in_dim": _broadcast_in_dim,
     "concatenate": _concatenate,
@@ -307,12 +309,12 @@ _RULES |= {
     "stack": _stack,
     "transpose": _transpose,
 }
-"""Array of the results of one operation; `NotImplemented` leaves it to `jax.vmap`."""
+"""Batching rules by the name of the operation; a rule that returns `NotImplemented` leaves it to `jax.vmap`."""
 _CALLS = {"batch_last": _call, "custom_jvp_call": _custom_jvp_call, "jit": _call, "pjit": _call}
-"""Operations that hold others."""
+"""Rules of operations that contain others."""
 
 
-def _as_it_is(*args, jaxpr):
+def _unbatched(*args, jaxpr):
     return jaxpr_as_fun(jaxpr)(*args)
 
 
@@ -321,7 +323,7 @@ def _jvp(primals, tangents, *, jaxpr):
 
     def function(*moving):
         moving = iter(moving)
-        return _as_it_is(*(next(moving) if m else x for x, m in zip(primals, moves, strict=True)), jaxpr=jaxpr)
+        return _unbatched(*(next(moving) if m else x for x, m in zip(primals, moves, strict=True)), jaxpr=jaxpr)
 
     chosen = [[x for x, m in zip(of, moves, strict=True) if m] for of in (primals, tangents)]
     return jax.jvp(function, *chosen)
@@ -339,8 +341,8 @@ def _batch(args, axes, *, jaxpr):
 
 _batch_last_p = Primitive("batch_last")
 _batch_last_p.multiple_results = True
-_batch_last_p.def_impl(_as_it_is)
+_batch_last_p.def_impl(_unbatched)
 _batch_last_p.def_abstract_eval(lambda *_, jaxpr: jaxpr.out_avals)
-mlir.register_lowering(_batch_last_p, mlir.lower_fun(_as_it_is, multiple_results=True))
+mlir.register_lowering(_batch_last_p, mlir.lower_fun(_unbatched, multiple_results=True))
 ad.primitive_jvps[_batch_last_p] = _jvp
 batching.primitive_batchers[_batch_last_p] = _batch

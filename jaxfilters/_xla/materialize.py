@@ -1,4 +1,4 @@
-"""Results that are written to memory once, for all that use them."""
+"""Intermediate results that XLA must not compute again in each of their uses."""
 
 import math
 
@@ -8,31 +8,31 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-_SINGLE = 64
-"""Elements of the largest matrix without an ensemble, of which writing it costs more than computing it again."""
+_MAX_RECOMPUTED = 64
+"""Largest number of elements for which computing a result again costs less than storing it."""
 
 
 def materialized(x: Array) -> Array:
-    """`x` itself, which the compiler may not compute again in each of its uses.
+    """The array `x`, stored in memory once, so that the compiler does not compute it again in each of its uses.
 
-    XLA merges a chain of small matrix products into one loop over the last of them, and computes each element of the
-    others as often as it is used: on a CPU, over an ensemble of matrices with six rows, ten times the arithmetic.
-    Nothing happens to arrays of no more than 64 elements, nor on other devices.
+    XLA fuses a chain of small matrix products into one loop over the elements of the last one and recomputes each
+    element of the others as often as it is used: on a CPU, for an ensemble of matrices with six rows, ten times the
+    arithmetic. Arrays of at most 64 elements are unaffected, and so are other devices.
     """
     return _materialized_p.bind(x)
 
 
 @jax.jit
-def _itself(x):
+def _identity(x):
     return x
 
 
 def _on_cpu(x):
-    if math.prod(x.shape) <= _SINGLE:
+    if math.prod(x.shape) <= _MAX_RECOMPUTED:
         return x
-    # Nothing is merged across the border of a call, and this attribute of XLA's keeps it one.
+    # XLA fuses nothing across the boundary of a call, and this attribute prevents that the call is inlined.
     with set_xla_metadata(inlineable="false"):
-        return _itself(x)
+        return _identity(x)
 
 
 _materialized_p = Primitive("materialized")

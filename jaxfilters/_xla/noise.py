@@ -1,9 +1,9 @@
-"""Standard normal numbers for whole ensembles: those of `jax.random.normal`, drawn in one pass.
+"""Standard normal numbers for whole ensembles: the numbers of `jax.random.normal`, generated in one pass.
 
-On a CPU `jax.random` keeps its generator (Threefry, 20 rounds) as a loop over two arrays of counters, each as large as
-the result. Here the rounds are written out and become one loop over the numbers: nothing is stored but the result. That
-takes two thirds of the time for 1e5 particles, a third for 1e6, and a third of the time to compile. For keys that are
-split, and single numbers, it would be the wrong thing: the compiler repeats the rounds wherever they are used.
+On a CPU `jax.random` evaluates its generator (Threefry, 20 rounds) as a loop over two arrays of counters, each as large
+as the result. Here the rounds are unrolled into one loop over the numbers, which stores the result alone. That takes
+two thirds of the time for 1e5 particles, one third for 1e6, and one third of the time to compile. It is unsuitable for
+splitting keys and for single numbers, because the compiler repeats the rounds in each of their uses.
 """
 
 import math
@@ -22,16 +22,17 @@ _PARITY = 0x1BD11BDA
 def standard_normal(key: AnyKey, shape: tuple[int, ...], dtype: DTypeLike = float) -> Float[Array, "..."]:
     """Independent standard normal numbers, bit for bit those of `jax.random.normal(key, shape, dtype)`.
 
-    Keys of another kind than JAX's default, and other types than float32 and float64, are left to `jax.random`.
+    Keys of other implementations than JAX's default, and types other than float32 and float64, are passed to
+    `jax.random`.
     """
     kind = jnp.finfo(jnp.zeros((), dtype).dtype)
-    # A setting of JAX, on unless a user clears it, gives every number a counter of its own.
-    known = jax.random.key_impl(key) == "threefry2x32" and bool(jax.threefry_partitionable.value)
-    if not known or math.prod(shape) >= 2**32 or kind.bits not in (32, 64):
+    # With this setting, the default of JAX, every number has its own counter.
+    supported = jax.random.key_impl(key) == "threefry2x32" and bool(jax.threefry_partitionable.value)
+    if not supported or math.prod(shape) >= 2**32 or kind.bits not in (32, 64):
         return jax.random.normal(key, shape, dtype)
     high, low = _threefry(key, shape)
     bits = (high.astype(jnp.uint64) << 32) | low.astype(jnp.uint64) if kind.bits == 64 else high ^ low
-    # Numbers in [1, 2) by their mantissa; from there to the open interval (-1, 1).
+    # The mantissa gives numbers in [1, 2), which are mapped to the open interval (-1, 1).
     one = np.ones((), kind.dtype).view(f"uint{kind.bits}")
     mantissa = jax.lax.bitcast_convert_type((bits >> (kind.bits - kind.nmant)) | one, kind.dtype)
     lowest = np.nextafter(np.asarray(-1, kind.dtype), np.asarray(0, kind.dtype))
@@ -40,7 +41,7 @@ def standard_normal(key: AnyKey, shape: tuple[int, ...], dtype: DTypeLike = floa
 
 
 def _threefry(key: AnyKey, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Threefry-2x32 of 0, 1, 2 ... (J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011)."""
+    """Threefry-2x32 of 0, 1, 2, ... (J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)."""
     first, second = jax.random.key_data(key)
     counters = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
     keys = (first, second, first ^ second ^ np.uint32(_PARITY))

@@ -1,9 +1,9 @@
-"""Running totals without rounding: what resampling needs to place every particle among the grid points.
+"""Cumulative sums without rounding error, for the positions of particles among the grid points of resampling.
 
-A float32 running sum over 10^6 weights is wrong by several hundredths of the distance between two grid points, and
+A float32 cumulative sum of 10^6 weights has errors of several hundredths of the distance between two grid points, and
 depends on the order of summation. Here every weight is rounded once to an integer of two digits, `high` and `low`,
-small enough that no sum of either, in any order, leaves the integers that the float type represents exactly. Sums in
-rows are products with a triangular matrix, which is fast on every device and, unlike a scan, vectorised.
+which are small enough that all their sums, in any order, are integers that the float type represents exactly. Sums
+within rows are products with a triangular matrix, which are fast on every device and, unlike a scan, vectorised.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
 ROW = 32
+"""Number of columns of the arrays of weights."""
 
 Digits = tuple[Array, ...]
 
@@ -20,14 +21,17 @@ Digits = tuple[Array, ...]
 def positions(
     weights: Float[Array, "rows 32"], total: int | Float[Array, ""]
 ) -> tuple[Int[Array, "rows 32"], Float[Array, "rows 32"]]:
-    """Running totals of `weights`, row after row, scaled to end at `total`: whole numbers and fractions in [0, 1].
+    """The cumulative sum of weights, row by row, scaled to end at `total`, as integers and fractions in [0, 1].
 
-    They never decrease; a weight of zero, and one below 2e-12 of the sum (float32), adds exactly nothing. The whole
-    number is `total` from the last weighted entry on, whatever the fraction, and earlier at most that.
-    `total` is itself whole, from 0 to the number of weights.
+    It never decreases; a weight of zero, or below 2e-12 of the sum in float32, adds exactly 0. The integer part is
+    `total` from the last positive weight on, whatever the fraction, and at most `total` before.
+
+    Args:
+        weights: (rows, 32), not negative.
+        total: An integer from 0 to the number of weights.
 
     Raises:
-        ValueError: more than 2**23 weights in float32 (2**52 in float64), whose sums it cannot hold exactly.
+        ValueError: If there are more than 2**23 weights in float32 (2**52 in float64), whose sums are not exact.
     """
     mantissa = jnp.finfo(weights.dtype).nmant
     high_bits = mantissa - (weights.size - 1).bit_length()
@@ -41,7 +45,7 @@ def positions(
     digits = _digits(weights, total * unit, low_unit)
     high, low = _carry(_running_sums(digits, lambda digits: _carry(digits, low_unit)), low_unit)
 
-    # The sum that scaled the weights was rounded; now the true one is known, to the last digit.
+    # The sum that scaled the weights was rounded; the exact sum corrects the scale.
     last_high, last_low = high[-1, -1], low[-1, -1]
     excess = (last_high - total * unit) * low_unit + last_low
     rate = excess / jnp.maximum(last_high * low_unit + last_low, 1.0)
@@ -55,12 +59,12 @@ def positions(
 
 
 def in_rows(values: Num[Array, " n"]) -> Num[Array, "rows 32"]:
-    """The values in rows of 32, zeros after the last."""
+    """The values in rows of 32, padded with zeros."""
     return jnp.pad(values, (0, -values.size % ROW)).reshape(-1, ROW)
 
 
 def running_count(counts: Int[Array, "rows 32"]) -> Int[Array, "rows 32"]:
-    """Running totals, row after row, of whole numbers from 0 up that sum to at most 2**24."""
+    """The cumulative sum, row by row, of nonnegative integers whose sum is at most 2**24."""
     (running,) = _running_sums((counts.astype(jnp.float32),), lambda digits: digits)
     return running.astype(jnp.int32)
 
@@ -79,9 +83,9 @@ def _carry(digits: Digits, low_unit: float) -> Digits:
 
 
 def _running_sums(digits: Digits, carry: Callable[[Digits], Digits]) -> Digits:
-    """Running sums of `(rows, row)` arrays, row after row; `carry` keeps the low digit of the rows' totals small."""
+    """Cumulative sums of (rows, 32) arrays, row by row; `carry` bounds the low digits of the sums of rows."""
     triangle = np.triu(np.ones((ROW, ROW), digits[0].dtype))
-    # Full precision: accelerators would otherwise round the factors to ten bits.
+    # Full precision, because accelerators round the factors to ten bits of mantissa by default.
     inside = [jnp.matmul(digit, triangle, precision="highest") for digit in digits]
     count = len(digits[0])
     if count == 1:
@@ -89,5 +93,5 @@ def _running_sums(digits: Digits, carry: Callable[[Digits], Digits]) -> Digits:
     totals = carry(tuple(sums[:, -1] for sums in inside))
     through = carry(_running_sums(tuple(in_rows(total) for total in totals), carry))
     starts = [sums.reshape(-1)[:count] - total for sums, total in zip(through, totals, strict=True)]
-    # Two axes, not one: with the rows' starts spread over a flat axis the CPU compiler gives up vectorising.
+    # The result keeps two axes, because the CPU compiler does not vectorise the addition over a flat axis.
     return tuple(sums + start[:, None] for sums, start in zip(inside, starts, strict=True))

@@ -1,7 +1,7 @@
-r"""Log densities to be maximised: log evidence of filters, priors, and what particle filters draw at every step.
+r"""Log densities to maximise: the log evidence of a filter, priors, and the randomness of particle filters.
 
-A log density is a function `theta -> log p`. One that draws random numbers is `(key, theta) -> log p`, and becomes one
-to be maximised by either of two choices: `common_random_numbers` or `fresh_keys`.
+A log density is a function `theta -> log p`. A random one, such as the estimate of a particle filter, is a function
+`(key, theta) -> log p`; `common_random_numbers` or `fresh_keys` turn it into a log density.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ RandomLogDensity = Callable[[AnyKey, PyTree], Float[Array, ""]]
 
 @pytree_dataclass
 class CommonRandomNumbers:
-    """A random log density with one key for all parameters."""
+    """A random log density, evaluated with one key for all parameters."""
 
     key: AnyKey
     log_density: RandomLogDensity
@@ -36,7 +36,7 @@ class CommonRandomNumbers:
 
 @pytree_dataclass
 class FreshKeys:
-    """A random log density with a new key at every step of the search."""
+    """A random log density, evaluated with a new key in every step of a search."""
 
     key: AnyKey
     log_density: RandomLogDensity
@@ -51,7 +51,7 @@ class FreshKeys:
 
 @pytree_dataclass
 class WithPrior:
-    """A log density and a log prior."""
+    """The sum of a log density and a log prior."""
 
     log_density: Callable
     log_prior: LogDensity
@@ -60,41 +60,55 @@ class WithPrior:
         return self.at(jnp.zeros((), jnp.int32), theta)
 
     def at(self, step: Int[Array, ""], theta: PyTree) -> Float[Array, ""]:
-        """Their sum, as seen at a step."""
+        """The sum with the random numbers of a step."""
         return at_step(self.log_density, step, theta) + self.log_prior(theta)
 
 
 def common_random_numbers(key: AnyKey, log_density: RandomLogDensity) -> CommonRandomNumbers:
-    """The log density with the same random numbers for all parameters: a search sees one function.
+    """The log density with the same random numbers for all parameters, so that a search sees a fixed function.
 
-    For every method. A particle filter's estimate jumps where resampling chooses otherwise, and its maximum is that
-    of one draw: take many particles.
+    It suits every method. The estimate of a particle filter is discontinuous where resampling selects other particles,
+    and its maximum is that of one realisation: use many particles.
+
+    Args:
+        key: Random key.
+        log_density: `(key, theta) -> log p`.
     """
     return CommonRandomNumbers(key, as_pytree(log_density))
 
 
 def fresh_keys(key: AnyKey, log_density: RandomLogDensity) -> FreshKeys:
-    """The log density with new random numbers at every step, for first-order methods: no draw is fitted.
+    """The log density with new random numbers in every step: stochastic approximation, for first-order methods.
 
-    The steps must be small enough to average the noise.
+    The learning rate must be small enough to average the noise (H. Robbins and S. Monro, "A stochastic approximation
+    method", Annals of Mathematical Statistics 22, 1951).
+
+    Args:
+        key: Random key.
+        log_density: `(key, theta) -> log p`.
     """
     return FreshKeys(key, as_pytree(log_density))
 
 
 def with_prior(log_density: Callable, log_prior: LogDensity) -> WithPrior:
-    """Log posterior but for a constant: its maximum is the most probable `theta`, in the coordinates of `theta`."""
+    """The unnormalised log posterior: its maximum is the maximum a posteriori estimate of `theta`.
+
+    Args:
+        log_density: A log density, or what `common_random_numbers` or `fresh_keys` return.
+        log_prior: `theta -> log p(theta)`, a density with respect to `theta` itself, not to its coordinates.
+    """
     return WithPrior(as_pytree(log_density), as_pytree(log_prior))
 
 
 def is_noisy(log_density: Callable) -> bool:
-    """Whether the log density changes from step to step."""
+    """Whether the log density uses new random numbers in every step."""
     if isinstance(log_density, WithPrior):
         return is_noisy(log_density.log_density)
     return isinstance(log_density, FreshKeys)
 
 
 def at_step(log_density: Callable, step: Int[Array, ""], theta: PyTree) -> Float[Array, ""]:
-    """The log density as seen at a step."""
+    """The log density with the random numbers of a step, if it uses any."""
     if isinstance(log_density, FreshKeys | WithPrior):
         return log_density.at(step, theta)
     return log_density(theta)
@@ -102,7 +116,7 @@ def at_step(log_density: Callable, step: Int[Array, ""], theta: PyTree) -> Float
 
 @pytree_dataclass
 class LogEvidence:
-    """Log evidence of a sequence, or the sum over several, as a function of the parameters."""
+    """The log evidence of a sequence, or its sum over several sequences, as a function of the parameters."""
 
     filter_of: Callable[[PyTree], Filter]
     observations: PyTree
@@ -134,20 +148,37 @@ def log_evidence(
     mask: Array | np.ndarray | None = None,
     draws: Callable[[AnyKey, RandomLogDensity], Any] = common_random_numbers,
 ) -> Any:
-    """Log evidence log p(y_1:T | theta) of one sequence, to be maximised.
+    """The marginal log-likelihood log p(y_1:T | theta) of one sequence as a function of theta, for `maximize`.
+
+    NaN in the observations means what the filter takes it for, as in `jaxfilters.run`: a Gaussian filter treats it as
+    a missing component, a particle filter's likelihood usually becomes NaN. `maximize` reports a log evidence that is
+    not finite at the start.
 
     Args:
         key: Random key; deterministic filters ignore it.
-        filter_of: `theta -> Filter`. Compared by identity: a function made anew compiles anew.
-        observations: As for `jaxfilters.run`, time first.
-        controls: As for `jaxfilters.run`.
-        mask: `False` where a frame was not seen.
-        draws: What a particle filter draws at each step of the search: `common_random_numbers` or `fresh_keys`.
+        filter_of: `theta -> Filter`. Functions are compared by identity: a new function object compiles anew.
+        observations: Pytree of arrays with time as their first axis, as for `jaxfilters.run`.
+        controls: Known inputs, time first, as for `jaxfilters.run`.
+        mask: (T,), `False` for frames without an observation.
+        draws: `common_random_numbers` or `fresh_keys`: the random numbers of a particle filter in a search.
+
+    Returns:
+        A callable pytree `theta -> log p(y_1:T | theta)`.
 
     Raises:
-        ValueError: If an observation is NaN and no mask says that it is missing.
+        ValueError: If `observations` has no array, or `observations`, `controls` and `mask` differ in length.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> def filter_of(noise):
+        ...     prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        ...     return jf.extended_kalman(prior, lambda x, u: x, jnp.eye(1), lambda x: x, noise**2 * jnp.eye(1))
+        >>> log_density = jf.fit.log_evidence(jax.random.key(0), filter_of, jnp.zeros((10, 1)))
+        >>> log_density(1.0).shape
+        ()
     """
-    check_observations(observations, mask)
+    _check_lengths(observations, controls, mask)
     return draws(key, LogEvidence(as_pytree(filter_of), observations, controls, mask))
 
 
@@ -160,43 +191,99 @@ def over_sequences(
     mask: Array | np.ndarray | None = None,
     draws: Callable[[AnyKey, RandomLogDensity], Any] = common_random_numbers,
 ) -> Any:
-    """Log evidence of several sequences with the same parameters, to be maximised; arguments as `log_evidence`.
+    """The marginal log-likelihood of n sequences that share their parameters: the sum of those of all sequences.
 
-    Sequences lie along the last axis of every leaf, of the mask `(t, n)` and of the controls too, and are filtered
-    together. Shorter ones are padded, and the padding masked: `jaxfilters.hmm.pad` does it.
+    Arguments are those of `log_evidence`, with the sequences along the last axis of every leaf of `observations` and
+    `controls` and of `mask` (T, n). Shorter sequences are padded, and the padding is masked: see `jaxfilters.hmm.pad`.
+
+    Returns:
+        A callable pytree `theta -> sum of log p(y_1:T | theta)`.
+
+    Raises:
+        ValueError: If `observations` has no array, or lengths or numbers of sequences differ.
     """
-    check_observations(observations, mask)
+    _check_lengths(observations, controls, mask)
+    counts = {
+        f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)
+        for name, tree in (("observations", observations), ("controls", controls), ("mask", mask))
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
+    if any(len(shape) < 2 for shape in counts.values()) or len({shape[-1] for shape in counts.values()}) != 1:
+        raise ValueError(
+            f"observations, controls and mask must share one number of sequences along their last axis, which is not "
+            f"the axis of time; got shapes {counts}."
+        )
     return draws(key, LogEvidence(as_pytree(filter_of), observations, controls, mask, sequences=True))
 
 
-def check_observations(observations: PyTree, mask: Array | np.ndarray | None = None) -> None:
-    """Reject NaN that nothing declares as missing; under `vmap` and `jit`, where values are not known, do nothing.
+def _check_lengths(observations: PyTree, controls: PyTree, mask: Array | np.ndarray | None) -> None:
+    shapes = {
+        f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)
+        for name, tree in (("observations", observations), ("controls", controls), ("mask", mask))
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
+    if not jax.tree.leaves(observations):
+        raise ValueError("observations must have at least one array with time as its first axis; got none.")
+    if () in shapes.values() or len({shape[0] for shape in shapes.values()}) != 1:
+        raise ValueError(
+            f"observations, controls and mask must share one length along their first axis, time; got shapes {shapes}."
+        )
 
-    Args:
-        observations: Leaves with time first; of a `Measured`, the components that its own mask leaves out may be NaN.
-        mask: `(t,)`, or `(t, n)` for sequences along the last axis: False where nothing was seen.
 
-    Raises:
-        ValueError: Naming the leaf and the first such frame.
-    """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((observations, mask))):
-        return
+def explain_not_finite(log_density: Callable, theta: PyTree) -> str:
+    """Why a log density is not finite at `theta`: a clause for an error message, or '' if the cause is unknown."""
+    if isinstance(log_density, WithPrior):
+        prior = float(log_density.log_prior(theta))
+        return (
+            f"the log prior is {prior}"
+            if not np.isfinite(prior)
+            else explain_not_finite(log_density.log_density, theta)
+        )
+    if not isinstance(log_density, CommonRandomNumbers | FreshKeys):
+        return ""
+    evidence = log_density.log_density
+    if not isinstance(evidence, LogEvidence):
+        return ""
+    undeclared = _undeclared_nan(evidence.observations, evidence.mask)
+    if undeclared:
+        return f"{undeclared}, which this filter does not treat as missing: pass mask"
+    return f"the log evidence {_first_bad_frame(log_density.key, evidence, theta)}"
+
+
+def _first_bad_frame(key: AnyKey, evidence: LogEvidence, theta: PyTree) -> str:
+    if evidence.sequences:
+        return "of at least one sequence is not finite: the parameters at the start may rule the observations out"
+    run = filters.run(
+        evidence.filter_of(theta),
+        key,
+        evidence.observations,
+        evidence.controls,
+        mask=evidence.mask,
+        collect=filters.keep_info,
+    )
+    per_frame = np.asarray(run[1].log_evidence)
+    frames = np.flatnonzero(~np.isfinite(per_frame))
+    if not len(frames):
+        return "is not finite with the random numbers of the search, but is with others"
+    return f"of frame {frames[0]} is {per_frame[frames[0]]}: the parameters at the start may rule the observation out"
+
+
+def _undeclared_nan(observations: PyTree, mask: Array | np.ndarray | None) -> str:
+    """Names the first NaN that no mask marks as missing, e.g. "observations['y'] is NaN in frame 3"; '' if none."""
     found = jax.tree_util.tree_leaves_with_path(observations, is_leaf=lambda node: isinstance(node, Observation))
     for path, leaf in found:
         y, own_mask = (leaf.y, leaf.mask) if isinstance(leaf, Observation) else (leaf, None)
         y = np.asarray(y)
         if not np.issubdtype(y.dtype, np.floating):
             continue
-        missing = np.isnan(y)
+        undeclared = np.isnan(y)
         if own_mask is not None:
-            missing = missing & np.asarray(own_mask)
+            undeclared = undeclared & np.asarray(own_mask)
         if mask is not None:
-            seen = np.asarray(mask)
-            missing = missing & seen.reshape(seen.shape[0], *[1] * (y.ndim - seen.ndim), *seen.shape[1:])
-        if missing.any():
-            name = f"observations{jax.tree_util.keystr(path)}"
-            frame = int(np.argwhere(missing)[0, 0])
-            raise ValueError(
-                f"{name} must not be NaN where mask does not say that it is missing; got NaN in frame {frame}, "
-                f"and in {int(missing.sum())} numbers altogether."
-            )
+            observed = np.asarray(mask)
+            shape = (observed.shape[0], *[1] * (y.ndim - observed.ndim), *observed.shape[1:])
+            undeclared = undeclared & observed.reshape(shape)
+        if undeclared.any():
+            name, frame = f"observations{jax.tree_util.keystr(path)}", int(np.argwhere(undeclared)[0, 0])
+            return f"{name} is NaN in frame {frame} ({int(undeclared.sum())} NaN in all)"
+    return ""

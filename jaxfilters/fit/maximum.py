@@ -1,73 +1,22 @@
-"""Parameters by maximum likelihood, or with a prior by maximum a posteriori, and how certain they are."""
+"""Maximum likelihood and maximum a posteriori estimates with standard errors."""
 
 from collections.abc import Callable
-from dataclasses import field
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.fit.chart import Chart, boxed, chart_about, check_inside
 from jaxfilters.fit.constraints import free
-from jaxfilters.fit.density import at_step, is_noisy
+from jaxfilters.fit.density import at_step, explain_not_finite, is_noisy
 from jaxfilters.fit.methods import FirstOrder, LeastSquares, Residuals, bfgs
-from jaxfilters.fit.search import Method, Search, begin, descend
-from jaxfilters.fit.uncertainty import Errors, intervals, observed_information
+from jaxfilters.fit.parametrization import Parametrization, check_start, parametrize, with_box_bounds
+from jaxfilters.fit.result import Fit
+from jaxfilters.fit.search import Method, SearchState, initial_search, minimize
+from jaxfilters.fit.uncertainty import Errors, ErrorStatus, Uncertainty, intervals, observed_information
 from jaxfilters.typing import as_pytree
-
-
-@pytree_dataclass
-class Fit:
-    """Parameters, how certain they are, and how they were found. Printed, it is a table."""
-
-    theta: PyTree
-    standard_errors: PyTree
-    """Like `theta`: from the observed information; NaN where the search did not end at a maximum."""
-    lower: PyTree
-    upper: PyTree
-    """Like `theta`: 95 % intervals. Of numbers with a coordinate of their own they are the mapped intervals of that
-    coordinate, and never leave the constraint."""
-    log_density: Float[Array, "..."]
-    """At `theta`."""
-    covariance: Float[Array, "..."]
-    """(d, d): of the coordinates."""
-    search: Search
-    chart: Chart
-    method: Method = field(metadata={"static": True})
-
-    @property
-    def num_steps(self) -> Int[Array, "..."]:
-        """Steps taken, those before a restart among them."""
-        return self.search.step
-
-    @property
-    def converged(self) -> Bool[Array, "..."]:
-        """Whether the method's own criterion ended the search."""
-        return self.search.done
-
-    @property
-    def trajectory(self) -> np.ndarray:
-        """Minus the log density at every step since the last start; for a fit that is not batched."""
-        return np.asarray(self.search.losses)[: int(self.search.step - self.search.first)]
-
-    @property
-    def ending(self) -> str:
-        """Why the search ended, in words; for a fit that is not batched."""
-        steps = int(self.num_steps)
-        if bool(self.search.failed):
-            names = self.chart.names
-            wrong = list(dict.fromkeys(names[i] for i in np.flatnonzero(self.search.not_finite)))
-            what = f"gradient of {', '.join(wrong)}" if wrong else "log density"
-            return f"{what} not finite in step {steps - 1}; kept the last good value"
-        return f"converged after {steps} steps" if bool(self.converged) else f"stopped after {steps} steps"
-
-    def __str__(self) -> str:
-        from jaxfilters.fit.report import report
-
-        return report(self)
 
 
 def maximize(
@@ -78,81 +27,117 @@ def maximize(
     method: Method | None = None,
     errors: Errors = observed_information,
 ) -> Fit:
-    """Parameters at a maximum of a log density, with their standard errors.
+    """Parameters at a local maximum of a log density, with their standard errors.
 
-    Under `vmap`, over starts, data or both, the `Fit` has stacked leaves, and values are not checked.
+    Under `vmap`, over starts, data or both, the leaves of the `Fit` are stacked, and values are not checked.
 
     Args:
         log_density: `theta -> log p`, or what `log_evidence`, `common_random_numbers`, `fresh_keys`, `with_prior` or
-            `residuals` make. Functions are compared by identity: data belong in a pytree or a `Partial`.
-        start: Parameters to start from, or a `Fit` to continue.
-        constraints: One constraint for every leaf of `start`, or for a whole branch. A `Fit` keeps its own.
+            `residuals` return. Functions are compared by identity: data belong in a pytree or a `Partial`.
+        start: Parameters from which to start, or a `Fit` to continue.
+        constraints: A tree of constraints like `start`, or a prefix of it. A `Fit` keeps its own.
         method: `bfgs()` (default), `lbfgsb()`, `adam()`, `first_order(...)` or `least_squares()`.
-        errors: How certain the parameters are: `observed_information` or `no_errors`.
+        errors: `observed_information` or `no_errors`.
+
+    Returns:
+        The fit. `fit.converged` and `fit.termination` say how the search ended, `fit.missing_errors` which parameters
+        have no standard error, and why.
 
     Raises:
-        ValueError: If `start` is outside its constraints, or the method does not serve the log density.
+        ValueError: If `start` violates its constraints, the log density is not finite there, or the method does not
+            support the log density.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> fit = jf.fit.maximize(lambda x: -0.5 * jnp.sum((x - 3.0) ** 2), jnp.zeros(2))
+        >>> print(fit.theta, fit.standard_errors)
+        [3. 3.] [1. 1.]
     """
     method = bfgs() if method is None else method
     _check_method(method, log_density)
     log_density = as_pytree(log_density)
     if isinstance(start, Fit) and start.method == method:
-        return _continue(log_density, start, errors)
+        found = _continue(log_density, start, errors)
+        _check_first_step(log_density, found, start.theta)
+        return found
     if isinstance(start, Fit):
-        start, constraints = start.theta, jax.tree.unflatten(jax.tree.structure(start.theta), start.chart.constraints)
-    chart = chart_about(start, constraints)
-    check_inside(chart)
-    return _start(log_density, boxed(chart) if method.knows_bounds else chart, method, errors)
+        tree = jax.tree.structure(start.theta)
+        start, constraints = start.theta, jax.tree.unflatten(tree, start.parametrization.constraints)
+    parametrization = parametrize(start, constraints)
+    check_start(parametrization)
+    parametrization = with_box_bounds(parametrization) if method.supports_bounds else parametrization
+    found = _start(log_density, parametrization, method, errors)
+    _check_first_step(log_density, found, parametrization.origin)
+    return found
 
 
 @pytree_dataclass
 class _Negative:
-    """Minus the log density in the coordinates."""
+    """Minus the log density as a function of the coordinates."""
 
     log_density: Callable
-    chart: Chart
+    parametrization: Parametrization
 
     def __call__(self, step, z):
-        return -at_step(self.log_density, step, self.chart.point(z))
+        return -at_step(self.log_density, step, self.parametrization.constrain(z))
 
     def residuals(self, z):
-        return self.log_density.function(self.chart.point(z))
+        return self.log_density.function(self.parametrization.constrain(z))
 
 
 @partial(jax.jit, static_argnames=("method", "errors"))
-def _start(log_density: Callable, chart: Chart, method: Method, errors: Errors) -> Fit:
-    loss, bounds = _Negative(log_density, chart), chart.bounds()
-    search = begin(method, loss, chart.coordinates(chart.origin), bounds)
-    return _finished(loss, descend(method, loss, search, bounds), method, errors)
+def _start(log_density: Callable, parametrization: Parametrization, method: Method, errors: Errors) -> Fit:
+    loss, bounds = _Negative(log_density, parametrization), parametrization.bounds()
+    search = initial_search(method, loss, parametrization.unconstrain(parametrization.origin), bounds)
+    return _finished(loss, minimize(method, loss, search, bounds), method, errors)
 
 
 @partial(jax.jit, static_argnames="errors")
 def _continue(log_density: Callable, fit: Fit, errors: Errors) -> Fit:
-    loss = _Negative(log_density, fit.chart)
+    loss = _Negative(log_density, fit.parametrization)
     search = fit.search._replace(failed=jnp.zeros((), bool))
-    return _finished(loss, descend(fit.method, loss, search, fit.chart.bounds()), fit.method, errors)
+    return _finished(loss, minimize(fit.method, loss, search, fit.parametrization.bounds()), fit.method, errors)
 
 
-def _finished(loss: _Negative, search: Search, method: Method, errors: Errors) -> Fit:
-    here = partial(loss, search.step)
-    lower_bound, upper_bound = loss.chart.bounds()
-    held = (search.z <= lower_bound) | (search.z >= upper_bound)
+def _finished(loss: _Negative, search: SearchState, method: Method, errors: Errors) -> Fit:
+    at_last_step = partial(loss, search.step)
+    lower_bound, upper_bound = loss.parametrization.bounds()
+    at_bound = (search.z <= lower_bound) | (search.z >= upper_bound)
 
-    def of_the_rest(z):
-        return here(jnp.where(held, search.z, z)) + 0.5 * jnp.sum(jnp.where(held, z, 0.0) ** 2)
+    def of_interior(z: Array) -> Array:
+        # A quadratic term for the coordinates at bounds keeps the information matrix regular.
+        return at_last_step(jnp.where(at_bound, search.z, z)) + 0.5 * jnp.sum(jnp.where(at_bound, z, 0.0) ** 2)
 
-    # What a bound holds is as if it were known.
-    covariance = jnp.where(held[:, None] | held, 0.0, errors(of_the_rest, search.z))
-    theta = loss.chart.point(search.z)
-    spread, lower, upper = intervals(loss.chart, search.z, covariance)
-    return Fit(theta, spread, lower, upper, -here(search.z), covariance, search, loss.chart, method)
+    covariance, status = errors(of_interior, search.z)
+    # The standard errors are conditional on the active bounds.
+    status = jnp.where(at_bound, ErrorStatus.AT_BOUND, status)
+    covariance = jnp.where(at_bound[:, None] | at_bound, 0.0, covariance)
+    theta = loss.parametrization.constrain(search.z)
+    found = intervals(loss.parametrization, search.z, Uncertainty(covariance, status))
+    log_density = -at_last_step(search.z)
+    noisy = is_noisy(loss.log_density)
+    return Fit(theta, *found, log_density, covariance, search, loss.parametrization, method, noisy)
+
+
+def _check_first_step(log_density: Callable, found: Fit, start: PyTree) -> None:
+    """Reject a log density that is not finite where the search starts; tracers are not checked."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(found)):
+        return
+    search = found.search
+    if np.ndim(search.failed) or not search.failed or search.step - search.first_step > 1:
+        return
+    value = float(at_step(log_density, search.first_step, start))
+    if not np.isfinite(value):
+        because = explain_not_finite(log_density, start)
+        raise ValueError(f"log_density must be finite at start; got {value}{': ' if because else ''}{because}.")
 
 
 def _check_method(method: Method, log_density: Callable) -> None:
     if is_noisy(log_density) and not isinstance(method, FirstOrder):
         raise ValueError(
             f"method must be of first order, such as fit.adam(), for a log density with fresh keys; got "
-            f"{type(method).__name__}. Or take fit.common_random_numbers."
+            f"{type(method).__name__}. Fixed random numbers, fit.common_random_numbers, suit every method."
         )
     if isinstance(method, LeastSquares) and not isinstance(log_density, Residuals):
         raise ValueError(f"log_density must be made by fit.residuals for least squares; got {log_density!r}.")

@@ -1,6 +1,6 @@
-"""Ways to search: first order, quasi-Newton, quasi-Newton within bounds, least squares.
+"""Search methods: first order, quasi-Newton, quasi-Newton within bounds, and least squares.
 
-Each is made by a function and is compared by value: the same options, made again, compile nothing.
+Methods are compared by value: a second method with the same options does not compile again.
 """
 
 import warnings
@@ -16,34 +16,40 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.fit.search import Move
+from jaxfilters.fit.search import StepResult
 from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt
 from jaxfilters.typing import as_pytree
 
 _SMOOTHING = 0.9
+"""Factor of the exponential moving average of the loss by which a first-order search decides whether it improves."""
 _ARMIJO = 1e-4
-_SHORTEST = 1e-10
+"""Constant of the sufficient decrease condition (Nocedal and Wright, equation 3.4)."""
+_MIN_STEP_LENGTH = 1e-10
+"""Step length at which the backtracking line search gives up."""
 
 
 class FirstOrderState(NamedTuple):
-    """Of a first-order search."""
+    """State of a first-order search."""
 
     inner: PyTree
+    """State of the gradient transformation."""
     previous: Float[Array, " d"]
-    smooth: Float[Array, ""]
-    best: Float[Array, ""]
-    stale: Int[Array, ""]
+    """Coordinates before the last step."""
+    smoothed_loss: Float[Array, ""]
+    best_loss: Float[Array, ""]
+    """Lowest smoothed loss so far."""
+    steps_without_gain: Int[Array, ""]
 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """Steps that a gradient transformation makes; it ends when the smoothed loss has long not improved."""
+    """Steps of a gradient transformation, until the smoothed loss has not improved for `patience` steps."""
 
     transformation: optax.GradientTransformation
     max_steps: int
     tolerance: float
     patience: int
-    knows_bounds = False
+    supports_bounds = False
 
     def init(self, objective: Any, z: Array, bounds: tuple[Array, Array]) -> FirstOrderState:
         """State before the first step."""
@@ -51,83 +57,93 @@ class FirstOrder:
         infinite = jnp.full((), jnp.inf, z.dtype)
         return FirstOrderState(self.transformation.init(z), z, infinite, infinite, jnp.zeros((), jnp.int32))
 
-    def step(self, objective: Any, step: Array, z: Array, state: FirstOrderState, bounds: tuple[Array, Array]) -> Move:
+    def step(
+        self, objective: Any, step: Array, z: Array, state: FirstOrderState, bounds: tuple[Array, Array]
+    ) -> StepResult:
         """One step along the transformed gradient."""
         del bounds
         loss, gradient = jax.value_and_grad(objective, 1)(step, z)
         update, inner = self.transformation.update(gradient, state.inner, z)
-        smooth = jnp.where(jnp.isinf(state.smooth), loss, _SMOOTHING * state.smooth + (1 - _SMOOTHING) * loss)
-        improved = smooth < state.best - self.tolerance
-        stale = jnp.where(improved, 0, state.stale + 1)
-        after = FirstOrderState(inner, z, smooth, jnp.where(improved, smooth, state.best), stale)
-        return Move(z + update, after, loss, gradient, state.previous, stale >= self.patience)
+        average = _SMOOTHING * state.smoothed_loss + (1 - _SMOOTHING) * loss
+        smoothed = jnp.where(jnp.isinf(state.smoothed_loss), loss, average)
+        improved = smoothed < state.best_loss - self.tolerance
+        stalled = jnp.where(improved, 0, state.steps_without_gain + 1)
+        after = FirstOrderState(inner, z, smoothed, jnp.where(improved, smoothed, state.best_loss), stalled)
+        return StepResult(z + update, after, loss, gradient, state.previous, stalled >= self.patience)
 
 
 class BfgsState(NamedTuple):
-    """Where a quasi-Newton search stands, and where it looks next."""
+    """State of a quasi-Newton search: the last accepted point's loss and gradient, and the next trial point."""
 
     trial: Float[Array, " d"]
+    """The point that the next step evaluates."""
     loss: Float[Array, ""]
     gradient: Float[Array, " d"]
-    inverse: Float[Array, "d d"]
-    """Of the Hessian, approximately."""
+    inverse_hessian: Float[Array, "d d"]
+    """Approximation of the inverse Hessian."""
     direction: Float[Array, " d"]
     length: Float[Array, ""]
-    taken: Int[Array, ""]
-    """How many points were taken, the first one included."""
+    """Step length along `direction`."""
+    num_accepted: Int[Array, ""]
+    """Number of accepted points, including the first one."""
 
 
 @dataclass(frozen=True)
 class Bfgs:
-    """Quasi-Newton steps with backtracking (J. Nocedal, S. Wright, "Numerical optimization", 2006, algorithm 6.1).
+    """Quasi-Newton steps with backtracking (J. Nocedal and S. Wright, "Numerical optimization", 2006, algorithm 6.1).
 
-    One step is one look at the loss and its gradient. It ends when the next whole step promises too little gain.
+    One step evaluates the loss and its gradient once. The search converges when the predicted decrease of the next full
+    step is at most `tolerance`.
     """
 
     max_steps: int
     tolerance: float
-    knows_bounds = False
+    supports_bounds = False
 
     def init(self, objective: Any, z: Array, bounds: tuple[Array, Array]) -> BfgsState:
-        """State before the first look."""
+        """State before the first evaluation."""
         del objective, bounds
         infinite, one = jnp.full((), jnp.inf, z.dtype), jnp.ones((), z.dtype)
         none = jnp.zeros_like(z)
         return BfgsState(z, infinite, none, jnp.eye(z.size, dtype=z.dtype), none, one, jnp.zeros((), jnp.int32))
 
-    def step(self, objective: Any, step: Array, z: Array, state: BfgsState, bounds: tuple[Array, Array]) -> Move:
-        """Look at the trial point; take it or shorten the step to it."""
+    def step(self, objective: Any, step: Array, z: Array, state: BfgsState, bounds: tuple[Array, Array]) -> StepResult:
+        """Evaluate the trial point, and accept it or halve the step."""
         del bounds
         loss, gradient = jax.value_and_grad(objective, 1)(step, state.trial)
         descent = jnp.sum(state.gradient * state.direction)
-        # Losses that differ by their own rounding are equal.
+        # Differences below the rounding error of the loss count as zero.
         rounding = 4 * jnp.finfo(z.dtype).eps * jnp.abs(state.loss)
-        first = state.taken == 0
-        take = first | (loss <= state.loss + _ARMIJO * state.length * descent + rounding)
-        at = jnp.where(take, state.trial, z)
-        kept, slope = jnp.where(take, loss, state.loss), jnp.where(take, gradient, state.gradient)
-        inverse = jnp.where(take, _updated(state, state.trial - z, gradient), state.inverse)
-        direction = jnp.where(take, -_product(inverse, slope), state.direction)
-        length = jnp.where(take, 1.0, 0.5 * state.length)
-        promised = -0.5 * jnp.sum(slope * direction)
-        done = (take & ~first & (promised <= self.tolerance)) | (length < _SHORTEST)
-        after = BfgsState(at + length * direction, kept, slope, inverse, direction, length, state.taken + take)
-        return Move(at, after, kept, slope, z, done)
+        first = state.num_accepted == 0
+        accept = first | (loss <= state.loss + _ARMIJO * state.length * descent + rounding)
+        accepted = jnp.where(accept, state.trial, z)
+        loss, slope = jnp.where(accept, loss, state.loss), jnp.where(accept, gradient, state.gradient)
+        inverse = jnp.where(accept, _updated_inverse(state, state.trial - z, gradient), state.inverse_hessian)
+        direction = jnp.where(accept, -_product(inverse, slope), state.direction)
+        length = jnp.where(accept, 1.0, 0.5 * state.length)
+        predicted = -0.5 * jnp.sum(slope * direction)
+        converged = (accept & ~first & (predicted <= self.tolerance)) | (length < _MIN_STEP_LENGTH)
+        after = BfgsState(
+            accepted + length * direction, loss, slope, inverse, direction, length, state.num_accepted + accept
+        )
+        return StepResult(accepted, after, loss, slope, z, converged)
 
 
-def _updated(state: BfgsState, step: Array, gradient: Array) -> Array:
-    """The inverse Hessian after a step: equations 6.17 and, before the first update, 6.20."""
+def _updated_inverse(state: BfgsState, step: Array, gradient: Array) -> Array:
+    """The inverse Hessian approximation after an accepted step (Nocedal and Wright, equations 6.17 and 6.20)."""
     unit = jnp.eye(step.size, dtype=step.dtype)
     change = gradient - state.gradient
     curvature, square = jnp.sum(step * change), jnp.sum(change**2)
     curved = curvature > jnp.finfo(step.dtype).eps * jnp.sqrt(jnp.sum(step**2) * square)
     rate = 1 / jnp.where(curved, curvature, 1.0)
-    before = jnp.where(state.taken == 1, curvature / jnp.where(curved, square, 1.0) * unit, state.inverse)
+    # Before the first update the identity is scaled to the observed curvature: equation 6.20.
+    scaled = curvature / jnp.where(curved, square, 1.0) * unit
+    before = jnp.where(state.num_accepted == 1, scaled, state.inverse_hessian)
     left = unit - rate * jnp.outer(step, change)
     after = _product(_product(left, before), left.T) + rate * jnp.outer(step, step)
-    # The first step of all is at most one long.
-    begun = unit / jnp.maximum(1.0, jnp.sqrt(jnp.sum(gradient**2)))
-    return jnp.where(state.taken == 0, begun, jnp.where(curved, after, state.inverse))
+    # The very first step has at most unit length.
+    initial = unit / jnp.maximum(1.0, jnp.sqrt(jnp.sum(gradient**2)))
+    return jnp.where(state.num_accepted == 0, initial, jnp.where(curved, after, state.inverse_hessian))
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -136,20 +152,20 @@ def _product(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True)
 class Lbfgsb:
-    """Limited-memory quasi-Newton steps within bounds, by jaxopt."""
+    """Limited-memory quasi-Newton steps within bounds, by jaxopt (R. Byrd, P. Lu, J. Nocedal and C. Zhu, 1995)."""
 
     max_steps: int
     tolerance: float
-    knows_bounds = True
+    supports_bounds = True
 
     def init(self, objective: Any, z: Array, bounds: tuple[Array, Array]) -> Any:
         """State at the start."""
         return self._solver(lambda z: objective(jnp.zeros((), jnp.int32), z)).init_state(z, bounds)
 
-    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array]) -> Move:
-        """One iteration, line search included."""
+    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array]) -> StepResult:
+        """One iteration, including its line search."""
         moved, state = self._solver(lambda z: objective(step, z)).update(z, state, bounds)
-        return Move(moved, state, state.value, state.grad, z, state.error <= self.tolerance)
+        return StepResult(moved, state, state.value, state.grad, z, state.error <= self.tolerance)
 
     def _solver(self, fun: Callable) -> Any:
         with warnings.catch_warnings():
@@ -170,30 +186,35 @@ class Residuals:
 
 
 def residuals(function: Callable[[PyTree], PyTree]) -> Residuals:
-    """The log density of residuals with unit variance, for `least_squares`."""
+    """The log density of residuals with unit variance, for `least_squares`.
+
+    Args:
+        function: `theta -> residuals`, a pytree of arrays in units of their standard deviations; the residuals of a
+            Gaussian prior are further leaves.
+    """
     return Residuals(as_pytree(function))
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Levenberg-Marquardt within bounds, by optimistix and `jaxfilters.least_squares`."""
+    """Levenberg-Marquardt within bounds, by optimistix and `jaxfilters.optimize`."""
 
     max_steps: int
     tolerance: float
-    knows_bounds = True
+    supports_bounds = True
 
     def init(self, objective: Any, z: Array, bounds: tuple[Array, Array]) -> Any:
         """State before the first step."""
         del objective, bounds
         return self._solver().init(None, z, None, {}, None, None, frozenset())
 
-    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array]) -> Move:
+    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array]) -> StepResult:
         """One damped step."""
         options = {"lower": bounds[0], "upper": bounds[1]}
         function = lambda z, _: (objective.residuals(z), None)
         moved, state, _ = self._solver().step(function, z, None, options, state, frozenset())
         loss, gradient = jax.value_and_grad(objective, 1)(step, moved)
-        return Move(moved, state, loss, gradient, z, state.terminate)
+        return StepResult(moved, state, loss, gradient, z, state.terminate)
 
     def _solver(self) -> BoxLevenbergMarquardt:
         return BoxLevenbergMarquardt(rtol=self.tolerance, atol=self.tolerance)
@@ -203,41 +224,66 @@ class LeastSquares:
 def adam(
     learning_rate: float = 0.03, *, max_steps: int = 500, tolerance: float = 1e-3, patience: int = 30
 ) -> FirstOrder:
-    """Adam by optax, for large or noisy problems; arguments as `first_order`."""
+    """Adam (D. P. Kingma and J. Ba, ICLR 2015) by optax, for large or noisy problems.
+
+    Args:
+        learning_rate: Step size in the unconstrained coordinates.
+        max_steps: Upper bound on the number of steps.
+        tolerance: Least decrease of the smoothed loss that counts as an improvement.
+        patience: Number of steps without an improvement that ends the search.
+
+    Raises:
+        ValueError: If an option is out of range.
+    """
+    if not learning_rate > 0:
+        raise ValueError(f"learning_rate must be positive; got {learning_rate}.")
+    _check_options(max_steps, tolerance, patience)
     return FirstOrder(optax.adam(learning_rate), max_steps, tolerance, patience)
 
 
 def first_order(
     transformation: optax.GradientTransformation, *, max_steps: int = 500, tolerance: float = 1e-3, patience: int = 30
 ) -> FirstOrder:
-    """First-order search with any optax transformation.
+    """First-order search with any gradient transformation of optax.
 
     Args:
-        transformation: `init(z)` and `update(gradient, state, z)`. Compared by identity: make it once.
-        max_steps: Upper bound.
-        tolerance: Gain of the log density, averaged over some ten steps, that counts as one.
-        patience: Steps without such a gain that end the search.
+        transformation: `init(z)` and `update(gradient, state, z)`. It is compared by identity: a new one compiles anew.
+        max_steps: Upper bound on the number of steps.
+        tolerance: Least decrease of the smoothed loss that counts as an improvement.
+        patience: Number of steps without an improvement that ends the search.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance, patience)
     return FirstOrder(transformation, max_steps, tolerance, patience)
 
 
 def bfgs(*, max_steps: int = 200, tolerance: float = 1e-5) -> Bfgs:
-    """Quasi-Newton search, for smooth problems of up to some hundred parameters.
+    """Quasi-Newton search (BFGS), for smooth problems of up to some hundred parameters.
 
     Args:
-        max_steps: Upper bound of looks at the loss and its gradient.
-        tolerance: Promised gain of the log density that is not worth a step.
+        max_steps: Upper bound on the number of evaluations of the loss and its gradient.
+        tolerance: Predicted gain of the log density, in nats, below which the search has converged.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return Bfgs(max_steps, tolerance)
 
 
 def lbfgsb(*, max_steps: int = 100, tolerance: float = 1e-3) -> Lbfgsb:
-    """Quasi-Newton search that may end at the bounds of an `interval`, in the units of the parameter.
+    """Quasi-Newton search (L-BFGS-B) that may end at the bounds of an `interval`, in the units of the parameter.
 
     Args:
-        max_steps: Upper bound of iterations.
-        tolerance: Largest component of the projected gradient at the end.
+        max_steps: Upper bound on the number of iterations.
+        tolerance: Largest component of the projected gradient at convergence.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return Lbfgsb(max_steps, tolerance)
 
 
@@ -245,7 +291,18 @@ def least_squares(*, max_steps: int = 50, tolerance: float = 1e-6) -> LeastSquar
     """Levenberg-Marquardt search for `residuals`; it may end at the bounds of an `interval`.
 
     Args:
-        max_steps: Upper bound.
-        tolerance: Relative step, or component of the projected gradient, that ends the search.
+        max_steps: Upper bound on the number of steps.
+        tolerance: Relative step, or largest component of the projected gradient, at convergence.
+
+    Raises:
+        ValueError: If an option is out of range.
     """
+    _check_options(max_steps, tolerance)
     return LeastSquares(max_steps, tolerance)
+
+
+def _check_options(max_steps: int, tolerance: float, patience: int = 1) -> None:
+    if max_steps < 1 or patience < 1:
+        raise ValueError(f"max_steps and patience must be at least 1; got {max_steps} and {patience}.")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must not be negative; got {tolerance}.")

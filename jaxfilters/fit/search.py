@@ -1,4 +1,4 @@
-"""One compiled loop for every way to search: the losses on the way, when it ends, and what is kept if it fails."""
+"""The compiled loop that all search methods share: the history of the loss, termination, and non-finite values."""
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -7,50 +7,59 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
-class Move(NamedTuple):
-    """One step of a method."""
+class StepResult(NamedTuple):
+    """The result of one step of a method."""
 
     z: Float[Array, " d"]
+    """The coordinates after the step."""
     state: PyTree
+    """The state of the method after the step."""
     loss: Float[Array, ""]
+    """The loss at the last point that the step evaluated."""
     gradient: Float[Array, " d"]
-    """At the newest point that was looked at; where it is not finite, `good` is what is kept."""
-    good: Float[Array, " d"]
-    done: Bool[Array, ""]
+    """The gradient at that point."""
+    last_finite: Float[Array, " d"]
+    """The coordinates to keep if the loss or the gradient is not finite."""
+    converged: Bool[Array, ""]
 
 
 @runtime_checkable
 class Method(Protocol):
-    """How to search. Hashable: it is static."""
+    """A search method. It is hashable, because it is a static argument of compiled functions."""
 
     @property
     def max_steps(self) -> int: ...
 
     @property
-    def knows_bounds(self) -> bool: ...
+    def supports_bounds(self) -> bool: ...
 
-    def init(self, objective: Any, z: Array, bounds: tuple[Array, Array], /) -> Any: ...
+    def init(self, objective: Any, z: Array, bounds: tuple[Array, Array], /) -> Any:
+        """The state before the first step."""
+        ...
 
-    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array], /) -> Move: ...
+    def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array], /) -> StepResult:
+        """One step from `z`."""
+        ...
 
 
-class Search(NamedTuple):
-    """A search under way, or its end."""
+class SearchState(NamedTuple):
+    """A search in progress, or its final state."""
 
     z: Float[Array, "..."]
     """(d,): coordinates."""
     state: PyTree
+    """State of the method."""
     losses: Float[Array, "..."]
-    """(max_steps,): NaN after the last step."""
+    """(max_steps,): minus the log density in every step since the last start; NaN after the last step."""
     step: Int[Array, "..."]
-    """How many steps were taken, those before a restart among them."""
-    first: Int[Array, "..."]
-    """The number of the first step of these losses."""
-    done: Bool[Array, "..."]
+    """Number of steps taken, including those before a restart."""
+    first_step: Int[Array, "..."]
+    """Number of the step to which `losses[0]` belongs."""
+    converged: Bool[Array, "..."]
     failed: Bool[Array, "..."]
     """Whether the last step met a loss or a gradient that is not finite."""
     not_finite: Bool[Array, "..."]
-    """(d,): in which coordinates the gradient is not."""
+    """(d,): the components of the last gradient that are not finite."""
 
 
 @runtime_checkable
@@ -60,37 +69,39 @@ class Loss(Protocol):
     def __call__(self, step: Array, z: Array, /) -> Array: ...
 
 
-def begin(method: Method, loss: Any, z: Float[Array, " d"], bounds: tuple[Array, Array]) -> Search:
-    """A search that starts at z."""
+def initial_search(method: Method, loss: Any, z: Float[Array, " d"], bounds: tuple[Array, Array]) -> SearchState:
+    """A search that starts at `z`."""
     zero = jnp.zeros((), jnp.int32)
     no = jnp.zeros((), bool)
     losses = jnp.full(method.max_steps, jnp.nan, z.dtype)
-    return Search(z, method.init(loss, z, bounds), losses, zero, zero, no, no, jnp.zeros(z.shape, bool))
+    return SearchState(z, method.init(loss, z, bounds), losses, zero, zero, no, no, jnp.zeros(z.shape, bool))
 
 
-def descend(method: Method, loss: Any, search: Search, bounds: tuple[Array, Array]) -> Search:
-    """The search after up to `method.max_steps` more steps.
+def minimize(method: Method, loss: Any, search: SearchState, bounds: tuple[Array, Array]) -> SearchState:
+    """The search after up to `method.max_steps` further steps.
 
-    A step whose loss or gradient is not finite is the last one; the search then stands where both were finite.
+    A step whose loss or gradient is not finite ends the search, at the last point where both were finite.
     """
-    first = search.step
-    search = search._replace(first=first, losses=jnp.full_like(search.losses, jnp.nan), done=jnp.zeros((), bool))
+    first_step = search.step
+    search = search._replace(
+        first_step=first_step, losses=jnp.full_like(search.losses, jnp.nan), converged=jnp.zeros((), bool)
+    )
 
-    def goes_on(search: Search) -> Bool[Array, ""]:
-        return (search.step - first < method.max_steps) & ~search.done & ~search.failed
+    def unfinished(search: SearchState) -> Bool[Array, ""]:
+        return (search.step - first_step < method.max_steps) & ~search.converged & ~search.failed
 
-    def walk(search: Search) -> Search:
-        move = method.step(loss, search.step, search.z, search.state, bounds)
-        not_finite = ~jnp.isfinite(move.gradient)
-        failed = ~jnp.isfinite(move.loss) | jnp.any(not_finite)
+    def advance(search: SearchState) -> SearchState:
+        result = method.step(loss, search.step, search.z, search.state, bounds)
+        not_finite = ~jnp.isfinite(result.gradient)
+        failed = ~jnp.isfinite(result.loss) | jnp.any(not_finite)
         return search._replace(
-            z=jnp.where(failed, move.good, move.z),
-            state=jax.tree.map(lambda new, old: jnp.where(failed, old, new), move.state, search.state),
-            losses=search.losses.at[search.step - first].set(move.loss),
+            z=jnp.where(failed, result.last_finite, result.z),
+            state=jax.tree.map(lambda new, old: jnp.where(failed, old, new), result.state, search.state),
+            losses=search.losses.at[search.step - first_step].set(result.loss),
             step=search.step + 1,
-            done=move.done & ~failed,
+            converged=result.converged & ~failed,
             failed=failed,
             not_finite=not_finite,
         )
 
-    return jax.lax.while_loop(goes_on, walk, search)
+    return jax.lax.while_loop(unfinished, advance, search)

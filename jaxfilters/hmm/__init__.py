@@ -1,7 +1,16 @@
-"""Hidden Markov models: inference, training, networks of models, and finding symbols in a stream.
+"""Hidden Markov models: inference, training, networks of models, and online spotting of symbols in a stream.
 
-A model is a chain, `HiddenMarkovModel`, and what its states let one observe, an emission. `model.log_likelihoods` makes
-an array (T, Q) of observations, which any other source may replace; the recursions go on from there.
+A `HiddenMarkovModel` is a Markov chain with an emission distribution. `model.log_likelihoods` turns observations into
+log-likelihoods (T, Q) of the states, on which all recursions work; they may come from any other source as well.
+
+Example:
+    >>> import jax.numpy as jnp
+    >>> import jaxfilters as jf
+    >>> emission = jf.hmm.DiagonalGaussian(jnp.array([[0.0], [5.0]]), jnp.ones((2, 1)))
+    >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.1, 0.9]], emission)
+    >>> log_likelihoods = model.log_likelihoods(jnp.array([[0.1], [-0.2], [4.8]]))
+    >>> print(jf.hmm.viterbi(model, log_likelihoods).states)
+    [0 0 1]
 """
 
 from jaxfilters.hmm.emissions import Codes as Codes
@@ -11,17 +20,17 @@ from jaxfilters.hmm.emissions import FullGaussian as FullGaussian
 from jaxfilters.hmm.emissions import Independent as Independent
 from jaxfilters.hmm.model import HiddenMarkovModel as HiddenMarkovModel
 from jaxfilters.hmm.model import ergodic as ergodic
-from jaxfilters.hmm.model import first_only as first_only
 from jaxfilters.hmm.model import from_probabilities as from_probabilities
 from jaxfilters.hmm.model import from_topology as from_topology
 from jaxfilters.hmm.model import left_right as left_right
+from jaxfilters.hmm.model import left_right_initial as left_right_initial
 from jaxfilters.hmm.model import sample as sample
 from jaxfilters.hmm.networks import Network as Network
 from jaxfilters.hmm.networks import Segment as Segment
 from jaxfilters.hmm.networks import loop as loop
+from jaxfilters.hmm.networks import parallel_composition as parallel_composition
 from jaxfilters.hmm.networks import segments as segments
-from jaxfilters.hmm.networks import side_by_side as side_by_side
-from jaxfilters.hmm.networks import threshold as threshold
+from jaxfilters.hmm.networks import threshold_model as threshold_model
 from jaxfilters.hmm.online import ChainInfo as ChainInfo
 from jaxfilters.hmm.online import ChainState as ChainState
 from jaxfilters.hmm.online import online as online
@@ -40,7 +49,7 @@ from jaxfilters.hmm.spotting import spotter as spotter
 from jaxfilters.hmm.training import Training as Training
 from jaxfilters.hmm.training import baum_welch as baum_welch
 from jaxfilters.hmm.training import best_of_restarts as best_of_restarts
-from jaxfilters.hmm.training import in_turn as in_turn
 from jaxfilters.hmm.training import pad as pad
-from jaxfilters.hmm.training import scattered as scattered
-from jaxfilters.hmm.training import with_states as with_states
+from jaxfilters.hmm.training import random_responsibilities as random_responsibilities
+from jaxfilters.hmm.training import uniform_segmentation as uniform_segmentation
+from jaxfilters.hmm.training import with_responsibilities as with_responsibilities

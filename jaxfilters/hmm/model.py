@@ -1,4 +1,4 @@
-"""A hidden Markov model: its probabilities, the transitions that it allows, and draws from it."""
+"""Hidden Markov models: their parameters, common topologies, and sampling."""
 
 from functools import partial
 from typing import Any
@@ -9,113 +9,178 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.hmm.emissions import Emission
+from jaxfilters.hmm.emissions import Emission, check_values
 from jaxfilters.typing import AnyKey
 
 
 @pytree_dataclass
 class HiddenMarkovModel:
-    """A chain of hidden states, and what each of them lets one observe."""
+    """A Markov chain of Q hidden states with an emission distribution for each of them.
+
+    Probabilities are logarithms; `from_probabilities` makes a model from probabilities.
+    """
 
     log_initial: Float[Array, "..."]
-    """(Q,): log p(s_1), of the state in the first frame."""
+    """(Q,): log p(s_1), for the state in the first frame."""
     log_transition: Float[Array, "..."]
-    """(Q, Q): log p(s_t+1 = j | s_t = i) at [i, j]; `-inf` where there is no such transition, which training keeps."""
+    """(Q, Q): log p(s_t+1 = j | s_t = i) at [i, j]; `-inf` for a transition that is ruled out, also in training."""
     emission: Emission | None = None
-    """p(y | s); `None` where log-likelihoods come from elsewhere."""
+    """p(y | s); `None` if log-likelihoods (T, Q) come from another source."""
 
     def log_likelihoods(self, observations: PyTree, mask: Bool[Array, " t"] | None = None) -> Float[Array, "t q"]:
-        """Log p(y_t | s_t) of one sequence: observations whose leaves have time as their first axis.
+        """Log p(y_t | s_t) of every frame and state of one sequence.
 
-        For n sequences along the last axis: `jax.vmap(model.log_likelihoods, -1, -1)(observations)`. Frames where
-        `mask` is `False` were not seen: they say nothing of the states, and time passes all the same.
+        For n sequences along the last axis: `jax.vmap(model.log_likelihoods, -1, -1)(observations)`.
+
+        Args:
+            observations: Pytree whose leaves have time as their first axis.
+            mask: `False` for frames without an observation: their log-likelihood is 0 in every state.
+
+        Returns:
+            (T, Q); NaN and codes out of range have `-inf` where they are not known before compilation.
+
+        Raises:
+            ValueError: If there is no emission, shapes do not match, or a value is NaN or a code out of range.
+            TypeError: If codes are not integers.
         """
+        check_model(self)
         if self.emission is None:
             raise ValueError("model has no emission: pass log-likelihoods (T, Q) to the recursions instead.")
-        if mask is None:
-            return jax.vmap(self.emission.log_likelihood)(observations)
-        # What is not seen is often NaN, and NaN times zero would poison gradients.
-        seen = jax.tree.map(
-            lambda leaf: jnp.where(mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros_like(leaf)), observations
-        )
-        return jnp.where(mask[:, None], jax.vmap(self.emission.log_likelihood)(seen), 0.0)
+        lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((observations, mask))}
+        if len(lengths) != 1 or () in lengths:
+            raise ValueError(
+                f"observations and mask must share one length along their first axis, time; got {sorted(lengths)}."
+            )
+        if not isinstance(mask, jax.core.Tracer):
+            observed = np.ones(lengths.pop(), bool) if mask is None else np.asarray(mask)
+            check_values(self.emission, observations, observed)
+        if mask is not None:
+            # Missing observations are often NaN, and NaN times zero would make gradients NaN.
+            fill = lambda leaf: jnp.where(mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros_like(leaf))
+            observations = jax.tree.map(fill, observations)
+        found = jax.vmap(self.emission.log_likelihood)(observations)
+        if found.shape[1:] != self.log_initial.shape:
+            raise ValueError(
+                f"emission must have the {self.log_initial.shape[0]} states of log_initial; it gives log-likelihoods "
+                f"{found.shape}, expected (T, {self.log_initial.shape[0]})."
+            )
+        return found if mask is None else jnp.where(mask[:, None], found, 0.0)
+
+
+def check_model(model: HiddenMarkovModel) -> None:
+    """Reject parameters whose shapes do not match, at trace time.
+
+    Raises:
+        ValueError: If `log_initial` is not (Q,) or `log_transition` is not (Q, Q).
+    """
+    shapes = jnp.shape(model.log_initial), jnp.shape(model.log_transition)
+    if len(shapes[0]) != 1 or shapes[1] != shapes[0] * 2:
+        raise ValueError(f"log_initial and log_transition must be (Q,) and (Q, Q); got {shapes[0]} and {shapes[1]}.")
 
 
 def from_probabilities(initial: Any, transition: Any, emission: Emission | None = None) -> HiddenMarkovModel:
     """A model from probabilities rather than their logarithms.
 
     Args:
-        initial: (Q,), summing to 1.
-        transition: (Q, Q), every row summing to 1.
-        emission: p(y | s).
+        initial: (Q,): p(s_1), summing to 1.
+        transition: (Q, Q): p(s_t+1 = j | s_t = i) at [i, j]; every row sums to 1.
+        emission: p(y | s) of the Q states.
 
     Raises:
-        ValueError: If shapes do not match, or something is no probability, or a sum is not 1 to 1e-4.
+        ValueError: If shapes do not match, a number is not a probability, or a sum differs from 1 by more than 1e-4.
+
+    Example:
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
+        >>> model.log_transition.shape
+        (2, 2)
     """
     initial, transition = np.asarray(initial, float), np.asarray(transition, float)
     if initial.ndim != 1 or transition.shape != (len(initial), len(initial)) or not len(initial):
         raise ValueError(
             f"initial and transition must be (Q,) and (Q, Q), Q > 0; got {initial.shape} and {transition.shape}."
         )
-    for name, values in (("initial", initial[None]), ("transition", transition)):
-        sums = values.sum(axis=-1)
-        if not (np.all(values >= 0) and np.all(abs(sums - 1) < 1e-4)):
-            raise ValueError(f"{name} must be probabilities whose rows sum to 1; got sums {sums} of {values}.")
+    _check_probabilities("initial", initial[None])
+    _check_probabilities("transition", transition)
+    _check_num_states(emission, len(initial))
     with np.errstate(divide="ignore"):
         logs = np.log(initial), np.log(transition)
     return HiddenMarkovModel(jnp.asarray(logs[0], dtype=float), jnp.asarray(logs[1], dtype=float), emission)
 
 
 def from_topology(
-    allowed: Bool[np.ndarray, "q q"], emission: Emission | None = None, *, first: Bool[np.ndarray, " q"] | None = None
+    allowed: Bool[np.ndarray, "q q"],
+    emission: Emission | None = None,
+    *,
+    initial: Bool[np.ndarray, " q"] | None = None,
 ) -> HiddenMarkovModel:
-    """A model in which every state is left, and the chain begun, in all allowed ways with equal probability.
+    """A model in which all allowed transitions of a state, and all allowed initial states, are equally probable.
 
     Args:
-        allowed: Whether there is a transition from i to j, e.g. `left_right(8)`.
-        emission: p(y | s).
-        first: States in which the chain may begin; `None` is all of them.
+        allowed: (Q, Q): whether there is a transition from i to j, for example `left_right(8)`.
+        emission: p(y | s) of the Q states.
+        initial: (Q,): states in which the chain may start; `None` allows all of them.
 
     Raises:
-        ValueError: If a state cannot be left, not even for itself, or the chain cannot begin.
+        ValueError: If shapes do not match, a state has no transition, or there is no initial state.
     """
-    begins = np.ones(len(allowed), bool) if first is None else np.asarray(first, bool)
-    if not np.all(np.any(allowed, axis=1)) or not np.any(begins):
-        raise ValueError(f"allowed must have a transition in every row, and first a state; got {allowed}, {begins}.")
-    return from_probabilities(begins / begins.sum(), allowed / np.sum(allowed, axis=1, keepdims=True), emission)
+    allowed = np.asarray(allowed, bool)
+    starts = np.ones(len(allowed), bool) if initial is None else np.asarray(initial, bool)
+    if allowed.shape != (len(allowed), len(allowed)) or starts.shape != (len(allowed),):
+        raise ValueError(f"allowed and initial must be (Q, Q) and (Q,); got {allowed.shape} and {starts.shape}.")
+    if not np.all(np.any(allowed, axis=1)) or not np.any(starts):
+        raise ValueError(f"allowed must have a transition in every row, and initial a state; got {allowed}, {starts}.")
+    return from_probabilities(starts / starts.sum(), allowed / np.sum(allowed, axis=1, keepdims=True), emission)
 
 
-def left_right(num_states: int, *, longest_step: int = 2) -> Bool[np.ndarray, "q q"]:
-    """Transitions to the same state and to those up to `longest_step` after it.
+def left_right(num_states: int, *, max_jump: int = 2) -> Bool[np.ndarray, "q q"]:
+    """The left-right (Bakis) topology: transitions to the same state and to the next `max_jump` states.
+
+    See L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77(2), 1989, section IV.B.
+
+    Returns:
+        (Q, Q), for `from_topology`.
 
     Raises:
-        ValueError: If there is no state, or `longest_step < 1`.
+        ValueError: If `num_states` or `max_jump` is less than 1.
     """
-    if num_states < 1 or longest_step < 1:
-        raise ValueError(f"num_states and longest_step must be at least 1; got {num_states} and {longest_step}.")
+    if num_states < 1 or max_jump < 1:
+        raise ValueError(f"num_states and max_jump must be at least 1; got {num_states} and {max_jump}.")
     ahead = np.arange(num_states) - np.arange(num_states)[:, None]
-    return (ahead >= 0) & (ahead <= longest_step)
+    return (ahead >= 0) & (ahead <= max_jump)
 
 
 def ergodic(num_states: int) -> Bool[np.ndarray, "q q"]:
-    """Transitions from every state to every state.
+    """The ergodic topology: transitions from every state to every state.
+
+    Returns:
+        (Q, Q), for `from_topology`.
 
     Raises:
-        ValueError: If there is no state.
+        ValueError: If `num_states` is less than 1.
     """
     if num_states < 1:
         raise ValueError(f"num_states must be at least 1; got {num_states}.")
     return np.ones((num_states, num_states), bool)
 
 
-def first_only(num_states: int) -> Bool[np.ndarray, " q"]:
-    """Chains that begin in state 0: the `first` of a left-right model."""
+def left_right_initial(num_states: int) -> Bool[np.ndarray, " q"]:
+    """The initial states of a left-right model, (Q,) for `from_topology`: state 0 only."""
     return np.arange(num_states) == 0
 
 
 @partial(jax.jit, static_argnames="num_frames")
 def sample(key: AnyKey, model: HiddenMarkovModel, num_frames: int) -> tuple[Int32[Array, " t"], PyTree]:
-    """States and observations of one sequence; the observations are `None` without an emission."""
+    """A sample of the states and observations of one sequence.
+
+    Args:
+        key: Random key.
+        model: The model.
+        num_frames: Length T of the sequence.
+
+    Returns:
+        States (T,) and observations, leaves with time first; `None` without an emission.
+    """
     state_key, emission_key = jax.random.split(key)
 
     def step(state: Array, step_key: AnyKey) -> tuple[Array, Array]:
@@ -128,3 +193,27 @@ def sample(key: AnyKey, model: HiddenMarkovModel, num_frames: int) -> tuple[Int3
     if model.emission is None:
         return states, None
     return states, jax.vmap(model.emission.sample)(jax.random.split(emission_key, num_frames), states)
+
+
+def _check_probabilities(name: str, rows: np.ndarray) -> None:
+    sums = rows.sum(axis=-1)
+    wrong = np.flatnonzero(~(np.all(rows >= 0, axis=-1) & (abs(sums - 1) < 1e-4)))
+    if not len(wrong):
+        return
+    if name == "initial":
+        raise ValueError(f"initial must be probabilities that sum to 1; got {rows[0]} with the sum {sums[0]:g}.")
+    columns = rows.shape[0] > 1 and np.all(abs(rows.sum(axis=0) - 1) < 1e-4)
+    hint = " Its columns (axis 0) sum to 1: pass its transpose." if columns else ""
+    raise ValueError(
+        f"transition must be probabilities whose rows (axis 1) sum to 1; got row {wrong[0]}, {rows[wrong[0]]}, "
+        f"with the sum {sums[wrong[0]]:g}.{hint}"
+    )
+
+
+def _check_num_states(emission: Emission | None, num_states: int) -> None:
+    for leaf in jax.tree.leaves(emission):
+        if jnp.shape(leaf)[:1] != (num_states,):
+            raise ValueError(
+                f"emission must have arrays whose first axis is that of the {num_states} states of initial; "
+                f"got shape {jnp.shape(leaf)}."
+            )

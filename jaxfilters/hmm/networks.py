@@ -1,4 +1,4 @@
-"""Several models as one: side by side, in a loop, and the ergodic threshold that a symbol has to beat."""
+"""Compositions of several models: in parallel, in a loop, and the threshold model that a symbol has to exceed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,77 +9,86 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.hmm.model import HiddenMarkovModel
+from jaxfilters.hmm.model import HiddenMarkovModel, check_model
 
 
 @pytree_dataclass
 class Network:
-    """The states of several models in one row."""
+    """Several models composed in parallel: one model over the states of all of them."""
 
     model: HiddenMarkovModel
-    """Without transitions between the models. `log_initial` starts each of them with the probability 1, and what the
-    rows of final states lack of 1 is the probability of leaving the model."""
-    owner: Int[Array, "..."]
-    """(Q,): which model each state belongs to, from 0."""
+    """The composed model, without transitions between its parts. `log_initial` gives each part a total probability of
+    1, and the rows of final states sum to 1 minus the probability of leaving the part."""
+    part: Int[Array, "..."]
+    """(Q,): index of the part to which each state belongs, from 0."""
     final: Bool[Array, "..."]
-    """(Q,): whether a model may end in this state."""
+    """(Q,): whether a part may end in this state."""
 
 
 class Segment(NamedTuple):
-    """A run of frames in which one model was at work."""
+    """Consecutive frames that belong to one part of a network."""
 
     label: int
+    """Index of the part."""
     start: int
     """First frame."""
     end: int
     """Last frame."""
 
 
-def side_by_side(
+def parallel_composition(
     models: Sequence[HiddenMarkovModel],
     final: Sequence[Bool[np.ndarray, " q"]] | None = None,
     *,
-    leaving: float = 0.1,
+    exit_probability: float = 0.1,
 ) -> Network:
-    """The models in one row, with their emissions.
+    """The parallel composition of models, with their emissions.
 
     Args:
-        models: Of any numbers of states; their emissions are of one kind with the same settings.
-        final: States in which each model may end; `None` is the last state of each.
-        leaving: Probability with which a model in a final state ends, in (0, 1).
+        models: Models with any numbers of states, whose emissions are of one class with the same static options.
+        final: (Q_i,) for each model: the states in which it may end; `None` is its last state.
+        exit_probability: Probability of leaving a model from a final state, in (0, 1).
 
     Raises:
-        ValueError: If there is no model, `final` does not fit, `leaving` is no such probability, or the emissions are
-            not of one kind.
+        ValueError: If there is no model, `final` does not match, a model has no final state, `exit_probability` is out
+            of range, or the emissions differ in class, options or size.
     """
-    if not 0 < leaving < 1:
-        raise ValueError(f"leaving must be a probability between 0 and 1; got {leaving!r}.")
+    if not 0 < exit_probability < 1:
+        raise ValueError(f"exit_probability must be between 0 and 1; got {exit_probability!r}.")
+    for model in models:
+        check_model(model)
     sizes = [model.log_initial.shape[0] for model in models]
     ends = [np.arange(size) == size - 1 for size in sizes] if final is None else [np.asarray(one) for one in final]
     if not models or [len(one) for one in ends] != sizes:
         raise ValueError(f"final must have a flag for each state of models, {sizes}; got {[len(one) for one in ends]}.")
-    if len({jax.tree.structure(model) for model in models}) != 1:
-        raise ValueError("models must have emissions of one kind with the same settings.")
+    for i, one in enumerate(ends):
+        if not np.any(one):
+            raise ValueError(f"final must have a state for each model; got none for model {i}.")
+    kinds = {(jax.tree.structure(model), tuple(_feature_shapes(model))) for model in models}
+    if len(kinds) != 1:
+        raise ValueError(
+            f"models must have emissions of one class with the same options and sizes; got {len(kinds)} different ones."
+        )
     log_transition = jnp.full((sum(sizes), sum(sizes)), -jnp.inf, models[0].log_transition.dtype)
     for model, at in zip(models, np.cumsum([0, *sizes[:-1]]), strict=True):
         log_transition = jax.lax.dynamic_update_slice(log_transition, model.log_transition, (at, at))
-    ended = jnp.asarray(np.concatenate(ends))
-    log_transition = jnp.where(ended[:, None], log_transition + jnp.log1p(-leaving), log_transition)
+    is_final = jnp.asarray(np.concatenate(ends))
+    log_transition = jnp.where(is_final[:, None], log_transition + jnp.log1p(-exit_probability), log_transition)
     emission = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(model.emission for model in models))
     log_initial = jnp.concatenate([model.log_initial for model in models])
-    owner = np.repeat(np.arange(len(models), dtype=np.int32), sizes)
-    return Network(HiddenMarkovModel(log_initial, log_transition, emission), jnp.asarray(owner), ended)
+    part = np.repeat(np.arange(len(models), dtype=np.int32), sizes)
+    return Network(HiddenMarkovModel(log_initial, log_transition, emission), jnp.asarray(part), is_final)
 
 
-def threshold(network: Network) -> HiddenMarkovModel:
-    """The model that a symbol has to beat: all states, each kept as long as in its symbol, then any other one.
+def threshold_model(network: Network) -> HiddenMarkovModel:
+    """The threshold model of a network: an ergodic model of all its states with their self-transition probabilities.
 
-    It can produce whatever the symbols are made of, in any order, hence better than the wrong symbol and worse than
-    the right one (H.-K. Lee and J. Kim, "An HMM-based threshold model approach for gesture recognition", IEEE PAMI
-    21(10), 1999, section 4.1). What occurs only between symbols needs a model of its own in the network, e.g. of one
+    It explains any order of the symbols' states, hence better than the wrong symbol and worse than the right one
+    (H.-K. Lee and J. Kim, "An HMM-based threshold model approach for gesture recognition", IEEE PAMI 21(10), 1999,
+    section 4.1). Patterns that occur only between symbols need a model of their own in the network, for example of one
     state.
     """
-    num_states = network.owner.shape[0]
+    num_states = network.part.shape[0]
     stays = jnp.diagonal(network.model.log_transition)
     leaves = jnp.log1p(-jnp.exp(stays)) - jnp.log(max(num_states - 1, 1))
     same = jnp.eye(num_states, dtype=bool)
@@ -90,33 +99,51 @@ def threshold(network: Network) -> HiddenMarkovModel:
     return HiddenMarkovModel(log_initial, log_transition, network.model.emission)
 
 
-def loop(network: Network, *, between: Float[np.ndarray, "k k"] | None = None) -> HiddenMarkovModel:
-    """One model of a stream in which models follow each other; its Viterbi path, cut by `segments`, says which.
+def loop(network: Network, *, part_transition: Float[np.ndarray, "k k"] | None = None) -> HiddenMarkovModel:
+    """One model of a stream in which the parts of a network follow each other, as in connected word recognition.
+
+    `segments` decodes its Viterbi path.
 
     Args:
-        network: Made by `side_by_side`.
-        between: Probability that model l follows model k, at [k, l], rows summing to 1; `None` is even.
+        network: Made by `parallel_composition`.
+        part_transition: (K, K): probability that part l follows part k at [k, l], rows summing to 1; `None` is uniform.
 
     Raises:
-        ValueError: If `between` has another shape.
+        ValueError: If `part_transition` has another shape, or its rows do not sum to 1.
     """
-    num_models = int(np.asarray(network.owner).max()) + 1
-    follows = np.full((num_models, num_models), 1 / num_models) if between is None else np.asarray(between)
+    num_models = int(np.asarray(network.part).max()) + 1
+    uniform = np.full((num_models, num_models), 1 / num_models)
+    follows = uniform if part_transition is None else np.asarray(part_transition)
     if follows.shape != (num_models, num_models):
-        raise ValueError(f"between must be ({num_models}, {num_models}), one row a model; got {follows.shape}.")
+        raise ValueError(
+            f"part_transition must be ({num_models}, {num_models}), one row for each part; got {follows.shape}."
+        )
+    if not (np.all(follows >= 0) and np.all(abs(follows.sum(axis=1) - 1) < 1e-4)):
+        raise ValueError(
+            f"part_transition must be probabilities whose rows (axis 1) sum to 1; got sums {follows.sum(axis=1)}."
+        )
     inside, initial = jnp.exp(network.model.log_transition), jnp.exp(network.model.log_initial)
-    entering = jnp.asarray(follows, inside.dtype)[network.owner][:, network.owner] * initial
+    entering = jnp.asarray(follows, inside.dtype)[network.part][:, network.part] * initial
     leaving = jnp.where(network.final, 1 - jnp.sum(inside, axis=1), 0.0)
     transition = inside + leaving[:, None] * entering
     return HiddenMarkovModel(jnp.log(initial / num_models), jnp.log(transition), network.model.emission)
 
 
 def segments(states: Int[np.ndarray, " t"], network: Network) -> list[Segment]:
-    """Runs of frames with one owner along a path through the network; frames with the state -1 belong to none.
+    """The segments of a path through a network: consecutive frames in one part.
 
-    A model that follows itself makes two segments: its state steps back from a final one.
+    A part that follows itself makes two segments, separated by a transition from a final to an initial state.
+
+    Args:
+        states: (T,): states of the network; frames with the state -1 belong to no segment.
+        network: The network.
+
+    Raises:
+        ValueError: If a state is out of range.
     """
-    owner, final = np.asarray(network.owner), np.asarray(network.final)
+    part, final = np.asarray(network.part), np.asarray(network.final)
+    if np.any(np.asarray(states) < -1) or np.any(np.asarray(states) >= len(part)):
+        raise ValueError(f"states must be from -1 to {len(part) - 1}; got {np.min(states)} to {np.max(states)}.")
     starts = np.exp(np.asarray(network.model.log_initial)) > 0
     inside = np.asarray(network.model.log_transition) > -np.inf
     found: list[Segment] = []
@@ -124,9 +151,13 @@ def segments(states: Int[np.ndarray, " t"], network: Network) -> list[Segment]:
         if state < 0:
             continue
         before = states[frame - 1] if frame else -1
-        again = before >= 0 and final[before] and starts[state] and not inside[before, state]
-        if before >= 0 and owner[before] == owner[state] and not again:
+        restarts = before >= 0 and final[before] and starts[state] and not inside[before, state]
+        if before >= 0 and part[before] == part[state] and not restarts:
             found[-1] = found[-1]._replace(end=frame)
         else:
-            found.append(Segment(int(owner[state]), frame, frame))
+            found.append(Segment(int(part[state]), frame, frame))
     return found
+
+
+def _feature_shapes(model: HiddenMarkovModel) -> list[tuple[int, ...]]:
+    return [jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(model.emission)]

@@ -1,4 +1,4 @@
-"""The chain as a `Filter`: one observation at a time, as they come."""
+"""The exact filter of a hidden Markov model as a `Filter`: one observation at a time."""
 
 from typing import NamedTuple
 
@@ -8,33 +8,46 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters import weights
 from jaxfilters.filter import Filter
-from jaxfilters.hmm.model import HiddenMarkovModel
+from jaxfilters.hmm.model import HiddenMarkovModel, check_model
 from jaxfilters.typing import AnyKey
 
 
 class ChainState(NamedTuple):
-    """What is known of the state."""
+    """The distribution of the hidden state given the observations so far."""
 
     log_probabilities: Float[Array, " q"]
-    """`logsumexp` is 0."""
+    """(Q,): normalised, so that their `logsumexp` is 0."""
     started: Bool[Array, ""]
-    """Whether a frame has been predicted: the first one finds the chain where it begins."""
+    """Whether a prediction was made: the first one keeps the initial distribution."""
 
 
 class ChainInfo(NamedTuple):
     """Diagnostics of one update."""
 
     log_evidence: Float[Array, ""]
-    """log p(y_t | y_1:t-1); `-inf` if the observation is impossible, which then changes nothing."""
+    """log p(y_t | y_1:t-1); `-inf` if the observation is impossible, and the distribution then stays as it is."""
     most_probable: Int32[Array, ""]
-    """State, given the observations so far."""
+    """The state of greatest probability given the observations so far."""
 
 
 def online(model: HiddenMarkovModel) -> Filter:
-    """Exact filter of the hidden state.
+    """The exact filter of the hidden state, for `jaxfilters.run`.
 
-    Observations are those of `model.emission`; without one, the log-likelihoods (Q,) of the states themselves.
+    Args:
+        model: The model. Observations are those of `model.emission`; without one, log-likelihoods (Q,).
+
+    Raises:
+        ValueError: If `log_initial` and `log_transition` are not (Q,) and (Q, Q).
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
+        >>> state, (states, infos) = jf.run(jf.hmm.online(model), jax.random.key(0), jnp.zeros((5, 2)))
+        >>> states.log_probabilities.shape
+        (5, 2)
     """
+    check_model(model)
     return Filter(model, _init, _predict, _update)
 
 
@@ -54,7 +67,11 @@ def _update(
     model: HiddenMarkovModel, key: AnyKey, state: ChainState, observation: PyTree
 ) -> tuple[ChainState, ChainInfo]:
     del key
-    seen = observation if model.emission is None else model.emission.log_likelihood(observation)
-    after, log_evidence = weights.normalize(state.log_probabilities + seen)
+    log_likelihood = observation if model.emission is None else model.emission.log_likelihood(observation)
+    if jnp.shape(log_likelihood) != model.log_initial.shape:
+        name = "observation, without an emission," if model.emission is None else "emission.log_likelihood"
+        expected = model.log_initial.shape
+        raise ValueError(f"{name} must be log-likelihoods {expected}, (Q,); got {jnp.shape(log_likelihood)}.")
+    after, log_evidence = weights.normalize(state.log_probabilities + log_likelihood)
     after = jnp.where(log_evidence > -jnp.inf, after, state.log_probabilities)
     return state._replace(log_probabilities=after), ChainInfo(log_evidence, jnp.argmax(after).astype(jnp.int32))

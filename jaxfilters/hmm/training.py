@@ -1,8 +1,8 @@
-"""Learning a model from sequences: expectation-maximisation, where it starts, and the best of several starts.
+"""Training by expectation-maximisation: Baum-Welch, its initialisation, and random restarts.
 
-Sequences lie along the last axis of every leaf of the observations, time along the first; `pad` makes such arrays of
-sequences of different lengths. Many models are trained at once by `vmap` over models and observations: give symbols of
-which there are fewer examples sequences of length 0.
+Observations have time as the first axis and the sequences as the last axis of every leaf; `pad` makes such arrays from
+sequences of different lengths. Many models are trained at once by `vmap` over models and observations; a model with
+fewer sequences than others is given sequences of length 0.
 """
 
 from collections.abc import Sequence
@@ -15,38 +15,43 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int32, PyTree
 
-from jaxfilters.hmm.emissions import Emission
-from jaxfilters.hmm.model import HiddenMarkovModel
+from jaxfilters.hmm.emissions import Emission, check_values
+from jaxfilters.hmm.model import HiddenMarkovModel, check_model
 from jaxfilters.hmm.recursions import Posterior, posterior
 from jaxfilters.typing import AnyKey
 
 
 class Training(NamedTuple):
-    """A trained model and how it came about."""
+    """A trained model and the course of its training."""
 
     model: HiddenMarkovModel
     objective: Float[Array, " i"]
-    """Log-likelihood of all sequences plus log prior before each iteration, `max_iterations` of them; never falls.
-    After convergence its last value. Sequences that the model cannot produce are left out."""
+    """(max_iterations,): log evidence of all sequences plus log prior before each iteration, which never decreases;
+    after convergence the last value repeats. Impossible sequences are left out."""
     num_iterations: Int32[Array, ""]
     converged: Bool[Array, ""]
     num_impossible: Int32[Array, ""]
-    """Sequences that the model could not produce before the last iteration: nothing was learnt from them."""
+    """Number of sequences that were impossible under the model before the last iteration and had no influence on it."""
 
 
 def pad(sequences: Sequence[PyTree], length: int | None = None) -> tuple[PyTree, Int32[Array, " n"]]:
-    """Sequences of one kind, time first, as arrays with the sequences last; and their lengths.
+    """Sequences of different lengths as arrays with the sequences along the last axis, padded with zeros.
 
     Args:
-        sequences: Arrays `(t, ...)` or pytrees of them; t may be 0.
-        length: Number of frames of the result; `None` is that of the longest sequence.
+        sequences: Arrays (T_i, ...) with time first, or pytrees of them; T_i may be 0.
+        length: Number T of frames of the result; `None` is the length of the longest sequence.
+
+    Returns:
+        Arrays (T, ..., n), and the lengths (n,).
 
     Raises:
-        ValueError: If there is no sequence, or `length` is less than that of one.
+        ValueError: If there is no sequence, or one is longer than `length`.
     """
     lengths = np.array([len(jax.tree.leaves(sequence)[0]) for sequence in sequences], np.int32)
     if not len(lengths) or (length is not None and length < lengths.max()):
-        raise ValueError(f"sequences must be at least one, none longer than length = {length}; got lengths {lengths}.")
+        raise ValueError(
+            f"sequences must hold at least one, none longer than length = {length}; got lengths {lengths}."
+        )
     num_frames = int(lengths.max()) if length is None else length
 
     def stack(*leaves: Any) -> Array:
@@ -59,128 +64,186 @@ def pad(sequences: Sequence[PyTree], length: int | None = None) -> tuple[PyTree,
     return jax.tree.map(stack, *sequences), jnp.asarray(lengths)
 
 
-@partial(jax.jit, static_argnames="max_iterations")
 def baum_welch(
     model: HiddenMarkovModel,
     observations: PyTree,
-    lengths: Int[Array, " n"] | None = None,
-    mask: Bool[Array, "t n"] | None = None,
+    lengths: Int[Array, " n"] | Int[np.ndarray, " n"] | None = None,
+    mask: Bool[Array, "t n"] | Bool[np.ndarray, "t n"] | None = None,
     *,
     max_iterations: int = 30,
     tolerance: float | Float[Array, ""] = 1e-4,
     transition_pseudo_count: float | Float[Array, ""] = 0.0,
 ) -> Training:
-    """The model after expectation-maximisation (L. Rabiner 1989, section III.C), as the mode of the posterior.
+    """Training by expectation-maximisation (the Baum-Welch algorithm), to a maximum a posteriori estimate.
 
-    Transitions and starts that the model rules out stay ruled out. `vmap` over models trains all of them in one loop.
+    See L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77(2), 1989, section III.C. Transitions and initial
+    states of probability zero keep it. `vmap` over models trains all of them in one loop.
 
     Args:
-        model: Where to start; its emission says how it is trained, with which floors.
-        observations: Leaves `(T, ..., n)`.
-        lengths: Frames of each sequence; the rest is padding. 0 is allowed.
-        mask: `False` where a frame inside a sequence was not seen.
-        max_iterations: Upper bound, at least 1.
-        tolerance: Stops when the objective gains less than this share of its size.
-        transition_pseudo_count: Times added to those that each allowed transition, and start, is expected.
+        model: The initial model; its emission defines the M-step.
+        observations: Leaves (T, ..., n) with time first and the sequences last.
+        lengths: (n,): number of frames of each sequence, from 0 to T; `None` is T for all.
+        mask: (T, n): `False` for frames without an observation.
+        max_iterations: Upper bound on the number of iterations, at least 1.
+        tolerance: Relative increase of the objective below which the training has converged.
+        transition_pseudo_count: Count added to the expected number of each allowed transition and initial state.
+
+    Returns:
+        The trained model and the objective before each iteration.
 
     Raises:
-        ValueError: If the model has no emission.
+        ValueError: If the model has no emission, shapes do not match, a length is out of range, or an observation is
+            NaN or a code out of range.
+        TypeError: If codes are not integers.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> codes = jf.hmm.Codes(jnp.log(jnp.array([[0.7, 0.3], [0.4, 0.6]])), pseudo_count=0.1)
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]], codes)
+        >>> observations, lengths = jf.hmm.pad([jnp.array([0, 0, 0, 1, 1, 1]), jnp.array([0, 0, 1, 1])])
+        >>> trained = jf.hmm.baum_welch(model, observations, lengths)
+        >>> bool(trained.objective[-1] > trained.objective[0])
+        True
     """
-    num_frames, num_sequences = _extent(observations)
-    if lengths is None:
-        lengths = jnp.full(num_sequences, num_frames)
-    seen = jnp.arange(num_frames)[:, None] < lengths
+    num_frames, num_sequences = _check_training(model, observations, lengths, mask)
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations must be at least 1; got {max_iterations}.")
+    lengths = jnp.full(num_sequences, num_frames) if lengths is None else lengths
+    return _baum_welch(
+        model,
+        observations,
+        lengths,
+        mask,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        transition_pseudo_count=transition_pseudo_count,
+    )
+
+
+@partial(jax.jit, static_argnames="max_iterations")
+def _baum_welch(model, observations, lengths, mask, *, max_iterations, tolerance, transition_pseudo_count) -> Training:
+    observed = jnp.arange(_extent(observations)[0])[:, None] < lengths
     if mask is not None:
-        seen = seen & mask
-    # Padding may hold anything.
-    observations = jax.tree.map(lambda leaf: jnp.where(_along(seen, leaf), leaf, jnp.zeros_like(leaf)), observations)
+        observed = observed & mask
+    # Padding may hold NaN.
+    clean = lambda leaf: jnp.where(_along(observed, leaf), leaf, jnp.zeros_like(leaf))
+    observations = jax.tree.map(clean, observations)
 
     def improve(state: tuple) -> tuple:
         model, objectives, i, _, _ = state
-        found = _expected(model, observations, seen, lengths)
+        found = _expected(model, observations, observed, lengths)
         possible = found.log_evidence > -jnp.inf
         objective = jnp.sum(jnp.where(possible, found.log_evidence, 0.0)) + _log_prior(model, transition_pseudo_count)
         before = objectives[jnp.maximum(i - 1, 0)]
         converged = (i > 0) & (objective - before <= tolerance * jnp.abs(objective))
         objectives = jnp.where(jnp.arange(max_iterations) >= i, objective, objectives)
-        better = _maximized(model, found, observations, seen, transition_pseudo_count)
+        better = _maximized(model, found, observations, observed, transition_pseudo_count)
         return better, objectives, i + 1, converged, jnp.sum(~possible, dtype=jnp.int32)
 
-    def goes_on(state: tuple) -> Bool[Array, ""]:
+    def unfinished(state: tuple) -> Bool[Array, ""]:
         _, _, i, converged, _ = state
         return (i < max_iterations) & ~converged
 
-    nothing = jnp.zeros(max_iterations, model.log_initial.dtype)
+    objectives = jnp.zeros(max_iterations, model.log_initial.dtype)
     zero = jnp.zeros((), jnp.int32)
-    start = (model, nothing, zero, jnp.zeros((), bool), zero)
-    return Training(*jax.lax.while_loop(goes_on, improve, start))
+    start = (model, objectives, zero, jnp.zeros((), bool), zero)
+    return Training(*jax.lax.while_loop(unfinished, improve, start))
 
 
 def best_of_restarts(
     key: AnyKey, model: HiddenMarkovModel, observations: PyTree, lengths: Int[Array, " n"], *, num_restarts: int
 ) -> Training:
-    """The best of several trainings at once, each from emissions that `scattered` makes of random frames.
+    """The best of several trainings, each from the emissions of `random_responsibilities`.
+
+    Args:
+        key: Random key.
+        model: The model, whose emission is replaced.
+        observations: Leaves (T, ..., n).
+        lengths: (n,): number of frames of each sequence.
+        num_restarts: Number of trainings, which run at once.
 
     Raises:
-        ValueError: If `num_restarts < 1`.
+        ValueError: If `num_restarts` is less than 1, or as for `baum_welch`.
     """
     if num_restarts < 1:
         raise ValueError(f"num_restarts must be at least 1; got {num_restarts}.")
 
+    num_frames, _ = _check_training(model, observations, lengths, None)
+
     def train(key: AnyKey) -> Training:
-        shares = scattered(key, lengths, _extent(observations)[0], model.log_initial.shape[0])
-        return baum_welch(with_states(model, observations, shares), observations, lengths)
+        weights = random_responsibilities(key, lengths, num_frames, model.log_initial.shape[0])
+        return baum_welch(with_responsibilities(model, observations, weights), observations, lengths)
 
     trained = jax.vmap(train)(jax.random.split(key, num_restarts))
     best = jnp.argmax(trained.objective[:, -1])
     return jax.tree.map(lambda leaf: leaf[best], trained)
 
 
-def with_states(model: HiddenMarkovModel, observations: PyTree, shares: Float[Array, "t q n"]) -> HiddenMarkovModel:
-    """The model with the emission that `shares`, how probable each state is in each frame, imply.
+def with_responsibilities(
+    model: HiddenMarkovModel, observations: PyTree, responsibilities: Float[Array, "t q n"]
+) -> HiddenMarkovModel:
+    """The model with the emission of one M-step.
+
+    Args:
+        model: The model.
+        observations: Leaves (T, ..., n).
+        responsibilities: (T, Q, n): probability of each state in each frame, 0 in padding.
 
     Raises:
-        ValueError: If the model has no emission.
+        ValueError: If the model has no emission, or shapes do not match.
     """
-    return replace(model, emission=_emission(model).maximized(observations, shares))
+    num_frames, num_sequences = _extent(observations)
+    expected = (num_frames, model.log_initial.shape[0], num_sequences)
+    if responsibilities.shape != expected:
+        raise ValueError(f"responsibilities must be {expected}, (T, Q, n); got {responsibilities.shape}.")
+    return replace(model, emission=_emission(model).m_step(observations, responsibilities))
 
 
-def in_turn(lengths: Int[Array, " n"], num_frames: int, num_states: int) -> Float[Array, "t q n"]:
-    """Every sequence divided evenly among the states, in their order: where training of left-right models starts."""
+def uniform_segmentation(lengths: Int[Array, " n"], num_frames: int, num_states: int) -> Float[Array, "t q n"]:
+    """Responsibilities (T, Q, n) that divide every sequence evenly among the states, in their order.
+
+    This is the usual initialisation of left-right models.
+    """
     frames = jnp.arange(num_frames)[:, None]
     state = jnp.minimum(frames * num_states // jnp.maximum(lengths, 1), num_states - 1)
     inside = (frames < lengths)[:, None]
     return ((state[:, None] == jnp.arange(num_states)[:, None]) & inside).astype(float)
 
 
-def scattered(key: AnyKey, lengths: Int[Array, " n"], num_frames: int, num_states: int) -> Float[Array, "t q n"]:
-    """Every state half of one random frame and half of all frames: where the training of ergodic models starts."""
+def random_responsibilities(
+    key: AnyKey, lengths: Int[Array, " n"], num_frames: int, num_states: int
+) -> Float[Array, "t q n"]:
+    """Responsibilities (T, Q, n) that give every state a random frame and an equal part of all frames, half each.
+
+    This is an initialisation of ergodic models.
+    """
     inside = (jnp.arange(num_frames)[:, None] < lengths).astype(float)
     flat = inside.ravel()
     seeds = jax.random.choice(key, flat.size, (num_states,), p=flat / jnp.maximum(flat.sum(), 1.0))
-    own = jax.nn.one_hot(seeds, flat.size, dtype=flat.dtype) * flat
-    shares = own + flat / jnp.maximum(flat.sum(), 1.0)
-    return jnp.moveaxis(shares.reshape(num_states, *inside.shape), 0, 1)
+    single = jax.nn.one_hot(seeds, flat.size, dtype=flat.dtype) * flat
+    weights = single + flat / jnp.maximum(flat.sum(), 1.0)
+    return jnp.moveaxis(weights.reshape(num_states, *inside.shape), 0, 1)
 
 
-def _expected(model: HiddenMarkovModel, observations: PyTree, seen: Array, lengths: Array) -> Posterior:
-    log_likelihoods = jax.vmap(model.log_likelihoods, -1, -1)(observations, seen)
+def _expected(model: HiddenMarkovModel, observations: PyTree, observed: Array, lengths: Array) -> Posterior:
+    log_likelihoods = jax.vmap(model.log_likelihoods, -1, -1)(observations, observed)
     return posterior(model, log_likelihoods, lengths)
 
 
 def _maximized(
-    model: HiddenMarkovModel, found: Posterior, observations: PyTree, seen: Array, pseudo_count: Array | float
+    model: HiddenMarkovModel, found: Posterior, observations: PyTree, observed: Array, pseudo_count: Array | float
 ) -> HiddenMarkovModel:
     initial = jnp.sum(found.states[0], axis=1)
     return HiddenMarkovModel(
         _frequencies(initial, model.log_initial, pseudo_count),
         _frequencies(found.transitions, model.log_transition, pseudo_count),
-        _emission(model).maximized(observations, found.states * seen[:, None]),
+        _emission(model).m_step(observations, found.states * observed[:, None]),
     )
 
 
 def _frequencies(counts: Array, before: Array, pseudo_count: Array | float) -> Array:
-    """Logarithms of relative frequencies along the last axis; as before where there are none."""
+    """Log relative frequencies along the last axis; the previous ones where all counts are zero."""
     allowed = before > -jnp.inf
     counts = jnp.where(allowed, counts + pseudo_count, 0.0)
     totals = jnp.sum(counts, axis=-1, keepdims=True)
@@ -201,8 +264,33 @@ def _emission(model: HiddenMarkovModel) -> Emission:
     return model.emission
 
 
-def _along(seen: Array, leaf: Array) -> Array:
-    return seen.reshape(seen.shape[0], *[1] * (leaf.ndim - 2), seen.shape[1])
+def _check_training(model: HiddenMarkovModel, observations: PyTree, lengths: Any, mask: Any) -> tuple[int, int]:
+    """The numbers of frames and sequences, after checks of shapes and, unless they are traced, values."""
+    check_model(model)
+    emission = _emission(model)
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(observations)]
+    if not shapes or any(len(shape) < 2 for shape in shapes) or len({(s[0], s[-1]) for s in shapes}) != 1:
+        raise ValueError(f"observations must be (T, ..., n) with time first and the sequences last; got {shapes}.")
+    num_frames, num_sequences = shapes[0][0], shapes[0][-1]
+    if lengths is not None and jnp.shape(lengths) != (num_sequences,):
+        raise ValueError(
+            f"lengths must be ({num_sequences},), one for each sequence along the last axis of observations; "
+            f"got {jnp.shape(lengths)}."
+        )
+    if mask is not None and jnp.shape(mask) != (num_frames, num_sequences):
+        raise ValueError(f"mask must be ({num_frames}, {num_sequences}), (T, n); got {jnp.shape(mask)}.")
+    if isinstance(lengths, jax.core.Tracer) or isinstance(mask, jax.core.Tracer):
+        return num_frames, num_sequences
+    counts = np.full(num_sequences, num_frames) if lengths is None else np.asarray(lengths)
+    if np.any(counts < 0) or np.any(counts > num_frames):
+        raise ValueError(f"lengths must be from 0 to {num_frames}, the frames of observations; got {counts}.")
+    inside = np.arange(num_frames)[:, None] < counts
+    check_values(emission, observations, inside if mask is None else inside & np.asarray(mask))
+    return num_frames, num_sequences
+
+
+def _along(observed: Array, leaf: Array) -> Array:
+    return observed.reshape(observed.shape[0], *[1] * (leaf.ndim - 2), observed.shape[1])
 
 
 def _extent(observations: PyTree) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The mathematics that filters and trackers stand on: rotations, small matrices, tensors, assignment, statistics."""
+"""Mathematics for filters and trackers: rotations, small matrices, tensors, assignment, and online statistics."""
 
 import lazy_loader
 

@@ -1,8 +1,11 @@
-r"""Diffusion that follows the speed: how far a coasting target may stray from where it was headed.
+r"""Adaptive diffusion: the standard deviation of a velocity change as a linear function of the speed.
 
-A target that is predicted to go on as it went is wrong by how much its velocity changes. The standard deviation of that
-change grows with the speed, $\delta = A |v| + b$, and the regression is learnt from the changes that were seen, while
-tracking (K. Oka, Y. Sato et al. 2006, equations 21-24).
+The error of a constant-velocity prediction is the change of the velocity. Its standard deviation grows with the speed,
+$\delta = A |v| + b$, and the coefficients are estimated online from the observed changes by recursive least squares
+(Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion", master's thesis, The
+University of Tokyo, 2007, section 3.3; see also K. Oka, Y. Sato, Y. Nakanishi and H. Koike, "Head pose estimation
+system based on particle filtering with adaptive diffusion control", IAPR Conference on Machine Vision Applications,
+2005).
 """
 
 import math
@@ -14,48 +17,57 @@ from jaxtyping import Array, Float
 from jaxfilters._struct import pytree_dataclass
 
 GAMMA = math.sqrt(math.pi / 2)
-"""Standard deviation of a centred Gaussian over its mean absolute value."""
+"""Ratio of the standard deviation of a centred Gaussian to its mean absolute value."""
 
 
 @pytree_dataclass
 class DiffusionFit:
-    """A regression of diffusion on speed, in numbers without units."""
+    """A linear regression of the diffusion on the speed, in dimensionless numbers."""
 
     coefficients: Float[Array, "d+1 d"]
-    """Of each coordinate, a column: its dependence on every speed, then the constant; everything over `scale`."""
+    """One column for each coordinate: its dependence on the d speeds, then the constant, all relative to `scale`."""
     covariance: Float[Array, "d+1 d+1"]
-    """Of every column of the coefficients, over the variance of what is regressed."""
+    """Covariance of every column of the coefficients, relative to the variance of the regressed numbers."""
     scale: Float[Array, " d"]
-    """Size of a typical velocity in each coordinate's own unit per unit of time."""
+    """A typical speed of each coordinate, in its unit per unit of time."""
     strength: Float[Array, ""]
-    """Of the first guess, as `start` was given it."""
+    """Number of observations to which the initial coefficients are equivalent."""
 
     @property
     def slope(self) -> Float[Array, "d d"]:
-        """`A` of `A |v| + b`, in the coordinates' own units."""
+        """The matrix A of `A |v| + b`, in the units of the coordinates."""
         return self.scale[:, None] * self.coefficients[:-1].T / self.scale
 
     @property
     def offset(self) -> Float[Array, " d"]:
-        """`b` of `A |v| + b`, in the coordinates' own units per unit of time."""
+        """The vector b of `A |v| + b`, in the units of the coordinates per unit of time."""
         return self.scale * self.coefficients[-1]
 
 
 def start(
     scale: Float[Array, " d"], *, slope: float = 1.0, offset: float = 1.0, strength: float = 10.0
 ) -> DiffusionFit:
-    """The fit before anything was seen: `A = slope I`, and `b = offset scale`.
+    """The fit before the first observation: `A = slope I` and `b = offset scale`.
 
     Args:
-        scale: Size of a typical velocity of each coordinate, in its unit per unit of time.
-        slope: Of the first guess; 0 with the fixed fit of `keep` is a diffusion that never adapts.
-        offset: Of the first guess, in units of `scale`.
-        strength: How many observations at a speed of `scale` the first guess is worth.
+        scale: (d,): a typical speed of each coordinate, in its unit per unit of time.
+        slope: Initial slope; 0 together with `fixed` is a diffusion that does not depend on the speed.
+        offset: Initial constant, in units of `scale`.
+        strength: Number of observations at a speed of `scale` to which the initial coefficients are equivalent.
 
     Raises:
-        ValueError: If `scale` or `strength` is not positive.
+        ValueError: If `scale` is not a vector, or `scale` or `strength` is not positive.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import diffusion
+        >>> fit = diffusion.start(jnp.array([2.0]))
+        >>> print(diffusion.velocity_change_std(fit, jnp.array([3.0])))
+        [5.]
     """
     scale = jnp.asarray(scale, dtype=float)
+    if scale.ndim != 1:
+        raise ValueError(f"scale must be a vector (d,); got {scale.shape}.")
     check_positive("scale", scale)
     check_positive("strength", strength)
     size = scale.shape[0]
@@ -67,28 +79,34 @@ def start(
 def update(
     fit: DiffusionFit,
     velocity: Float[Array, " d"],
-    change: Float[Array, " d"],
+    velocity_change: Float[Array, " d"],
     *,
     forgetting: float | Float[Array, ""] = 1.0,
 ) -> DiffusionFit:
     r"""The fit after one more step, by recursive least squares.
 
-    With $z = (|v|, 1)$ and the target $\hat\delta = \gamma |c|$, both over `scale`: $g = P z / (1 + z^T P z)$,
-    $\Theta \leftarrow \Theta + g (\hat\delta^T - z^T \Theta)$, $P \leftarrow P - g z^T P$ (equations 23 and
-    24). Without forgetting this is ridge regression towards the first guess, exactly.
+    With $z = (|v|, 1)$ and the target $\hat\delta = \gamma |c|$, both relative to `scale`: $g = P z / (1 + z^T P z)$,
+    $\Theta \leftarrow \Theta + g (\hat\delta^T - z^T \Theta)$, $P \leftarrow P - g z^T P$. Without forgetting this is
+    exactly ridge regression towards the initial coefficients.
 
     Args:
-        fit: Fit so far.
-        velocity: `v` before the step.
-        change: `c`, the velocity after the step less that before it: the error of the prediction over the time it took.
-        forgetting: Weight of each step for the next one, from 0.5 to 1. Forgetting ends where coefficients are as
-            uncertain as they were at first, $P \leftarrow P + (1 / \lambda - 1)(P - s P P)$ with the strength $s$ of
-            the first guess: a target that rests for long says nothing of speed, and $P / \lambda$ would overflow.
+        fit: The fit so far.
+        velocity: (d,): the velocity v before the step.
+        velocity_change: (d,): c, the velocity after the step minus that before it.
+        forgetting: Factor by which the weight of earlier steps decreases at every step, from 0.5 to 1. The covariance
+            never exceeds the initial one, $P \leftarrow P + (1 / \lambda - 1)(P - s P P)$ with the initial strength
+            $s$: a target at rest yields no information about the slope, and $P / \lambda$ would overflow.
 
     Returns:
-        The fit; as it was where a velocity or a change is not finite.
+        The fit; the unchanged one if a velocity or a change is not finite.
+
+    Raises:
+        ValueError: If a vector is not (d,).
     """
-    z, target = _regressor(fit, velocity), GAMMA * jnp.abs(change) / fit.scale
+    for name, vector in (("velocity", velocity), ("velocity_change", velocity_change)):
+        if jnp.shape(vector) != fit.scale.shape:
+            raise ValueError(f"{name} must be {fit.scale.shape}, the shape of scale; got {jnp.shape(vector)}.")
+    z, target = _regressor(fit, velocity), GAMMA * jnp.abs(velocity_change) / fit.scale
     usable = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(target))
     z, target = jnp.where(usable, z, 0.0), jnp.where(usable, target, 0.0)
     Pz = _product(fit.covariance, z)
@@ -106,20 +124,35 @@ def update(
     )
 
 
-def keep(fit: DiffusionFit, velocity: Float[Array, " d"], change: Float[Array, " d"]) -> DiffusionFit:
-    """The fit as it is: `A` and `b` are given, not learnt."""
-    del velocity, change
+def fixed(fit: DiffusionFit, velocity: Float[Array, " d"], velocity_change: Float[Array, " d"]) -> DiffusionFit:
+    """The unchanged fit, in place of `update`, for coefficients that are not estimated."""
+    del velocity, velocity_change
     return fit
 
 
-def spread(
+def velocity_change_std(
     fit: DiffusionFit,
     velocity: Float[Array, " d"],
     *,
     low: float | Float[Array, " d"] = 0.0,
     high: float | Float[Array, " d"] = math.inf,
 ) -> Float[Array, " d"]:
-    """Standard deviation `A |v| + b` of the next change of velocity, between `low` and `high`."""
+    """The standard deviation `A |v| + b` of the next velocity change, clipped to `low` and `high`.
+
+    Args:
+        fit: The fit.
+        velocity: (d,): the present velocity v.
+        low: Lower limit, in the units of the coordinates per unit of time.
+        high: Upper limit.
+
+    Returns:
+        (d,).
+
+    Raises:
+        ValueError: If `velocity` is not (d,).
+    """
+    if jnp.shape(velocity) != fit.scale.shape:
+        raise ValueError(f"velocity must be {fit.scale.shape}, the shape of scale; got {jnp.shape(velocity)}.")
     return jnp.clip(fit.scale * _product(fit.coefficients.T, _regressor(fit, velocity)), low, high)
 
 
@@ -132,10 +165,10 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def check_positive(name: str, value: float | Array) -> None:
-    """Reject what is not above zero.
+    """Reject numbers that are not positive.
 
     Raises:
-        ValueError: If any number is zero, negative or NaN.
+        ValueError: If a number is zero, negative or NaN.
     """
     if not np.all(np.asarray(value) > 0):
         raise ValueError(f"{name} must be positive; got {value}.")

@@ -1,8 +1,16 @@
 """Rotations and rigid motions: unit quaternions `(w, x, y, z)`, rotation vectors in radians, transforms in metres.
 
 Every function takes one quaternion and is written as algebra on its components, so that
-`vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble. Values and first derivatives are
-finite at the identity and at half a turn.
+`vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble. Values and first derivatives are finite
+at the identity and at rotations by pi. All functions raise a ValueError, when they are traced, if a quaternion does not
+have four components or a vector three.
+
+Example:
+    >>> import jax.numpy as jnp
+    >>> from jaxfilters.math import lie
+    >>> q = lie.so3_exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> print(lie.quaternion_to_matrix(q).round(3)[:, 0])
+    [0. 1. 0.]
 """
 
 import jax
@@ -12,14 +20,26 @@ from jaxtyping import Array, Float
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 
-# Below this squared half-angle tangent the series' first neglected term is under float64 rounding.
+# Below this squared tangent of half the angle, the first neglected term of the series is less than float64 rounding.
 _SMALL = 1e-4
+
+
+def _quaternion(name: str, q: Array) -> Array:
+    if jnp.shape(q)[:1] != (4,):
+        raise ValueError(f"{name} must be a quaternion (4,), (w, x, y, z); got {jnp.shape(q)}.")
+    return q
+
+
+def _vector(name: str, v: Array) -> Array:
+    if jnp.shape(v)[:1] != (3,):
+        raise ValueError(f"{name} must be a vector (3,); got {jnp.shape(v)}.")
+    return v
 
 
 def quaternion_multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Hamilton product `p q`: the rotation `q` followed by the rotation `p`."""
-    pw, px, py, pz = p
-    qw, qx, qy, qz = q
+    pw, px, py, pz = _quaternion("p", p)
+    qw, qx, qy, qz = _quaternion("q", q)
     return jnp.stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
@@ -32,14 +52,14 @@ def quaternion_multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arr
 
 def quaternion_conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Inverse of a unit quaternion."""
-    w, x, y, z = q
+    w, x, y, z = _quaternion("q", q)
     return jnp.stack([w, -x, -y, -z])
 
 
 def quaternion_normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Unit quaternion along `q`. The zero quaternion has no direction and gives NaN."""
-    w, x, y, z = q
-    # Scaled first: in float32 the plain sum of squares underflows for norms below 1e-19.
+    """The quaternion `q` divided by its norm; NaN for the zero quaternion."""
+    w, x, y, z = _quaternion("q", q)
+    # Scaled first, because in float32 the sum of squares underflows for norms below 1e-19.
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(abs(w), abs(x)), jnp.maximum(abs(y), abs(z))))
     w, x, y, z = w / scale, x / scale, y / scale, z / scale
     inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
@@ -47,8 +67,8 @@ def quaternion_normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 
 def quaternion_to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Rotation matrix of a unit quaternion."""
-    w, x, y, z = q
+    """The rotation matrix of a unit quaternion."""
+    w, x, y, z = _quaternion("q", q)
     return jnp.stack(
         [
             jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
@@ -59,11 +79,13 @@ def quaternion_to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 
 def quaternion_from_matrix(R: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Unit quaternion of a rotation matrix, with `w >= 0`.
+    """The unit quaternion of a rotation matrix, with `w >= 0`.
 
-    Of the four columns `4 q_k q` that a rotation matrix yields, the longest is taken, so nothing cancels at any
-    angle (S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
+    Of the four vectors `4 q_k q` that a rotation matrix determines, the longest is used, so that no angle leads to
+    cancellation (S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
     """
+    if jnp.shape(R)[:2] != (3, 3):
+        raise ValueError(f"R must be a rotation matrix (3, 3); got {jnp.shape(R)}.")
     (a, b, c), (d, e, f), (g, h, i) = R
     by_w = jnp.stack([1 + a + e + i, h - f, c - g, d - b])
     by_x = jnp.stack([h - f, 1 + a - e - i, b + d, c + g])
@@ -77,8 +99,8 @@ def quaternion_from_matrix(R: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def so3_exp(rotvec: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Unit quaternion of the rotation by `|rotvec|` radians about `rotvec`."""
-    x, y, z = rotvec
+    """The unit quaternion of a rotation by `|rotvec|` radians about `rotvec`."""
+    x, y, z = _vector("rotvec", rotvec)
     angle2 = x * x + y * y + z * z
     small = angle2 < _SMALL
     angle = jnp.sqrt(jnp.where(small, 1.0, angle2))
@@ -90,17 +112,17 @@ def so3_exp(rotvec: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 def so3_log(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Rotation vector, in radians and at most pi long, of a quaternion: inverse of `so3_exp`.
+    """The rotation vector, in radians and at most pi long, of a quaternion: the inverse of `so3_exp`.
 
-    `q` and `-q` are the same rotation and give the same vector, except at half a turn, where both signs are right.
-    The length of `q` does not matter.
+    `q` and `-q` are the same rotation and give the same vector, except for a rotation by pi, for which both signs are
+    valid. The norm of `q` has no influence.
     """
-    w, x, y, z = q
+    w, x, y, z = _quaternion("q", q)
     sign = jnp.where(w < 0, -1.0, 1.0).astype(q.dtype)
     w, x, y, z = sign * w, sign * x, sign * y, sign * z
     sine2 = x * x + y * y + z * z
     small = sine2 < _SMALL * w * w
-    # The half angle from both of its sides, never from one: accurate near 0 and near half a turn alike.
+    # The half angle from its sine and cosine together, which is accurate near 0 and near pi.
     sine = jnp.sqrt(jnp.where(small, 1.0, sine2))
     cosine = jnp.where(small, w, 1.0)
     tangent2 = jnp.where(small, sine2, 0.0) / (cosine * cosine)
@@ -110,22 +132,31 @@ def so3_log(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def so3_retract(q: Float[Array, "4"], rotvec: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotation `q` turned by `rotvec` radians about axes that turn with it: `q exp(rotvec)`, of unit length."""
+    """The rotation `q` followed by `rotvec` in its own frame, `q exp(rotvec)`, as a unit quaternion."""
     return quaternion_normalize(quaternion_multiply(q, so3_exp(rotvec)))
 
 
 def so3_local(q: Float[Array, "4"], p: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Rotation vector in radians that leads from `q` to `p`: `log(q^-1 p)`, what `so3_retract` takes."""
+    """The rotation vector from `q` to `p`, `log(q^-1 p)` in radians: the inverse of `so3_retract`."""
     return so3_log(quaternion_multiply(quaternion_conjugate(q), p))
 
 
 def quaternion_mean(q: Float[Array, "4 n"], log_weights: Float[Array, " n"]) -> Float[Array, "4"]:
-    """Weighted mean rotation as a unit quaternion with `w >= 0`; the signs of the inputs do not matter.
+    """The weighted mean rotation as a unit quaternion with `w >= 0`, independent of the signs of the inputs.
 
-    The top eigenvector of `sum_i w_i q_i q_i^T` (F. L. Markley et al., "Averaging quaternions", J. Guidance, Control
-    and Dynamics 30(4), 2007, eq. 13). Not determined, nor differentiable, where the two largest eigenvalues are
-    equal: half of the weight on each of two rotations half a turn apart.
+    It is the leading eigenvector of `sum_i w_i q_i q_i^T` (F. L. Markley et al., "Averaging quaternions", J. Guidance,
+    Control and Dynamics 30(4), 2007, eq. 13). It is neither unique nor differentiable if the two largest eigenvalues
+    are equal, as for two rotations of equal weight that differ by pi.
+
+    Args:
+        q: (4, n): unit quaternions.
+        log_weights: (n,): log weights, which need not be normalised.
+
+    Raises:
+        ValueError: If `q` is not (4, n) with the n of `log_weights`.
     """
+    if jnp.shape(q) != (4, *jnp.shape(log_weights)):
+        raise ValueError(f"q and log_weights must be (4, n) and (n,); got {jnp.shape(q)} and {jnp.shape(log_weights)}.")
     w = weights.linear(log_weights)
     moment = jnp.matmul(q * w, q.T, precision="highest")
     return _with_positive_w(quaternion_normalize(_top_eigenvector(moment)))
@@ -142,8 +173,8 @@ def _top_eigenvector(moment: Float[Array, "4 4"]) -> Float[Array, "4"]:
 
 @_top_eigenvector.defjvp
 def _top_eigenvector_jvp(primals, tangents):
-    # The derivative of `eigh` divides by the gaps between all eigenvalues; like rotations leave three of them at
-    # zero. Only the gaps to the top one matter.
+    # The derivative of `eigh` divides by the gaps between all eigenvalues, of which three are zero for equal rotations.
+    # Only the gaps to the largest eigenvalue matter.
     (moment,), (d_moment,) = primals, tangents
     values, vectors = jnp.linalg.eigh(moment)
     top = vectors[:, -1]
@@ -154,7 +185,7 @@ def _top_eigenvector_jvp(primals, tangents):
 
 @pytree_dataclass
 class RigidTransform:
-    """Rotation, then translation; named by its frames at call sites, `T_target_source`."""
+    """A rotation followed by a translation; variables are named by their frames, `T_target_source`."""
 
     rotation: Float[Array, "..."]
     """(4,): unit quaternion `(w, x, y, z)`."""
@@ -163,23 +194,25 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> "RigidTransform":
-        """The transform that moves nothing, in the default float type."""
+        """The identity transform, in the default float type."""
         return cls(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
 
     def apply(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-        """Points of the source frame in the target frame, metres."""
+        """Points (..., 3) of the source frame in the target frame, in metres."""
+        if jnp.shape(points)[-1:] != (3,):
+            raise ValueError(f"points must be (..., 3); got {jnp.shape(points)}.")
         R = quaternion_to_matrix(self.rotation)
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        # Not a matrix product: accelerators would round its float32 inputs to ten bits.
+        # Not a matrix product, because accelerators round its float32 inputs to ten bits of mantissa.
         moved = [R[i, 0] * x + R[i, 1] * y + R[i, 2] * z + self.translation[i] for i in range(3)]
         return jnp.stack(moved, axis=-1)
 
     def inverse(self) -> "RigidTransform":
-        """`T_source_target` of `T_target_source`."""
+        """The inverse transform, `T_source_target` of `T_target_source`."""
         back = quaternion_conjugate(self.rotation)
         return RigidTransform(back, -RigidTransform(back, jnp.zeros_like(self.translation)).apply(self.translation))
 
 
 def compose(a: RigidTransform, b: RigidTransform) -> RigidTransform:
-    """`T_x_z` of `T_x_y` and `T_y_z`: first `b`, then `a`."""
+    """The composition `T_x_z` of a = `T_x_y` and b = `T_y_z`, which applies `b` first."""
     return RigidTransform(quaternion_multiply(a.rotation, b.rotation), a.apply(b.translation))

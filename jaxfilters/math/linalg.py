@@ -1,7 +1,7 @@
-"""Small dense linear algebra that survives zero variances: triangularisation, Cholesky factors, triangular solves.
+"""Linear algebra of small dense matrices that may be singular: triangularisation, Cholesky factors, triangular solves.
 
-Up to 8 rows everything but `tria` is plain algebra on the elements, which `last_axis.vmap` runs as vector arithmetic
-over an ensemble, ten times faster on a CPU than one LAPACK call each; above that LAPACK is faster.
+Up to 8 rows all functions but `tria` are written as algebra on the elements, which becomes vector arithmetic over an
+ensemble and is ten times faster on a CPU than a LAPACK call for each matrix; above that LAPACK is faster.
 """
 
 from functools import reduce
@@ -18,29 +18,40 @@ _UNROLLED = 8
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Square root of which the derivative at 0 is 0, not infinite; 0 for negative numbers."""
+    """The square root, with derivative 0 instead of infinity at 0; it is 0 for negative numbers."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def safe_norm(x: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
-    """Euclidean length along the last axis; its derivative at 0 is 0."""
+    """The Euclidean norm along the last axis, with derivative 0 at 0."""
     return safe_sqrt(jnp.sum(x * x, axis=-1))
 
 
 def matmul(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
-    """Matrix product in full precision on every device."""
+    """The matrix product in full precision on every device.
+
+    Raises:
+        ValueError: If the inner sizes differ.
+    """
+    if a.shape[1] != b.shape[0]:
+        raise ValueError(f"a and b must be (n, k) and (k, m); got {a.shape} and {b.shape}.")
     if max(*a.shape, *b.shape) > _UNROLLED or a.shape[1] == 0:
         return jnp.matmul(a, b, precision="highest")
     return materialized(reduce(add, (a[:, i, None] * b[None, i, :] for i in range(a.shape[1]))))
 
 
 def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower L with `L L^T = S`, from the lower half of a positive semidefinite S.
+    """The lower triangular L with `L L^T = S`, from the lower triangle of a positive semidefinite S.
 
-    A variable without variance gets a row and a column of zeros, and up to n = 8 so does one that depends on those
-    before it, to rounding. NaN where S is not positive semidefinite.
+    A variable without variance has a row and a column of zeros, and up to n = 8 so has one that is a linear combination
+    of those before it, up to rounding. L has NaN if S is not positive semidefinite.
+
+    Raises:
+        ValueError: If S is not square.
     """
+    if S.shape != S.shape[:1] * 2:
+        raise ValueError(f"S must be square; got {S.shape}.")
     n = S.shape[0]
     if n > _UNROLLED:
         fixed = jnp.diagonal(S) == 0
@@ -62,12 +73,18 @@ def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def solve_triangular(
     L: Float[Array, "n n"], b: Float[Array, " n"] | Float[Array, "n m"], *, transpose: bool = False
 ) -> Float[Array, " n"] | Float[Array, "n m"]:
-    """`x` with `L x = b`, or `L^T x = b`, for a lower L; 0 for the unknowns whose diagonal element is 0."""
+    """The solution of `L x = b` or `L^T x = b` with lower triangular L; 0 for unknowns whose diagonal element is 0.
+
+    Raises:
+        ValueError: If L is not square, or b does not have as many rows.
+    """
     n = L.shape[0]
+    if L.shape != (n, n) or b.shape[:1] != (n,):
+        raise ValueError(f"L and b must be (n, n) and (n,) or (n, m); got {L.shape} and {b.shape}.")
     if n > _UNROLLED:
         fixed = jnp.diagonal(L) == 0
         rest = jnp.where(fixed.reshape((n,) + (1,) * (b.ndim - 1)), 0.0, b)
-        # A fixed unknown is zero: its column must not matter, nor its row.
+        # An unknown that is fixed at zero must not influence the others through its column or row.
         square = jnp.where(fixed[:, None] | fixed, jnp.eye(n, dtype=L.dtype), L)
         return lapack_solve_triangular(square, rest, lower=True, trans=1 if transpose else 0)
     diagonal = jnp.stack([L[i, i] for i in range(n)])
@@ -81,16 +98,16 @@ def solve_triangular(
 
 
 def tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """Lower L with `L L^T = A A^T` and no negative number on its diagonal, for A of any width.
+    """The lower triangular L with `L L^T = A A^T` and a nonnegative diagonal, for A of any width.
 
-    A row of zeros gives a row and a column of zeros. L is smooth where the rows of A are independent. A row that is
-    zero, or lies in the span of the rows before it to rounding, has a zero on the diagonal, where L has a kink as |x|
-    at 0: there the derivative is finite, right for all changes that keep the row in the span, and ignores the part of
-    a change that leaves it on the right of the diagonal.
+    A row of zeros leads to a row and a column of zeros. L is differentiable where the rows of A are independent. A row
+    that is zero, or a linear combination of earlier rows up to rounding, has a zero on the diagonal, at which L is not
+    differentiable, as |x| at 0: the derivative there is finite, correct for changes that keep the row in the span, and
+    ignores the part of other changes to the right of the diagonal.
     """
     n, m = A.shape
     zero = jnp.all(A == 0, axis=1)
-    # Zero rows go last, so that no direction of the row space is spent on them.
+    # Rows of zeros are moved to the end, so that the factorisation assigns no direction of the row space to them.
     place = jnp.where(zero, jnp.sum(~zero) + jnp.cumsum(zero), jnp.cumsum(~zero)) - 1
     ordered = (place == jnp.arange(n)[:, None]).astype(A.dtype)
     L = _tria(jnp.pad(matmul(ordered, A), ((0, 0), (0, max(0, n - m)))))
@@ -110,8 +127,8 @@ def _tria(A):
 
 @_tria.defjvp
 def _tria_jvp(primals, tangents):
-    # A = L Q^T. For every skew W, dL = dA Q + L W gives d(L L^T) = d(A A^T), at any rank; the W that makes dL lower
-    # follows from the part above the diagonal of L^-1 dA Q, for which only independent rows need dividing.
+    # A = L Q^T. For every skew-symmetric W, dL = dA Q + L W satisfies d(L L^T) = d(A A^T), at any rank. The W for which
+    # dL is lower triangular follows from the upper triangle of L^-1 dA Q, which needs independent rows only.
     (A,), (dA,) = primals, tangents
     L, Q = _factors(A)
     turned = jnp.matmul(dA, Q, precision="highest")

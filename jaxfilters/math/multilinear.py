@@ -1,13 +1,13 @@
-r"""Tensors as a small core times a matrix for each mode: unfolding, N-mode SVD, and the best approximation of low rank.
+r"""Tucker decompositions of tensors: unfolding, the N-mode SVD, and the best approximation of low multilinear rank.
 
 `X = core x_1 U_1 ... x_N U_N`, where $(\mathcal X \times_n C)_{i_1..j..i_N} = \sum_{i_n} \mathcal X_{i_1..i_n..i_N}
-C_{j i_n}$. A truncated N-mode SVD is not the best approximation of its ranks; alternating least squares, which starts
-from it, finds a better one (L. De Lathauwer, B. De Moor and J. Vandewalle, "A multilinear singular value decomposition"
-and "On the best rank-1 and rank-(R1, ..., RN) approximation of higher-order tensors", SIAM J. Matrix Anal. Appl. 21(4),
-2000; Y. Sugano 2007, equations 4.1-4.14). Modes are counted from 0.
+C_{j i_n}$. A truncated N-mode SVD is not the best approximation of its ranks; alternating least squares (HOOI), which
+starts from it, finds a better one (L. De Lathauwer, B. De Moor and J. Vandewalle, "A multilinear singular value
+decomposition" and "On the best rank-1 and rank-(R1, ..., RN) approximation of higher-order tensors", SIAM J. Matrix
+Anal. Appl. 21(4), 2000). Modes are counted from 0.
 
-Factors are dictionaries from a mode to its matrix with orthonormal columns, each of which has a sum of 0 or more; a
-mode that is not in the dictionary is left as it is.
+Factors are dictionaries from a mode to its matrix, whose columns are orthonormal and have a nonnegative sum; a mode
+that is not in the dictionary is not reduced.
 """
 
 from collections.abc import Mapping
@@ -24,40 +24,42 @@ Factors = dict[int, Array]
 
 
 class Tucker(NamedTuple):
-    """A tensor as `compose(core, factors)`."""
+    """A Tucker decomposition: the tensor is `compose(core, factors)`."""
 
     core: Float[Array, "..."]
+    """The core tensor."""
     factors: Factors
     """(I_n, R_n) for each reduced mode."""
 
 
 class Hooi(NamedTuple):
-    """An approximation of low rank, and how it was reached."""
+    """An approximation of low multilinear rank, and the course of its computation."""
 
     core: Float[Array, "..."]
+    """The core tensor."""
     factors: Factors
     """(I_n, R_n) for each reduced mode."""
     history: Float[Array, " sweeps"]
-    """Captured energy `|core|^2` at the start and after every sweep; the last value repeats after convergence."""
+    """Energy `|core|^2` of the approximation at the start and after every sweep; after convergence it repeats."""
 
 
 def unfold(X: Float[Array, "..."], mode: int) -> Float[Array, "rows columns"]:
-    """The tensor as a matrix with the index of one mode along its rows.
+    """The mode-n unfolding: the tensor as a matrix with the index of one mode along its rows.
 
-    Columns run through the other modes in their order, the last one fastest.
+    Columns enumerate the other modes in their order, the last one fastest.
 
     Raises:
-        ValueError: if the tensor has no such mode.
+        ValueError: If the tensor has no such mode.
     """
     _check_mode(X.ndim, mode)
     return jnp.moveaxis(X, mode, 0).reshape(X.shape[mode], -1)
 
 
 def fold(Y: Float[Array, "rows columns"], mode: int, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """The tensor of a shape whose unfolding is `Y`: inverse of `unfold`.
+    """The tensor of a given shape whose unfolding is `Y`: the inverse of `unfold`.
 
     Raises:
-        ValueError: if the tensor has no such mode, or the matrix does not fit the shape.
+        ValueError: If the tensor has no such mode, or `Y` does not match the shape.
     """
     _check_mode(len(shape), mode)
     rest = tuple(size for n, size in enumerate(shape) if n != mode)
@@ -67,10 +69,10 @@ def fold(Y: Float[Array, "rows columns"], mode: int, shape: tuple[int, ...]) -> 
 
 
 def mode_product(X: Float[Array, "..."], C: Float[Array, "rows columns"], mode: int) -> Float[Array, "..."]:
-    """The tensor with every one of its mode's fibres multiplied by `C` (equations 4.1 and 4.2).
+    """The n-mode product: the tensor with every fibre of one mode multiplied by `C`.
 
     Raises:
-        ValueError: if the tensor has no such mode, or its size is not the number of columns.
+        ValueError: If the tensor has no such mode, or its size is not the number of columns.
     """
     _check_mode(X.ndim, mode)
     if C.shape[1] != X.shape[mode]:
@@ -79,27 +81,27 @@ def mode_product(X: Float[Array, "..."], C: Float[Array, "rows columns"], mode: 
 
 
 def compose(core: Float[Array, "..."], factors: Factors) -> Float[Array, "..."]:
-    """The tensor `core x_n U_n` over all factors (equation 4.7)."""
+    """The tensor `core x_n U_n` over all factors."""
     for mode, U in factors.items():
         core = mode_product(core, U, mode)
     return core
 
 
 def project(X: Float[Array, "..."], factors: Factors) -> Float[Array, "..."]:
-    """The core `X x_n U_n^T` over all factors (equation 4.8), the best one for them."""
+    """The core `X x_n U_n^T` over all factors, which is the optimal one for them."""
     return compose(X, {mode: U.T for mode, U in factors.items()})
 
 
 def hosvd(X: Float[Array, "..."], ranks: Mapping[int, int] | None = None) -> Tucker:
-    """The N-mode singular value decomposition (equations 4.7-4.9), truncated to `ranks` (4.10).
+    """The N-mode singular value decomposition (higher-order SVD), truncated to `ranks`.
 
     Args:
         X: A tensor of finite numbers.
-        ranks: Rank of each mode to reduce; without it all modes get all of their singular vectors, and the
+        ranks: Rank of each mode to reduce; by default all modes keep all of their singular vectors, and the
             decomposition is exact.
 
     Raises:
-        ValueError: if a number is not finite, or a rank is outside of `1..min(I_n, product of the other sizes)`, where
+        ValueError: If a number is not finite, or a rank is outside of `1..min(I_n, product of the other sizes)`, where
             the size of a reduced mode is its rank.
     """
     if ranks is None:
@@ -111,19 +113,19 @@ def hosvd(X: Float[Array, "..."], ranks: Mapping[int, int] | None = None) -> Tuc
 
 
 def hooi(X: Float[Array, "..."], ranks: Mapping[int, int], *, max_sweeps: int = 200, tolerance: float = 1e-12) -> Hooi:
-    """The approximation of given ranks of least squared error that alternating least squares finds (equation 4.14).
+    """The approximation of given ranks with least squared error, by alternating least squares (HOOI).
 
     A sweep replaces each reduced mode's factor by the leading left singular vectors of the tensor projected onto the
-    factors of the others; the captured energy never falls, and `|X - Xhat|^2 = |X|^2 - |core|^2`.
+    factors of the others; the energy of the core never decreases, and `|X - Xhat|^2 = |X|^2 - |core|^2`.
 
     Args:
         X: A tensor of finite numbers.
         ranks: Rank of each mode to reduce; with `jit`, Python numbers.
-        max_sweeps: Most sweeps.
-        tolerance: Relative growth of the captured energy below which a sweep is the last; no less than rounding.
+        max_sweeps: Upper bound on the number of sweeps.
+        tolerance: Relative increase of the energy below which the iteration ends; at least rounding error.
 
     Raises:
-        ValueError: as `hosvd`, or if `max_sweeps` is not positive.
+        ValueError: As `hosvd`, or if `max_sweeps` is not positive.
     """
     check_ranks(X.shape, ranks)
     check_finite("X", X)
@@ -133,16 +135,16 @@ def hooi(X: Float[Array, "..."], ranks: Mapping[int, int], *, max_sweeps: int = 
 
 
 def numerical_ranks(X: Float[Array, "..."], tolerance: float | None = None) -> Int[Array, " modes"]:
-    """Rank of each unfolding: the number of singular values above a share of the largest one.
+    """The numerical rank of each unfolding: the number of singular values above a fraction of the largest one.
 
     Args:
         X: A tensor of finite numbers.
-        tolerance: The share; default: the unfolding's longer side times the rounding of its type, as for matrices in
-            numpy. Noise asks for more: its standard deviation times `sqrt(rows) + sqrt(columns)`, over the largest
-            singular value.
+        tolerance: The fraction; by default the larger size of the unfolding times the rounding error of its type, as
+            for matrices in numpy. For noisy tensors use the standard deviation of the noise times
+            `sqrt(rows) + sqrt(columns)`, divided by the largest singular value.
 
     Raises:
-        ValueError: if a number is not finite, or the tolerance is not in [0, 1).
+        ValueError: If a number is not finite, or the tolerance is not in [0, 1).
     """
     check_finite("X", X)
     if tolerance is not None and not 0 <= tolerance < 1:
@@ -150,32 +152,32 @@ def numerical_ranks(X: Float[Array, "..."], tolerance: float | None = None) -> I
     found = []
     for mode in range(X.ndim):
         unfolded = unfold(X, mode)
-        values = jnp.linalg.svd(unfolded, full_matrices=False, compute_uv=False)  # not even asked for, they take room
+        values = jnp.linalg.svd(unfolded, full_matrices=False, compute_uv=False)  # saves memory
         least = max(unfolded.shape) * float(jnp.finfo(X.dtype).eps) if tolerance is None else tolerance
         found.append(jnp.sum(values > least * values[0]))
     return jnp.stack(found)
 
 
-def leading(X: Float[Array, "..."], mode: int, rank: int) -> Float[Array, "rows rank"]:
-    """The leading left singular vectors of an unfolding (equation 4.9), with sums of 0 or more."""
+def leading_singular_vectors(X: Float[Array, "..."], mode: int, rank: int) -> Float[Array, "rows rank"]:
+    """The leading left singular vectors of an unfolding, with signs that make their sums nonnegative."""
     U = jnp.linalg.svd(unfold(X, mode), full_matrices=False)[0][:, :rank]
     return U * jnp.where(jnp.sum(U, axis=0) < 0, -1.0, 1.0).astype(U.dtype)
 
 
 def sweep(X: Float[Array, "..."], factors: Factors) -> Factors:
-    """Factors after one round of alternating least squares over their modes."""
+    """The factors after one sweep of alternating least squares over their modes."""
     factors = dict(factors)
     for mode, U in factors.items():
         others = {n: V for n, V in factors.items() if n != mode}
-        factors[mode] = leading(project(X, others), mode, U.shape[1])
+        factors[mode] = leading_singular_vectors(project(X, others), mode, U.shape[1])
     return factors
 
 
 def check_ranks(shape: tuple[int, ...], ranks: Mapping[int, int]) -> None:
-    """Refuse ranks that no tensor of a shape can have.
+    """Reject ranks that no tensor of a shape can have.
 
     Raises:
-        ValueError: if there are none, a mode does not exist, or a rank is outside of
+        ValueError: If there are none, a mode does not exist, or a rank is outside of
             `1..min(I_n, product of the other sizes)`, where the size of a reduced mode is its rank.
     """
     if not ranks:
@@ -191,10 +193,10 @@ def check_ranks(shape: tuple[int, ...], ranks: Mapping[int, int]) -> None:
 
 
 def check_finite(name: str, X: Array) -> None:
-    """Refuse numbers that are not finite, where they are known before compilation.
+    """Reject numbers that are not finite; tracers are not checked.
 
     Raises:
-        ValueError: if one is not.
+        ValueError: If a number is not finite.
     """
     if not isinstance(X, jax.core.Tracer) and not np.all(np.isfinite(X)):
         raise ValueError(f"{name} must be finite; {int(np.sum(~np.isfinite(X)))} of {X.size} numbers are not.")
@@ -202,13 +204,13 @@ def check_finite(name: str, X: Array) -> None:
 
 @partial(jax.jit, static_argnums=1)
 def _hosvd(X, ranks):
-    factors = {mode: leading(X, mode, rank) for mode, rank in ranks}
+    factors = {mode: leading_singular_vectors(X, mode, rank) for mode, rank in ranks}
     return Tucker(project(X, factors), factors)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
 def _hooi(X, ranks, max_sweeps, tolerance):
-    # Below this, growth of the energy is rounding.
+    # Smaller increases of the energy are rounding errors.
     least = jnp.maximum(tolerance, 4 * float(jnp.finfo(X.dtype).eps))
     start = _hosvd(X, ranks)
     energy = jnp.sum(jnp.square(start.core))
@@ -218,14 +220,14 @@ def _hooi(X, ranks, max_sweeps, tolerance):
         factors, history, count, _ = carry
         factors = sweep(X, factors)
         captured = jnp.sum(jnp.square(project(X, factors)))
-        grown = captured - history[count] > least * captured
-        # All later entries at once: the last value repeats.
+        increased = captured - history[count] > least * captured
+        # All later entries are set, so that the last value repeats.
         history = jnp.where(jnp.arange(max_sweeps + 1) > count, captured, history)
-        return factors, history, count + 1, grown
+        return factors, history, count + 1, increased
 
-    underway = lambda carry: carry[3] & (carry[2] < max_sweeps)
-    begun = (start.factors, history, jnp.zeros((), jnp.int32), jnp.ones((), bool))
-    factors, history, *_ = jax.lax.while_loop(underway, improve, begun)
+    unfinished = lambda carry: carry[3] & (carry[2] < max_sweeps)
+    initial = (start.factors, history, jnp.zeros((), jnp.int32), jnp.ones((), bool))
+    factors, history, *_ = jax.lax.while_loop(unfinished, improve, initial)
     return Hooi(project(X, factors), factors, history)
 
 

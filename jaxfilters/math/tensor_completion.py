@@ -1,10 +1,10 @@
-"""Approximations of low rank of tensors of which some entries are missing, by expectation-maximisation.
+"""Approximations of low multilinear rank of tensors with missing entries, by expectation-maximisation.
 
-Missing entries are replaced by what the approximation says of them, and the factors improved for the completed tensor,
-in turn. The squared error over the observed entries never grows, and where it stops falling the approximation is one of
-weighted least squares with weights 1 for the observed entries and 0 for the others (N. Srebro and T. Jaakkola,
-"Weighted low-rank approximations", 2003; for tensors X. Geng et al., "Face image modeling by multilinear subspace
-analysis with missing values", 2011).
+Alternately, missing entries are replaced by those of the approximation, and the factors are improved for the completed
+tensor. The squared error over the observed entries never increases, and the limit is a stationary point of weighted
+least squares with weights 1 for observed and 0 for missing entries (N. Srebro and T. Jaakkola, "Weighted low-rank
+approximations", ICML 2003; for tensors X. Geng, K. Smith-Miles, Z.-H. Zhou and L. Wang, "Face image modeling by
+multilinear subspace analysis with missing values", IEEE Trans. Systems, Man, and Cybernetics B 41(3), 2011).
 """
 
 from collections.abc import Mapping
@@ -20,13 +20,14 @@ from jaxfilters.math.multilinear import Factors, check_finite, check_ranks, comp
 
 
 class Completion(NamedTuple):
-    """An approximation of low rank of what was observed."""
+    """An approximation of low multilinear rank of the observed entries."""
 
     core: Float[Array, "..."]
+    """The core tensor."""
     factors: Factors
     """(I_n, R_n) for each reduced mode."""
     history: Float[Array, " sweeps"]
-    """Squared error over the observed entries after every sweep; the last value repeats after convergence."""
+    """Squared error over the observed entries after every sweep; after convergence the last value repeats."""
     filled: Float[Array, "..."]
     """The tensor with its missing entries replaced by the approximation."""
 
@@ -39,85 +40,85 @@ def complete(
     max_sweeps: int = 2000,
     tolerance: float = 1e-9,
 ) -> Completion:
-    """The approximation of given ranks of least squared error over the observed entries.
+    """The approximation of given ranks with least squared error over the observed entries.
 
-    Missing entries begin as the sum of the means of the observed entries along each reduced mode, less what these
-    share. How well they are found depends on the ranks: every index of a reduced mode needs more observed numbers than
-    its rank.
+    Missing entries are initialised by an additive model of the means along the reduced modes. Every index of a reduced
+    mode needs more observed numbers than its rank.
 
     Args:
-        X: The tensor; missing entries may hold anything, NaN too.
-        observed: Which entries count, of a shape that broadcasts to the tensor's: (1, S, A) for cells of two modes.
+        X: The tensor; missing entries may have any value, including NaN.
+        observed: Whether each entry is observed, with a shape that broadcasts to that of the tensor.
         ranks: Rank of each mode to reduce.
-        max_sweeps: Most sweeps.
-        tolerance: Relative fall of the observed error at which a sweep is the last; no less than rounding.
+        max_sweeps: Upper bound on the number of sweeps.
+        tolerance: Relative decrease of the error below which the iteration ends; at least rounding error.
 
     Raises:
-        ValueError: if an observed number is not finite, `observed` does not broadcast to the tensor, an index of a
+        ValueError: If an observed number is not finite, `observed` does not broadcast to the tensor, an index of a
             reduced mode has no observed entry, or the ranks are not those of a tensor (`check_ranks`).
     """
     check_ranks(X.shape, ranks)
     try:
-        seen = jnp.broadcast_to(observed, X.shape)
+        observed = jnp.broadcast_to(observed, X.shape)
     except ValueError:
         raise ValueError(f"observed must broadcast to {X.shape}, the tensor; got {observed.shape}.") from None
-    _check_observed(X, seen, ranks)
+    _check_observed(X, observed, ranks)
     if max_sweeps < 1:
         raise ValueError(f"max_sweeps must be 1 or more; got {max_sweeps}.")
-    return _complete(X, seen, tuple(sorted(ranks.items())), max_sweeps, tolerance)
+    return _complete(X, observed, tuple(sorted(ranks.items())), max_sweeps, tolerance)
 
 
-def _check_observed(X, seen, ranks):
-    if isinstance(X, jax.core.Tracer) or isinstance(seen, jax.core.Tracer):
+def _check_observed(X, observed, ranks):
+    if isinstance(X, jax.core.Tracer) or isinstance(observed, jax.core.Tracer):
         return
-    check_finite("X where it is observed", jnp.where(seen, X, 0))
+    check_finite("X where it is observed", jnp.where(observed, X, 0))
     for mode in ranks:
         others = tuple(n for n in range(X.ndim) if n != mode)
-        empty = np.flatnonzero(~np.any(np.asarray(seen), axis=others))
+        empty = np.flatnonzero(~np.any(np.asarray(observed), axis=others))
         if len(empty):
             raise ValueError(f"observed must have an entry for each index of mode {mode}; {empty.tolist()} have none.")
 
 
 @partial(jax.jit, static_argnums=(2, 3))
-def _complete(X, seen, ranks, max_sweeps, tolerance):
-    X = jnp.where(seen, X, 0.0)
+def _complete(X, observed, ranks, max_sweeps, tolerance):
+    X = jnp.where(observed, X, 0.0)
     least = jnp.maximum(tolerance, 4 * float(jnp.finfo(X.dtype).eps))
-    error_of = lambda approximation: jnp.sum(jnp.square(jnp.where(seen, X - approximation, 0.0)))
-    filled = jnp.where(seen, X, _first_guess(X, seen, [mode for mode, _ in ranks]))
+    error_of = lambda approximation: jnp.sum(jnp.square(jnp.where(observed, X - approximation, 0.0)))
+    filled = jnp.where(observed, X, _additive_model(X, observed, [mode for mode, _ in ranks]))
     start = hosvd(filled, dict(ranks))
     approximation = compose(start.core, start.factors)
     history = jnp.full(max_sweeps + 1, error_of(approximation))
 
     def improve(carry):
         factors, approximation, history, count, _ = carry
-        filled = jnp.where(seen, X, approximation)
+        filled = jnp.where(observed, X, approximation)
         factors = sweep(filled, factors)
         approximation = compose(project(filled, factors), factors)
         error = error_of(approximation)
-        falls = history[count] - error > least * history[count]
+        decreases = history[count] - error > least * history[count]
         history = jnp.where(jnp.arange(max_sweeps + 1) > count, error, history)
-        return factors, approximation, history, count + 1, falls
+        return factors, approximation, history, count + 1, decreases
 
-    underway = lambda carry: carry[4] & (carry[3] < max_sweeps)
-    begun = (start.factors, approximation, history, jnp.zeros((), jnp.int32), jnp.ones((), bool))
-    factors, approximation, history, *_ = jax.lax.while_loop(underway, improve, begun)
-    filled = jnp.where(seen, X, approximation)
+    unfinished = lambda carry: carry[4] & (carry[3] < max_sweeps)
+    initial = (start.factors, approximation, history, jnp.zeros((), jnp.int32), jnp.ones((), bool))
+    factors, approximation, history, *_ = jax.lax.while_loop(unfinished, improve, initial)
+    filled = jnp.where(observed, X, approximation)
     return Completion(project(filled, factors), factors, history, filled)
 
 
-def _first_guess(X, seen, modes):
-    """Of every entry: the mean of all along the reduced modes, and how far each index lies from it on average."""
-    mean = _mean(X, seen, tuple(modes))
-    guess = mean
+def _additive_model(X, observed, modes):
+    """The mean over the reduced modes plus the mean deviation of each of their indices."""
+    mean = _mean(X, observed, tuple(modes))
+    estimate = mean
     for mode in modes:
         others = tuple(n for n in modes if n != mode)
-        # What is missing elsewhere would shift the mean of a row: its cells are compared with their columns' means.
-        column = _mean(X, seen, (mode,))
-        guess = guess + _mean(X - column, seen, others) if others else guess
-    return guess
+        # The cells of a row are compared with the means of their columns, because missing cells would bias its own
+        # mean.
+        column = _mean(X, observed, (mode,))
+        estimate = estimate + _mean(X - column, observed, others) if others else estimate
+    return estimate
 
 
-def _mean(X, seen, axes):
-    """Mean of the observed entries along axes, 0 where there is none."""
-    count = jnp.sum(seen, axis=axes, keepdims=True)
-    return jnp.sum(jnp.where(seen, X, 0.0), axis=axes, keepdims=True) / jnp.maximum(count, 1)
+def _mean(X, observed, axes):
+    """The mean of the observed entries along axes; 0 where there is none."""
+    count = jnp.sum(observed, axis=axes, keepdims=True)
+    return jnp.sum(jnp.where(observed, X, 0.0), axis=axes, keepdims=True) / jnp.maximum(count, 1)

@@ -1,4 +1,4 @@
-"""Nonlinear least squares within bounds: Levenberg-Marquardt for optimistix, and problems with shared variables."""
+"""Nonlinear least squares within bounds: a solver for optimistix, and one for many frames that share variables."""
 
 import lazy_loader
 

@@ -1,10 +1,9 @@
-"""Least squares within bounds where many frames share some variables: steps in time linear in the frames.
+"""Least squares within bounds for many frames that share some variables, in time linear in the number of frames.
 
-    residuals = lambda shared, frame, data: ...          # of one frame
-    solution = solve_shared(residuals, Split(shared, frames), data, steps=50)
-
-Bundle adjustment, calibration and hand-eye problems are of this form. Steps are those of `BoxLevenbergMarquardt`; the
-normal equations are solved by the Schur complement of the frames' own variables.
+Bundle adjustment, camera calibration and hand-eye calibration have this form. The method is that of
+`BoxLevenbergMarquardt` without its quasi-Newton correction; the normal equations are solved by the Schur complement of
+the variables of the frames (B. Triggs, P. McLauchlan, R. Hartley and A. Fitzgibbon, "Bundle adjustment: a modern
+synthesis", Vision Algorithms: Theory and Practice, 2000, section 6.1).
 """
 
 from collections.abc import Callable
@@ -17,48 +16,52 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxfilters.optimize.box_steps import (
-    Model,
+    QuadraticModel,
     active_set,
-    boxed,
-    by_gradient,
+    bounded_step,
     converged,
-    damped_on,
-    damping_of,
+    current_damping,
     line_search,
+    projected_gradient_norm,
+    updated_damping,
 )
 from jaxfilters.optimize.least_squares import bounds_of
 
 
 class Split(NamedTuple):
-    """Variables, or bounds of them."""
+    """Shared variables and those of the frames, or bounds of both."""
 
     shared: PyTree
+    """Variables of all frames."""
     frames: PyTree
-    """Leaves with a leading axis of n frames."""
+    """Variables of single frames: leaves with a leading axis of n frames."""
 
 
 class SharedSolution(NamedTuple):
-    """How it ended."""
+    """The solution of `solve_shared`."""
 
     value: Split
+    """The variables."""
     energy: Float[Array, ""]
-    """Half of the sum of squared residuals."""
+    """Half the sum of squared residuals."""
     projected_gradient: Float[Array, ""]
-    """Largest change of a variable by a gradient step within the bounds: 0 at a solution."""
+    """Maximum norm of the projected gradient: 0 at a solution."""
     steps: Int[Array, ""]
+    """Number of steps."""
     finite: Bool[Array, ""]
-    """False if residuals or derivatives became infinite or NaN; the value is the last good one."""
+    """False if residuals or derivatives became infinite or NaN; the value is then the last finite one."""
 
 
 class _Blocks(NamedTuple):
-    """Normal equations, a block for each frame."""
+    """Blocks of the normal equations: [[U, W], [W^T, V]] with a block of W and V for each frame."""
 
     U: Float[Array, "s s"]
     W: Float[Array, "n s f"]
     V: Float[Array, "n f f"]
     shared: Float[Array, " s"]
-    """Gradient."""
+    """Gradient with respect to the shared variables."""
     frames: Float[Array, "n f"]
+    """Gradient with respect to the variables of the frames."""
 
     def product(self, x: Float[Array, " s"], y: Float[Array, "n f"]) -> tuple[Array, Array]:
         """Normal matrix times (x, y)."""
@@ -80,22 +83,35 @@ def solve_shared(
     rtol: float = 1e-8,
     atol: float = 1e-8,
 ) -> SharedSolution:
-    """Variables of least energy within their bounds, by at most so many steps.
+    """The variables of least energy, half the sum of squared residuals, within bounds.
 
     Args:
-        residuals: `(shared, frame, data of the frame) -> residuals`.
-        start: Moved to the nearest point within the bounds if outside.
-        data: Leaves with a leading axis of n frames.
-        prior: `shared -> residuals`.
-        lower: Bounds with the structure of `start`; none where absent or infinite.
-        upper: The same.
-        steps: Largest number of steps.
-        rtol: It ends when no variable moves by more than `rtol (1 + |x|)`, with the largest |x|.
-        atol: Or when the projected gradient is at most this.
+        residuals: `(shared, frame, data) -> residuals` of one frame, an array or a pytree of arrays.
+        start: Initial variables; a start that violates the bounds is projected onto them.
+        data: Observations: leaves with a leading axis of n frames.
+        prior: `shared -> residuals` of a Gaussian prior.
+        lower: Lower bounds with the structure of `start`; none where absent or infinite.
+        upper: Upper bounds likewise.
+        steps: Upper bound on the number of steps.
+        rtol: The solver has converged when no variable changes by more than `rtol (1 + max |x|)`.
+        atol: It has also converged when the projected gradient is at most this in every variable.
 
     Raises:
-        ValueError: if a bound has another structure than `start`, or a lower one is above the upper one.
+        ValueError: If a bound does not have the structure of `start`, a lower bound exceeds the upper one, or the
+            leaves
+            of `start.frames` and `data` do not share one number of frames.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> data = jnp.array([[1.0, 2.0], [4.0, 5.0]])  # one offset a frame, and one common difference
+        >>> residuals = lambda shared, frame, data: data - jnp.stack([frame, frame + shared])
+        >>> start = jf.optimize.Split(shared=jnp.zeros(()), frames=jnp.zeros(2))
+        >>> solution = jf.optimize.solve_shared(residuals, start, data, rtol=1e-6, atol=1e-5)
+        >>> print(solution.value.shared.round(3), solution.value.frames.round(3))
+        1.0 [1. 4.]
     """
+    _check_frames(start, data)
     flat, whole = _flattened(start)
     _, as_tree = ravel_pytree(start)
     low, high = (_flattened(as_tree(side))[0] for side in bounds_of({"lower": lower, "upper": upper}, start))
@@ -103,55 +119,56 @@ def solve_shared(
     advance = partial(_advance, problem, low, high, rtol, atol)
     x = jnp.clip(flat, low, high)
     zero, yes = jnp.zeros((), x.dtype), jnp.ones((), bool)
-    begin = _Walk(x, problem.residuals(x), zero, zero + 2, jnp.zeros((), jnp.int32), yes, yes)
-    end = jax.lax.while_loop(lambda walk: walk.goes_on & (walk.steps < steps), advance, begin)
+    begin = _Iterate(x, problem.residuals(x), zero, zero + 2, jnp.zeros((), jnp.int32), yes, yes)
+    end = jax.lax.while_loop(lambda iterate: iterate.unfinished & (iterate.steps < steps), advance, begin)
     blocks = _blocks(problem, end.x)
-    rest = by_gradient(end.x, problem.join(blocks.shared, blocks.frames), (low, high))
-    return SharedSolution(whole(end.x), 0.5 * jnp.sum(jnp.square(end.residuals)), rest, end.steps, end.finite)
+    remaining = projected_gradient_norm(end.x, problem.join(blocks.shared, blocks.frames), (low, high))
+    return SharedSolution(whole(end.x), 0.5 * jnp.sum(jnp.square(end.residuals)), remaining, end.steps, end.finite)
 
 
-class _Walk(NamedTuple):
-    """Between two steps."""
+class _Iterate(NamedTuple):
+    """The state between two steps."""
 
     x: Array
     residuals: Array
     damping: Array
     """0 before the first step."""
     growth: Array
+    """Factor by which the damping grows at the next failure."""
     steps: Array
-    goes_on: Array
+    unfinished: Array
     finite: Array
 
 
-def _advance(problem: "_Problem", low: Array, high: Array, rtol: float, atol: float, walk: _Walk) -> _Walk:
-    """One step of Levenberg-Marquardt within the bounds, or none if nothing decreases the energy."""
-    x, split, join = walk.x, problem.split, problem.join
+def _advance(problem: "_Problem", low: Array, high: Array, rtol: float, atol: float, iterate: _Iterate) -> _Iterate:
+    """One step of Levenberg-Marquardt within the bounds; the point stays if no step decreases the energy."""
+    x, split, join = iterate.x, problem.split, problem.join
     blocks = _blocks(problem, x)
     gradient = join(blocks.shared, blocks.frames)
     diagonal = join(jnp.diagonal(blocks.U), jnp.diagonal(blocks.V, axis1=1, axis2=2))
-    damping = damping_of(walk.damping, diagonal)
+    damping = current_damping(iterate.damping, diagonal)
     free = ~active_set(x, gradient, low, high)
     largest = jnp.max(diagonal)
     product = lambda step: join(*blocks.product(*split(step)))
-    model = Model(x, walk.residuals, gradient, product, 1 / jnp.maximum(damping, largest))
+    model = QuadraticModel(x, iterate.residuals, gradient, product, 1 / jnp.maximum(damping, largest))
     solve = lambda gradient, free: join(*_step(blocks, damping, split(gradient), split(free)))
-    direction, leads = boxed(solve, model, free, (low, high))
-    found = line_search(problem.residuals, model, direction, (low, high), walk.goes_on)
-    finite = jnp.all(jnp.isfinite(walk.residuals)) & jnp.all(jnp.isfinite(gradient))
-    ends = found.is_exhausted | converged(model, found, (low, high), rtol)
-    ends |= by_gradient(x, gradient, (low, high)) <= atol
-    return _Walk(
+    direction, is_definite = bounded_step(solve, model, free, (low, high))
+    found = line_search(problem.residuals, model, direction, (low, high), iterate.unfinished)
+    finite = jnp.all(jnp.isfinite(iterate.residuals)) & jnp.all(jnp.isfinite(gradient))
+    ends = found.is_stagnant | converged(model, found, (low, high), rtol)
+    ends |= projected_gradient_norm(x, gradient, (low, high)) <= atol
+    return _Iterate(
         jnp.where(finite, found.point, x),
-        jnp.where(finite, found.residuals, walk.residuals),
-        *damped_on(damping, walk.growth, found.is_success & leads, found.gain, largest),
-        walk.steps + 1,
+        jnp.where(finite, found.residuals, iterate.residuals),
+        *updated_damping(damping, iterate.growth, found.is_success & is_definite, found.gain_ratio, largest),
+        iterate.steps + 1,
         ~ends & finite,
         finite,
     )
 
 
 def _flattened(start: Split) -> tuple[Array, Callable[[Array], Split]]:
-    """All variables, the shared ones first and the others frame by frame, and the way back."""
+    """All variables as one vector, the shared ones first and the others frame by frame, and the inverse function."""
     shared, to_shared = ravel_pytree(start.shared)
     one, to_frame = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], start.frames))
     frames = jax.vmap(lambda frame: ravel_pytree(frame)[0])(start.frames)
@@ -163,37 +180,49 @@ def _flattened(start: Split) -> tuple[Array, Callable[[Array], Split]]:
 
 
 class _Problem(NamedTuple):
-    """Residuals as functions of flat variables."""
+    """The residuals as functions of vectors of variables."""
 
     of_frame: Callable[[Array, Array, Any], Array]
-    own: Callable[[Array], Array]
-    """The prior's."""
+    of_prior: Callable[[Array], Array]
     data: PyTree
     size: int
-    """Of the shared variables, which come first."""
+    """Number of shared variables, which come first."""
     frames: int
+    """Number of frames."""
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Shared variables (s,), and those of the frames (n, f)."""
+        """The shared variables (s,), and those of the frames (n, f), of a vector of all variables."""
         return x[: self.size], x[self.size :].reshape(self.frames, -1)
 
     def join(self, shared: Array, frames: Array) -> Array:
-        """The other way round."""
+        """The inverse of `split`."""
         return jnp.concatenate([shared, frames.ravel()])
 
     def residuals(self, x: Array) -> Array:
-        """All of them."""
+        """The residuals of all frames and of the prior."""
         s, f = self.split(x)
         of_frames = jax.vmap(self.of_frame, (None, 0, 0))(s, f, self.data)
-        return jnp.concatenate([of_frames.ravel(), self.own(s)])
+        return jnp.concatenate([of_frames.ravel(), self.of_prior(s)])
+
+
+def _check_frames(start: Split, data: PyTree) -> None:
+    shapes = {
+        f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)
+        for name, tree in (("start.frames", start.frames), ("data", data))
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
+    if not jax.tree.leaves(start.frames):
+        raise ValueError("start.frames must have at least one array with a leading axis of frames; got none.")
+    if () in shapes.values() or len({shape[0] for shape in shapes.values()}) != 1:
+        raise ValueError(f"start.frames and data must share one number of frames as their first axis; got {shapes}.")
 
 
 def _problem(residuals, prior, start: Split, data: PyTree) -> _Problem:
     shared, to_shared = ravel_pytree(start.shared)
     _, to_frame = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], start.frames))
     of_frame = lambda s, f, data: ravel_pytree(residuals(to_shared(s), to_frame(f), data))[0]
-    own = (lambda s: ravel_pytree(prior(to_shared(s)))[0]) if prior else (lambda s: jnp.zeros(0, s.dtype))
-    return _Problem(of_frame, own, data, shared.size, jax.tree.leaves(start.frames)[0].shape[0])
+    of_prior = (lambda s: ravel_pytree(prior(to_shared(s)))[0]) if prior else (lambda s: jnp.zeros(0, s.dtype))
+    return _Problem(of_frame, of_prior, data, shared.size, jax.tree.leaves(start.frames)[0].shape[0])
 
 
 def _blocks(problem: _Problem, x: Array) -> _Blocks:
@@ -204,19 +233,19 @@ def _blocks(problem: _Problem, x: Array) -> _Blocks:
         return r, *jax.jacfwd(problem.of_frame, (0, 1))(s, f, data)
 
     r, by_shared, by_frame = jax.vmap(one)(f, problem.data)
-    own, by_own = problem.own(s), jax.jacfwd(problem.own)(s)
+    prior, by_prior = problem.of_prior(s), jax.jacfwd(problem.of_prior)(s)
     dot = lambda spec, *a: jnp.einsum(spec, *a, precision="highest")
     return _Blocks(
-        U=dot("nrs,nrt->st", by_shared, by_shared) + dot("rs,rt->st", by_own, by_own),
+        U=dot("nrs,nrt->st", by_shared, by_shared) + dot("rs,rt->st", by_prior, by_prior),
         W=dot("nrs,nrf->nsf", by_shared, by_frame),
         V=dot("nrf,nrg->nfg", by_frame, by_frame),
-        shared=dot("nrs,nr->s", by_shared, r) + dot("rs,r->s", by_own, own),
+        shared=dot("nrs,nr->s", by_shared, r) + dot("rs,r->s", by_prior, prior),
         frames=dot("nrf,nr->nf", by_frame, r),
     )
 
 
 def _step(blocks: _Blocks, damping: Array, gradient: tuple, free: tuple) -> tuple[Array, Array]:
-    """The damped step of the free variables; the others stay. Both arguments as `_Problem.split` has them."""
+    """The damped step of the free variables. `gradient` and `free` are pairs as `_Problem.split` returns them."""
     (of_shared, of_frames), (free_shared, free_frames) = gradient, free
     U = jnp.where(free_shared[:, None] & free_shared, blocks.U, 0.0)
     W = jnp.where(free_shared[:, None] & free_frames[:, None], blocks.W, 0.0)
@@ -233,12 +262,23 @@ def schur(
     b_shared: Float[Array, " s"],
     b_frames: Float[Array, "frames f"],
 ) -> tuple[Float[Array, " s"], Float[Array, "frames f"]]:
-    """Solution of normal equations in which frames share some variables, in time linear in the frames.
+    """The solution of normal equations in which frames share some variables, in time linear in the number of frames.
 
-    `[[U, W], [W^T, V]] (x, y) = (b_shared, b_frames)` with a block of V for each frame, by the Schur complement of V.
+    It solves `[[U, W], [W^T, V]] (x, y) = (b_shared, b_frames)`, where V is block diagonal with one block for each
+    frame, by the Schur complement of V.
+
+    Args:
+        U: (s, s), positive definite with W and V.
+        W: (n, s, f).
+        V: (n, f, f), positive definite.
+        b_shared: (s,).
+        b_frames: (n, f).
+
+    Returns:
+        x (s,) and y (n, f); NaN if a matrix is not positive definite.
     """
     solve = lambda V, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(V), True), b)
-    # One by one: batches of factorisations can stand still on two cores.
+    # One frame after the other: batches of matrix factorisations can deadlock on two cores.
     both = jnp.concatenate([jnp.swapaxes(W, 1, 2), b_frames[..., None]], axis=-1)
     solved = jax.lax.map(lambda frame: solve(*frame), (V, both))
     VW, Vb = solved[..., :-1], solved[..., -1]

@@ -114,7 +114,7 @@ def adaptive_diffusion(
         steady_std: Standard deviations `(d - m,)` of the random walks; `None` if m = d.
         low: Lower limit of the standard deviation, in each coordinate's unit per unit of time; a number or `(m,)`.
         high: Upper limit of the same.
-        update_fit: `diffusion.update`, `diffusion.keep`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
+        update_fit: `diffusion.update`, `diffusion.fixed`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
         partitions: Evaluates every observation in two stages, see `Partitions`; `None` in one.
         mode_distance: Argument `distance` of `mean_around_mode`.
         scheme: Function of `jaxfilters.resampling`; of `jaxfilters.differentiable_resampling` also `soft(...)`, and
@@ -183,7 +183,7 @@ def _predict(
     checks.check_shape("control", tau, (), "it is the time since the last prediction")
     tau = jnp.where(tau > 0, tau, 0.0)
     particles, log_weights, ancestors = resample(resample_key, state.particles, state.log_weights, model.scheme, 1.0)
-    changing = tau * diffusion.spread(state.fit, state.velocity, low=model.low, high=model.high)
+    changing = tau * diffusion.velocity_change_std(state.fit, state.velocity, low=model.low, high=model.high)
     spread = jnp.concatenate([changing, safe_sqrt(tau) * model.steady_std])
     drift = jnp.pad(tau * state.velocity, (0, model.steady_std.shape[0]))
     noise = standard_normal(noise_key, particles.shape, particles.dtype)

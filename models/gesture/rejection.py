@@ -1,7 +1,7 @@
 """How well a stroke is explained by the states of all symbols in any order: what a symbol has to beat.
 
-The threshold model of `hmm.threshold` for symbols side by side, whose transitions are a diagonal and a product of two
-vectors: a frame costs as much as there are states, not the square of that.
+The threshold model of `hmm.threshold_model` for symbols in parallel, whose transitions are a diagonal and a product of
+two vectors: a frame costs as much as there are states, not the square of that.
 """
 
 import jax
@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, Int
 from jaxfilters.hmm import HiddenMarkovModel
 
 LEAVING = 0.1
-"""Probability of leaving a symbol in its last state, as in `hmm.side_by_side`."""
+"""Probability of leaving a symbol in its last state, as in `hmm.parallel_composition`."""
 
 
 def threshold_log_likelihood(
     models: HiddenMarkovModel, log_likelihoods: Float[Array, "m t q n"], lengths: Int[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Log p(y_1:T) of each of n strokes: `hmm.log_likelihood` of `hmm.threshold` of the models side by side.
+    """Log p(y_1:T) of each of n strokes: `hmm.log_evidence` of `hmm.threshold_model` of the models side by side.
 
     Args:
         models: Leaves with the m models first; each may end in its last state.

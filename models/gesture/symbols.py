@@ -110,7 +110,7 @@ def trained(
     owned = np.where(np.arange(most) < counts[:, None], np.asarray(lengths)[chosen], 0)
     strokes = jax.tree.map(lambda leaf: jnp.asarray(np.moveaxis(np.asarray(leaf)[..., chosen], -2, 0)), observations)
     num_states = jax.tree.leaves(emission)[0].shape[0]
-    start = hmm.from_topology(hmm.left_right(num_states), emission, first=hmm.first_only(num_states))
+    start = hmm.from_topology(hmm.left_right(num_states), emission, initial=hmm.left_right_initial(num_states))
     models = _train(start, strokes, jnp.asarray(owned), max_iterations)
     return Symbols(models, jnp.asarray([names.index(name) for name, _ in groups], jnp.int32), names)
 
@@ -133,8 +133,8 @@ def extended(symbols: Symbols, others: Symbols) -> Symbols:
 
 
 def network(symbols: Symbols) -> hmm.Network:
-    """All models side by side, for `hmm.threshold`, `hmm.loop` and `hmm.spotter`."""
-    return hmm.side_by_side(
+    """All models side by side, for `hmm.threshold_model`, `hmm.loop` and `hmm.spotter`."""
+    return hmm.parallel_composition(
         [jax.tree.map(lambda leaf, i=i: leaf[i], symbols.models) for i in range(len(symbols.owner))]
     )
 
@@ -155,7 +155,7 @@ def recognise(
     Args:
         symbols: Made by `learn`.
         observations: Features `(p, f, n)` of n strokes, or what else the models observe; the strokes last.
-        threshold: What a symbol has to beat, `hmm.threshold(network(symbols))`; `None` rejects only strokes whose
+        threshold: What a symbol has to beat, `hmm.threshold_model(network(symbols))`; `None` rejects only strokes whose
             features are not finite or that no symbol can produce.
         lengths: Points of each stroke; `None` is all.
         margin: Nats a point by which it has to.
@@ -244,8 +244,8 @@ def _train(start: HiddenMarkovModel, strokes: PyTree, lengths: Array, max_iterat
     num_states = start.log_initial.shape[0]
 
     def one(strokes: PyTree, lengths: Array) -> HiddenMarkovModel:
-        shares = hmm.in_turn(lengths, jax.tree.leaves(strokes)[0].shape[0], num_states)
-        model = hmm.with_states(start, strokes, shares)
+        shares = hmm.uniform_segmentation(lengths, jax.tree.leaves(strokes)[0].shape[0], num_states)
+        model = hmm.with_responsibilities(start, strokes, shares)
         return hmm.baum_welch(model, strokes, lengths, max_iterations=max_iterations).model
 
     return jax.vmap(one)(strokes, lengths)

@@ -31,7 +31,7 @@ def nearest_in_order(
     """The paper's: as many pairs as possible in order, the least sum of squared distances; far ones then dropped."""
     there = state.tracks.mode != FREE
     distance = _squared_distances(beliefs, observed)
-    tips = _in_order(state, beliefs, observed, distance, there, observed.is_tip, assignment.match_ordered)[0]
+    tips = _in_order(state, beliefs, observed, distance, there, observed.is_tip, assignment.match_noncrossing)[0]
     reach = jnp.where(state.tracks.mode == CONFIRMED, config.gate, config.tentative_gate)
     own = jnp.take_along_axis(distance, jnp.maximum(tips, 0)[:, None], axis=1)[:, 0]
     return jnp.where((tips >= 0) & (own <= jnp.square(reach)), tips, -1), jnp.asarray(False)
@@ -49,7 +49,7 @@ def likeliest(
     cost = _surprise(config, mode, beliefs, observed)
 
     def gated(cost: Array, rows: Array, columns: Array) -> assignment.Matching:
-        return assignment.match_ordered_gated(cost, 2 * _PRICE, rows, columns)
+        return assignment.match_noncrossing_gated(cost, 2 * _PRICE, rows, columns)
 
     certain = mode == CONFIRMED
     tips, spent = _in_order(state, beliefs, observed, cost, certain, observed.is_tip, gated)

@@ -88,7 +88,7 @@ def learnt(
     modes = jax.lax.cond(
         far, lambda: incremental_pca.update(learner.subspace, change.ravel()), lambda: learner.subspace
     )
-    found = incremental_pca.components(modes)
+    found = incremental_pca.principal_components(modes)
     deviation = jnp.where(found.variances > 0, jnp.maximum(jnp.sqrt(found.variances), LEAST_DEVIATION), 0.0)
     after = Learner(modes, count, jnp.where(usable, shape, learner.shape), windows, usable)
     return after, FaceModel(model.mean + follow / count * change, found.basis, deviation, model.templates)
@@ -96,7 +96,7 @@ def learnt(
 
 def carried(x: Float[Array, "B n"], before: FaceModel, after: FaceModel) -> Float[Array, "B n"]:
     """Mode coefficients of the same shapes, or the nearest, in a model that has changed."""
-    return incremental_pca.transfer(x, before.mean.ravel(), before.basis, after.mean.ravel(), after.basis)
+    return incremental_pca.change_basis(x, before.mean.ravel(), before.basis, after.mean.ravel(), after.basis)
 
 
 def turning(before: FaceModel, after: FaceModel) -> Float[Array, "B B"]:
@@ -106,4 +106,4 @@ def turning(before: FaceModel, after: FaceModel) -> Float[Array, "B B"]:
 
 def contribution(learner: Learner) -> Array:
     """Share of the deformation that the modes explain, 0 to 1."""
-    return incremental_pca.contribution(learner.subspace)
+    return incremental_pca.explained_variance_ratio(learner.subspace)

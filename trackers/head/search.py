@@ -80,7 +80,7 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
         steady_std=jnp.zeros(NUM_MODES),
         low=jnp.asarray(LOW, float),
         high=jnp.asarray(HIGH, float),
-        update_fit=diffusion.update if options.diffusion == "learnt" else diffusion.keep,
+        update_fit=diffusion.update if options.diffusion == "learnt" else diffusion.fixed,
     )
     return Searches(build(), build(partitions=Partitions(consecutive(POSE, NUM_MODES))))
 

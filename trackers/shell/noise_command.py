@@ -27,9 +27,9 @@ def fit_noise(options: argparse.Namespace) -> str:
         raise InputError(f"--fps must be positive; got {options.fps}.")
     points, times = _synthetic(options.seed) if options.tracks is None else read_points(options.tracks, options.fps)
     tracks, _ = refusing(lambda: tracks_of(points, times))
-    found = learn(tracks)
+    found = refusing(lambda: learn(tracks))
     if not bool(found.converged):
-        raise InputError(f"{options.tracks}: no noises explain these tracks ({found.ending}).")
+        raise InputError(f"{options.tracks}: no noise parameters explain these tracks ({found.termination}).")
     if options.out is not None:
         _write(options.out, found, points, times)
     made_up = "" if options.tracks else f"Synthetic tracks: sensor {_SYNTHETIC[0]}, drive {_SYNTHETIC[1]}.\n"

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxfilters import fit
-from jaxfilters.fit.chart import chart_about, check_inside
+from jaxfilters.fit.parametrization import check_start, parametrize
 
 RNG = np.random.default_rng(3)
 ROOT = RNG.normal(size=(3, 3))
@@ -33,13 +33,13 @@ OUTSIDE = {
 @pytest.mark.parametrize("name", CASES)
 def test_charts_lead_there_and_back_and_every_coordinate_is_allowed(x64, name):
     constraint, value, count = CASES[name]
-    chart = chart_about({"p": value}, constraint)
-    z = chart.coordinates(chart.origin)
+    chart = parametrize({"p": value}, constraint)
+    z = chart.unconstrain(chart.origin)
     assert z.shape == (count,)
-    np.testing.assert_allclose(chart.point(z)["p"], value, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(chart.constrain(z)["p"], value, rtol=1e-10, atol=1e-12)
     elsewhere = jnp.asarray(3 * RNG.normal(size=count))
-    assert constraint.contains(np.asarray(chart.point(elsewhere)["p"]))
-    found = chart.coordinates(chart.point(elsewhere))
+    assert constraint.contains(np.asarray(chart.constrain(elsewhere)["p"]))
+    found = chart.unconstrain(chart.constrain(elsewhere))
     if name == "rotation":
         turns = Rotation.from_rotvec(np.array(found)), Rotation.from_rotvec(np.array(elsewhere))
         assert (turns[0].inv() * turns[1]).magnitude() < 1e-10
@@ -51,21 +51,21 @@ def test_charts_lead_there_and_back_and_every_coordinate_is_allowed(x64, name):
 def test_a_start_outside_is_named_with_its_value(name):
     constraint, _, _ = CASES[name]
     with pytest.raises(ValueError, match=r"start\['a'\]\[1\] must be .*; got"):
-        check_inside(chart_about({"a": [1.0, OUTSIDE[name]]}, {"a": [fit.free, constraint]}))
+        check_start(parametrize({"a": [1.0, OUTSIDE[name]]}, {"a": [fit.free, constraint]}))
 
 
 def test_a_branch_may_have_one_constraint_and_coordinates_have_names():
     start = {"noise": {"x": np.ones(2), "y": 3.0}, "rate": 0.5}
-    chart = chart_about(start, {"noise": fit.positive, "rate": fit.interval(0, 1)})
+    chart = parametrize(start, {"noise": fit.positive, "rate": fit.interval(0, 1)})
     assert chart.names == ["['noise']['x']", "['noise']['x']", "['noise']['y']", "['rate']"]
-    np.testing.assert_allclose(chart.coordinates(chart.origin), [0, 0, np.log(3), 0], atol=1e-6)
-    assert jax.tree.structure(chart.point(jnp.zeros(4))) == jax.tree.structure(start)
+    np.testing.assert_allclose(chart.unconstrain(chart.origin), [0, 0, np.log(3), 0], atol=1e-6)
+    assert jax.tree.structure(chart.constrain(jnp.zeros(4))) == jax.tree.structure(start)
 
 
 def test_constraints_that_do_not_fit_are_rejected():
-    with pytest.raises(ValueError, match="constraints must be like start"):
-        chart_about({"a": 1.0}, {"b": fit.free})
+    with pytest.raises(ValueError, match="constraints must have the tree structure of start"):
+        parametrize({"a": 1.0}, {"b": fit.free})
     with pytest.raises(ValueError, match=r"constraints must hold constraints such as fit\.positive; got 3"):
-        chart_about({"a": 1.0}, {"a": 3})
+        parametrize({"a": 1.0}, {"a": 3})
     with pytest.raises(ValueError, match="finite bounds"):
         fit.interval(1, 1)

@@ -6,6 +6,7 @@ from scipy.stats import multivariate_normal
 
 from jaxfilters import fit
 from jaxfilters.filter import log_evidence
+from jaxfilters.fit.density import _undeclared_nan
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import Observation, extended_kalman
 from jaxfilters.noise import StandardNormal
@@ -64,18 +65,52 @@ def test_the_log_evidence_of_sequences_is_that_of_the_joint_gaussian(x64):
     np.testing.assert_allclose(together(THETA), sum(expected), rtol=1e-9)
 
 
-def test_nan_that_nothing_declares_is_named():
+def test_nan_is_a_missing_component_to_a_gaussian_filter_as_in_run(x64):
+    ys = simulate(RNG, (9, 1), 0.8, 0.5, 0.4)
+    seen = np.arange(9) != 4
+    expected = joint_log_density(ys[:, 0], seen, 0.8, 0.5, 0.4)
+    holes = jnp.asarray(np.where(seen[:, None], ys, np.nan))
+    np.testing.assert_allclose(fit.log_evidence(KEY, filter_of, holes)(THETA), expected, rtol=1e-9)
+    found = fit.maximize(fit.log_evidence(KEY, filter_of, holes), THETA, LIMITS, method=fit.bfgs(max_steps=2))
+    assert np.isfinite(found.log_density)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_search_says_which_observation_makes_the_start_impossible(together):
+    ys = simulate(RNG, (6, 1), 0.8, 0.5, 0.4)
+    ys[3] = np.nan
+    observations = {"y": np.stack([ys, ys], axis=-1) if together else ys}
+    build = fit.over_sequences if together else fit.log_evidence
+    with pytest.raises(ValueError, match=r"finite at start; got (nan|-inf): observations\['y'\] is NaN in frame 3"):
+        fit.maximize(build(KEY, named_particle_filter_of, observations), THETA, LIMITS)
+
+
+def test_nan_that_a_mask_declares_is_not_blamed():
     ys = np.ones((5, 2))
     ys[3, 1] = np.nan
-    with pytest.raises(ValueError, match=r"observations\['y'\] must not be NaN.*frame 3"):
-        fit.log_evidence(KEY, filter_of, {"y": ys, "count": np.ones(5, int)})
-    fit.check_observations({"y": ys}, mask=np.arange(5) != 3)
-    fit.check_observations(Observation(ys, ~np.isnan(ys)))
-    fit.check_observations(ys[:, None], mask=~np.isnan(ys))
-    with pytest.raises(ValueError, match="frame 3"):
-        fit.check_observations(Observation(ys))
-    with pytest.raises(ValueError, match="frame 3"):
-        fit.check_observations(ys, mask=np.arange(5) != 2)
+    assert _undeclared_nan({"y": ys}, np.arange(5) != 3) == ""
+    assert _undeclared_nan(Observation(ys, ~np.isnan(ys)), None) == ""
+    assert _undeclared_nan(ys[:, None], ~np.isnan(ys)) == ""
+    assert _undeclared_nan({"count": np.ones(5, int)}, None) == ""
+    assert "frame 3" in _undeclared_nan(Observation(ys), None)
+    assert "frame 3" in _undeclared_nan(ys, np.arange(5) != 2)
+
+
+def ruled_out(key, theta):
+    del key
+    return jnp.where(theta["rate"] > 0.5, 0.0, -jnp.inf)
+
+
+def test_a_start_that_the_prior_or_a_frame_rules_out_is_named():
+    ys = jnp.asarray(simulate(RNG, (6, 1), 0.8, 0.5, 0.4), jnp.float32)
+    density = fit.with_prior(fit.log_evidence(KEY, filter_of, ys), lambda theta: ruled_out(None, theta))
+    with pytest.raises(ValueError, match="got -inf: the log prior is -inf"):
+        fit.maximize(density, START, LIMITS)
+    density = fit.log_evidence(KEY, particle_filter_of, ys.at[2].set(jnp.inf))
+    with pytest.raises(ValueError, match=r"the log evidence of frame 2 is (nan|-inf)"):
+        fit.maximize(density, START, LIMITS)
+    with pytest.raises(ValueError, match="must be finite at start; got -inf"):
+        fit.maximize(fit.common_random_numbers(KEY, ruled_out), START, LIMITS)
 
 
 def start_anywhere(key):
@@ -95,6 +130,16 @@ def particle_filter_of(theta):
     transition = jax.tree_util.Partial(move_by_noise, theta["rate"], theta["drift"])
     likelihood = jax.tree_util.Partial(log_likelihood, theta["noise"])
     return bootstrap(start_anywhere, transition, likelihood, num_particles=64, noise=StandardNormal(1))
+
+
+def named_particle_filter_of(theta):
+    transition = jax.tree_util.Partial(move_by_noise, theta["rate"], theta["drift"])
+    likelihood = jax.tree_util.Partial(named_log_likelihood, theta["noise"])
+    return bootstrap(start_anywhere, transition, likelihood, num_particles=16, noise=StandardNormal(1))
+
+
+def named_log_likelihood(scale, x, y):
+    return log_likelihood(scale, x, y["y"])
 
 
 @pytest.mark.parametrize("draws", [fit.common_random_numbers, fit.fresh_keys])

@@ -43,8 +43,8 @@ def test_every_method_finds_the_closed_form_and_its_errors(x64, name):
     half = np.exp(1.959964 / np.sqrt(2 * len(YS)))
     np.testing.assert_allclose([found.lower["std"], found.upper["std"]], [STD / half, STD * half], rtol=1e-4)
     np.testing.assert_allclose(found.log_density, norm.logpdf(YS, MEAN, STD).sum(), rtol=1e-8)
-    assert found.trajectory[-1] < found.trajectory[0]
-    assert len(found.trajectory) == found.num_steps
+    assert found.loss_history[-1] < found.loss_history[0]
+    assert len(found.loss_history) == found.num_steps
 
 
 def errors_of(ys, theta):
@@ -125,9 +125,9 @@ def test_a_search_continues_where_it_ended():
     half = fit.maximize(density(), START, LIMITS, method=at_most(10), errors=fit.no_errors)
     again = fit.maximize(density(), half, method=at_most(10), errors=fit.no_errors)
     np.testing.assert_allclose(again.theta["std"], whole.theta["std"], rtol=1e-6)
-    np.testing.assert_allclose([*half.trajectory, *again.trajectory], whole.trajectory, rtol=1e-6)
+    np.testing.assert_allclose([*half.loss_history, *again.loss_history], whole.loss_history, rtol=1e-6)
     assert again.num_steps == 20
-    assert again.ending == "stopped after 20 steps"
+    assert again.termination == "stopped after 20 steps"
     other = fit.maximize(density(), half, method=METHODS["bfgs"], errors=fit.no_errors)
     np.testing.assert_allclose(other.theta["mean"], MEAN, rtol=1e-3)
     assert np.isnan(other.standard_errors["mean"])
@@ -152,7 +152,7 @@ def test_what_is_not_finite_ends_the_search_at_the_last_good_value(method):
     assert 0.1 <= found.theta["x"] <= 1
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.theta))
     if isinstance(method, type(fit.adam())):
-        assert found.ending == "gradient of ['y'] not finite in step 4; kept the last good value"
+        assert found.termination == "gradient of ['y'] not finite in step 4; kept the last finite value"
         np.testing.assert_allclose(found.theta["x"], 0.85, rtol=1e-4)
 
 
@@ -163,7 +163,7 @@ def kinked(theta):
 
 def test_a_gradient_that_is_not_finite_at_the_start_is_announced():
     found = fit.maximize(kinked, {"x": jnp.array([1.0, -2.0])})
-    assert found.ending == "gradient of ['x'] not finite in step 0; kept the last good value"
+    assert found.termination == "gradient of ['x'] not finite in step 0; kept the last finite value"
     np.testing.assert_array_equal(found.theta["x"], [1.0, -2.0])
 
 
@@ -223,7 +223,7 @@ def test_a_start_outside_its_constraint_is_rejected():
 def test_where_there_is_no_maximum_errors_are_unknown():
     found = fit.maximize(partial(jnp.sum), {"x": jnp.ones(2)}["x"], method=fit.bfgs(max_steps=3))
     assert np.isnan(found.standard_errors).all()
-    assert found.ending == "stopped after 3 steps"
+    assert found.termination == "stopped after 3 steps"
 
 
 def test_what_is_not_determined_leaves_the_others_their_errors():

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters import fit
-from jaxfilters.fit.uncertainty import no_errors, observed_information
+from jaxfilters.fit.uncertainty import ErrorStatus, no_errors, observed_information
 
 INFORMATION = np.array([[4e6, 600.0], [600.0, 1.0]])
 
@@ -16,13 +16,56 @@ def test_the_covariance_is_the_inverse_information_whatever_the_units():
     loss = lambda z: 0.5 * z @ jnp.asarray(INFORMATION, jnp.float32) @ z
     # The two units differ by 2000, the correlation is 0.3: float32 keeps five digits.
     scaled = lambda factors: observed_information(lambda z: factors[0] * loss(factors[1:] * z), jnp.zeros(2))
-    right, downhill, flat = jax.jit(jax.vmap(scaled))(jnp.array([[1.0, 1, 1], [-1, 1, 1], [1, 1, 0]]))
+    (right, downhill, flat), status = jax.jit(jax.vmap(scaled))(jnp.array([[1.0, 1, 1], [-1, 1, 1], [1, 1, 0]]))
+    none, negative, level = ErrorStatus.DETERMINED, ErrorStatus.NEGATIVE_CURVATURE, ErrorStatus.FLAT
+    np.testing.assert_array_equal(status, [[none, none], [negative, negative], [none, level]])
     np.testing.assert_allclose(right, np.linalg.inv(INFORMATION), rtol=1e-5)
     assert np.isnan(downhill).all()
     # What is not determined takes no certainty from the rest.
     assert np.isnan(flat[1]).all()
     np.testing.assert_allclose(flat[0, 0], 1 / 4e6, rtol=1e-5)
-    assert np.isnan(no_errors(loss, jnp.zeros(2))).all()
+    assert np.isnan(no_errors(loss, jnp.zeros(2)).covariance).all()
+
+
+def steep(x):
+    return -(jnp.abs(x) ** 1.5)
+
+
+def test_the_report_says_why_a_standard_error_is_missing():
+    def log_density(theta):
+        saddle = theta["saddle"][0] ** 2 - theta["saddle"][1] ** 2
+        return -((theta["a"] - 1) ** 2) - 0 * theta["flat"] + saddle + steep(theta["steep"]) - theta["bound"] ** 2
+
+    start = {"a": 0.0, "bound": 0.5, "flat": 1.0, "fixed": 2, "saddle": jnp.zeros(2), "steep": 0.0}
+    constraints = {name: fit.free for name in start} | {"fixed": fit.fixed, "bound": fit.interval(0.2, 1)}
+    found = fit.maximize(log_density, start, constraints, method=fit.lbfgsb())
+    expected = {"a": 0, "bound": 1, "flat": 2, "fixed": 6, "saddle": [3, 0], "steep": 4}
+    jax.tree.map(np.testing.assert_array_equal, found.standard_error_status, jax.tree.map(np.asarray, expected))
+    assert list(found.missing_errors) == ["['flat']", "['saddle'][0]", "['steep']"]
+    shown = str(found)
+    for reason in ("at its bound", "flat direction", "fixed", "noisy information", "second derivatives", "for 3 of 7"):
+        assert reason in shown
+    without = fit.maximize(log_density, start, constraints, method=fit.lbfgsb(), errors=fit.no_errors)
+    assert without.missing_errors["['a']"] == "not computed"
+
+
+def rough(key, theta):
+    """A log density whose curvature at any step is mostly noise."""
+    return -0.5 * jnp.sum(theta["x"] ** 2) + 100 * jax.random.normal(key) * jnp.sum(theta["x"] ** 2)
+
+
+def test_noisy_information_of_a_search_with_fresh_keys_is_announced():
+    fits = [
+        fit.maximize(fit.fresh_keys(jax.random.key(i), rough), {"x": jnp.zeros(1)}, method=fit.adam(patience=2))
+        for i in range(16)
+    ]
+    missing = [found for found in fits if np.isnan(found.standard_errors["x"]).any()]
+    assert missing
+    for found in missing:
+        assert "converged" in str(found)
+        assert found.missing_errors["['x'][0]"].startswith("noisy information")
+        assert "noisy information" in str(found)
+        assert "one random draw" in str(found)
 
 
 def test_a_right_gradient_agrees_with_differences():

@@ -35,13 +35,13 @@ def test_what_is_no_probability_is_refused(initial, transition, named):
 
 
 def test_topologies():
-    np.testing.assert_array_equal(hmm.left_right(3, longest_step=1), [[1, 1, 0], [0, 1, 1], [0, 0, 1]])
+    np.testing.assert_array_equal(hmm.left_right(3, max_jump=1), [[1, 1, 0], [0, 1, 1], [0, 0, 1]])
     np.testing.assert_array_equal(hmm.left_right(4)[0], [1, 1, 1, 0])
     assert hmm.ergodic(3).all()
-    built = hmm.from_topology(hmm.left_right(3), first=hmm.first_only(3))
+    built = hmm.from_topology(hmm.left_right(3), initial=hmm.left_right_initial(3))
     np.testing.assert_allclose(np.exp(built.log_transition), [[1 / 3] * 3, [0, 0.5, 0.5], [0, 0, 1]], rtol=1e-6)
     np.testing.assert_array_equal(np.exp(built.log_initial), [1, 0, 0])
-    for wrong in (lambda: hmm.left_right(0), lambda: hmm.left_right(2, longest_step=0), lambda: hmm.ergodic(0)):
+    for wrong in (lambda: hmm.left_right(0), lambda: hmm.left_right(2, max_jump=0), lambda: hmm.ergodic(0)):
         with pytest.raises(ValueError, match="at least 1"):
             wrong()
     with pytest.raises(ValueError, match="every row"):

@@ -17,20 +17,20 @@ def symbol(codes, num_codes=7, purity=0.94):
     """A left-right model without skips whose states each prefer one code."""
     preferred = np.full((len(codes), num_codes), (1 - purity) / (num_codes - 1))
     preferred[np.arange(len(codes)), codes] = purity
-    stays, first = np.eye(len(codes)), hmm.first_only(len(codes))
+    stays, first = np.eye(len(codes)), hmm.left_right_initial(len(codes))
     steps = 0.7 * stays + 0.3 * np.roll(stays, 1, axis=1)
     steps[-1] = stays[-1]
     return hmm.from_probabilities(first, steps, hmm.Codes(jnp.asarray(np.log(preferred), dtype=float)))
 
 
 def network(leaving=0.1):
-    return hmm.side_by_side([symbol(codes) for codes in WORDS.values()], leaving=leaving)
+    return hmm.parallel_composition([symbol(codes) for codes in WORDS.values()], exit_probability=leaving)
 
 
 def with_filler():
     """The symbols, and as the last model what lies between them: anything."""
     anything = hmm.from_probabilities([1.0], [[1.0]], hmm.Codes(jnp.full((1, 7), -np.log(7.0), dtype=float)))
-    return hmm.side_by_side([*(symbol(codes) for codes in WORDS.values()), anything])
+    return hmm.parallel_composition([*(symbol(codes) for codes in WORDS.values()), anything])
 
 
 NOT_THE_FILLER = jnp.array([0.0, 0.0, 0.0, -jnp.inf])
@@ -62,24 +62,24 @@ def spotted(filter, codes, **more):
 
 def test_models_side_by_side_keep_their_states_apart():
     row = network()
-    np.testing.assert_array_equal(row.owner, np.repeat([0, 1, 2], 3))
+    np.testing.assert_array_equal(row.part, np.repeat([0, 1, 2], 3))
     np.testing.assert_array_equal(row.final, [False, False, True] * 3)
-    apart = np.asarray(row.owner)[:, None] != np.asarray(row.owner)
+    apart = np.asarray(row.part)[:, None] != np.asarray(row.part)
     assert np.all(np.asarray(row.model.log_transition)[apart] == -np.inf)
     own = np.exp(symbol(WORDS[1]).log_transition) * np.array([[1], [1], [0.9]])
     np.testing.assert_allclose(np.exp(row.model.log_transition[3:6, 3:6]), own, rtol=1e-5)
     np.testing.assert_array_equal(row.model.emission.log_probability[6:], symbol(WORDS[2]).emission.log_probability)
     with pytest.raises(ValueError, match="final"):
-        hmm.side_by_side([symbol(WORDS[0])], [np.ones(2, bool)])
-    with pytest.raises(ValueError, match="leaving"):
+        hmm.parallel_composition([symbol(WORDS[0])], [np.ones(2, bool)])
+    with pytest.raises(ValueError, match="exit_probability"):
         network(leaving=1.0)
-    with pytest.raises(ValueError, match="one kind"):
-        hmm.side_by_side([symbol(WORDS[0]), hmm.from_topology(hmm.ergodic(2))])
+    with pytest.raises(ValueError, match="one class"):
+        hmm.parallel_composition([symbol(WORDS[0]), hmm.from_topology(hmm.ergodic(2))])
 
 
 def test_the_threshold_is_between_the_right_symbol_and_the_wrong_ones():
     row = network()
-    null = hmm.threshold(row)
+    null = hmm.threshold_model(row)
     np.testing.assert_allclose(np.exp(null.log_transition).sum(1), 1, rtol=1e-5)
     np.testing.assert_allclose(np.exp(np.diagonal(null.log_transition))[:2], 0.7, rtol=1e-5)
     np.testing.assert_allclose(np.exp(null.log_initial), 1 / 9, rtol=1e-5)
@@ -90,7 +90,7 @@ def test_the_threshold_is_between_the_right_symbol_and_the_wrong_ones():
             own = symbol(WORDS[other])
             score = hmm.log_evidence(own, own.log_likelihoods(y))
             assert (score > bar) == (other == label)
-    one = hmm.threshold(hmm.side_by_side([symbol((0,))]))
+    one = hmm.threshold_model(hmm.parallel_composition([symbol((0,))]))
     np.testing.assert_array_equal(one.log_transition, 0)
 
 
@@ -105,10 +105,10 @@ def test_the_viterbi_path_of_a_loop_cuts_a_stream_into_its_symbols():
     expected = [Segment(label, 12 * i, 12 * i + 11) for i, label in enumerate(labels)]
     assert hmm.segments(np.asarray(path.states), row) == expected
     assert hmm.segments(np.full(4, -1), row) == []
-    never_repeats = hmm.loop(row, between=(1 - np.eye(3)) / 2)
+    never_repeats = hmm.loop(row, part_transition=(1 - np.eye(3)) / 2)
     assert np.all(never_repeats.log_transition[2, :2] == -np.inf)
-    with pytest.raises(ValueError, match="between"):
-        hmm.loop(row, between=np.eye(2))
+    with pytest.raises(ValueError, match="part_transition"):
+        hmm.loop(row, part_transition=np.eye(2))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -136,7 +136,7 @@ def test_what_is_no_symbol_is_not_reported():
     assert found == []
     y, truth = stream(5, [0, 1])
     assert spotted(spotter(margin=100.0), y)[0] == []
-    assert spotted(spotter(shortest=30), y)[0] == []
+    assert spotted(spotter(min_frames=30), y)[0] == []
     only_one = spotter(log_prior=NOT_THE_FILLER.at[0].set(-jnp.inf))
     assert [one.label for one in spotted(only_one, y)[0]] == [1]
     assert len(truth) == 2

@@ -45,7 +45,7 @@ def in_float64(model, log_likelihoods):
     return total
 
 
-@pytest.mark.parametrize("allowed", [None, hmm.left_right(3, longest_step=1)], ids=["ergodic", "left-right"])
+@pytest.mark.parametrize("allowed", [None, hmm.left_right(3, max_jump=1)], ids=["ergodic", "left-right"])
 def test_everything_agrees_with_the_sum_over_all_paths(x64, allowed):
     model, e = chain(0, allowed=allowed), scores(1)
     paths, logs = all_paths(model, e)
@@ -146,7 +146,7 @@ def test_an_impossible_observation_is_minus_infinity_and_never_nan(broken, frame
 
 
 def test_a_path_that_the_topology_forbids_is_impossible():
-    model = hmm.from_topology(hmm.left_right(3, longest_step=1), first=hmm.first_only(3))
+    model = hmm.from_topology(hmm.left_right(3, max_jump=1), initial=hmm.left_right_initial(3))
     backwards = jnp.where(jnp.eye(3)[::-1] > 0, 0.0, -jnp.inf)
     assert hmm.log_evidence(model, backwards) == -np.inf
     assert hmm.viterbi(model, backwards).log_probability == -np.inf
@@ -155,7 +155,7 @@ def test_a_path_that_the_topology_forbids_is_impossible():
 
 def test_a_chain_may_fall_far_behind_and_win_in_float32():
     """The state ahead explains 12 frames better by 10 nats each, but cannot explain the last one."""
-    model = hmm.from_topology(hmm.left_right(2, longest_step=1), first=hmm.first_only(2))
+    model = hmm.from_topology(hmm.left_right(2, max_jump=1), initial=hmm.left_right_initial(2))
     e = jnp.zeros((13, 2)).at[1:12, 0].set(-10.0).at[12].set(jnp.array([0.0, -jnp.inf]))
     np.testing.assert_allclose(hmm.log_evidence(model, e), -110 + 12 * np.log(0.5), rtol=1e-5)
     np.testing.assert_allclose(hmm.posterior(model, e).states[:, 0], 1, rtol=1e-6)
@@ -185,14 +185,14 @@ def test_hundreds_of_nats_between_states_are_no_trouble_in_float32():
 
 
 def test_what_is_seen_may_be_much_likelier_in_a_state_that_cannot_be_in_float32():
-    model = hmm.from_topology(hmm.left_right(2, longest_step=1), first=hmm.first_only(2))
+    model = hmm.from_topology(hmm.left_right(2, max_jump=1), initial=hmm.left_right_initial(2))
     e = jnp.zeros((20, 2)).at[0].set(jnp.array([-500.0, 0.0])).at[17].set(jnp.array([-jnp.inf, -300.0]))
     np.testing.assert_allclose(hmm.log_evidence(model, e), -800 + np.log1p(-(0.5**17)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("num_frames", [3, 16, 35])
 def test_the_evidence_of_the_filtered_states_has_the_gradient_of_the_log_likelihood(x64, num_frames):
-    model, e = chain(18, allowed=hmm.left_right(3, longest_step=1)), scores(19, num_frames, batch=(2,))
+    model, e = chain(18, allowed=hmm.left_right(3, max_jump=1)), scores(19, num_frames, batch=(2,))
     by_frames = jax.grad(lambda model, e: hmm.forward(model, e).log_evidence.sum(), argnums=(0, 1))(model, e)
     at_once = jax.grad(lambda model, e: hmm.log_evidence(model, e).sum(), argnums=(0, 1))(model, e)
     found, expected = (tree[0].log_transition for tree in (by_frames, at_once))

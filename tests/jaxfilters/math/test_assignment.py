@@ -12,8 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from jaxfilters.math import assignment
 
 MOST = 6
-ordered = jax.jit(jax.vmap(assignment.match_ordered))
-ordered_gated = jax.jit(jax.vmap(assignment.match_ordered_gated, in_axes=(0, None, 0, 0)))
+ordered = jax.jit(jax.vmap(assignment.match_noncrossing))
+ordered_gated = jax.jit(jax.vmap(assignment.match_noncrossing_gated, in_axes=(0, None, 0, 0)))
 any_order = jax.jit(jax.vmap(assignment.match))
 any_order_gated = jax.jit(jax.vmap(assignment.match_gated, in_axes=(0, None, 0, 0)))
 
@@ -60,7 +60,7 @@ def cheapest(cost, gate, *, keep_order):
 
 def test_ordered_combinations_are_few():
     """Oracle 6."""
-    counts = {(n, m): assignment.count_ordered(n, m) for n in range(1, 6) for m in range(1, 6)}
+    counts = {(n, m): assignment.count_noncrossing(n, m) for n in range(1, 6) for m in range(1, 6)}
     assert counts[2, 3] == counts[3, 2] == 3
     assert counts[2, 5] == counts[3, 5] == 10
     assert counts[5, 5] == 1
@@ -73,7 +73,7 @@ def test_the_programme_is_the_enumeration(x64):
     costs, rows, columns = random_cases(0, 3000)
     found = jax.tree.map(np.asarray, ordered(jnp.asarray(costs), jnp.asarray(rows), jnp.asarray(columns)))
     for case, (cost, row, column) in enumerate(zip(costs, rows, columns, strict=True)):
-        pairs, total = assignment.enumerate_ordered(small(cost, row, column))
+        pairs, total = assignment.enumerate_noncrossing(small(cost, row, column))
         assert pairs_of(found, case) == in_place(pairs, row, column)
         assert abs(float(found.cost[case]) - total) < 1e-12
 
@@ -84,7 +84,7 @@ def test_equal_costs_take_the_first_columns(x64):
     there = np.arange(MOST) < np.asarray([shape for shape, _ in cases])[:, :, None]
     found = ordered(jnp.ones((len(cases), MOST, MOST)), jnp.asarray(there[:, 0]), jnp.asarray(there[:, 1]))
     for case, (shape, pairs) in enumerate(cases):
-        assert assignment.enumerate_ordered(np.ones(shape))[0] == pairs
+        assert assignment.enumerate_noncrossing(np.ones(shape))[0] == pairs
         assert pairs_of(found, case) == pairs
 
 

@@ -62,7 +62,7 @@ def test_the_fit_is_ridge_regression_towards_the_first_guess(x64, count):
     np.testing.assert_allclose(fit.slope, A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(fit.offset, b, rtol=1e-9)
     np.testing.assert_allclose(
-        diffusion.spread(fit, jnp.asarray(velocities[0]), low=-np.inf), A @ np.abs(velocities[0]) + b
+        diffusion.velocity_change_std(fit, jnp.asarray(velocities[0]), low=-np.inf), A @ np.abs(velocities[0]) + b
     )
 
 
@@ -80,7 +80,7 @@ def test_of_gaussian_changes_the_standard_deviation_is_learnt():
     # The mean of 20000 absolute values of unit normals, over their mean: relative error sqrt(pi/2 - 1) / sqrt(20000).
     changes = SCALE * np.random.default_rng(3).normal(size=(20000, 6))
     fit = learn(diffusion.start(jnp.asarray(SCALE)), np.zeros_like(changes), changes)
-    np.testing.assert_allclose(diffusion.spread(fit, jnp.zeros(6)), SCALE, rtol=4 * 0.756 / np.sqrt(20000))
+    np.testing.assert_allclose(diffusion.velocity_change_std(fit, jnp.zeros(6)), SCALE, rtol=4 * 0.756 / np.sqrt(20000))
 
 
 def test_forgetting_weighs_old_steps_less(x64):
@@ -120,18 +120,20 @@ def test_what_is_not_finite_is_not_learnt(wrong):
 def test_the_spread_stays_within_limits():
     fit = diffusion.start(jnp.asarray(SCALE))
     low, high = 1.5 * jnp.asarray(SCALE), 3 * jnp.asarray(SCALE)
-    limited = functools.partial(diffusion.spread, fit, low=low, high=high)
+    limited = functools.partial(diffusion.velocity_change_std, fit, low=low, high=high)
     np.testing.assert_allclose(limited(jnp.zeros(6)), low)
     np.testing.assert_allclose(limited(jnp.asarray(SCALE)), 2 * SCALE, rtol=1e-6)
     np.testing.assert_allclose(limited(-1e9 * jnp.asarray(SCALE)), high)
     falling = diffusion.start(jnp.asarray(SCALE), slope=-1.0)
-    np.testing.assert_array_equal(diffusion.spread(falling, 5 * jnp.asarray(SCALE)), 0)
+    np.testing.assert_array_equal(diffusion.velocity_change_std(falling, 5 * jnp.asarray(SCALE)), 0)
 
 
 def test_a_fixed_diffusion_does_not_depend_on_speed_and_is_not_learnt():
     scale = jnp.asarray(SCALE)
     fit = diffusion.start(scale, slope=0.0, offset=2.0)
-    np.testing.assert_allclose(diffusion.spread(diffusion.keep(fit, scale, scale), 7 * scale), 2 * SCALE, rtol=1e-6)
+    np.testing.assert_allclose(
+        diffusion.velocity_change_std(diffusion.fixed(fit, scale, scale), 7 * scale), 2 * SCALE, rtol=1e-6
+    )
 
 
 def test_fits_learn_in_a_batch_and_are_differentiable():

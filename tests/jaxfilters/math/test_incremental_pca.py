@@ -42,8 +42,8 @@ def samples(seed, count, size=8):
 def test_in_one_dimension_the_variance_is_the_mean_square(x64):
     u = np.random.default_rng(0).normal(size=(50, 1))
     space = learn(u, 1, amnesic=0.0)
-    np.testing.assert_allclose(incremental_pca.components(space).variances, np.mean(u**2), rtol=1e-12)
-    np.testing.assert_allclose(incremental_pca.components(space).basis, np.sign(u[:1]))
+    np.testing.assert_allclose(incremental_pca.principal_components(space).variances, np.mean(u**2), rtol=1e-12)
+    np.testing.assert_allclose(incremental_pca.principal_components(space).basis, np.sign(u[:1]))
 
 
 def test_amnesia_weighs_late_samples_more(x64):
@@ -51,7 +51,7 @@ def test_amnesia_weighs_late_samples_more(x64):
     expected = np.mean(u[:20] ** 2)
     for n, x in enumerate(u[20:, 0], start=21):
         expected = (n - 3) / n * expected + 3 / n * x**2
-    np.testing.assert_allclose(incremental_pca.components(learn(u, 1)).variances, expected, rtol=1e-12)
+    np.testing.assert_allclose(incremental_pca.principal_components(learn(u, 1)).variances, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 7.0])
@@ -80,18 +80,18 @@ def test_repeated_and_dependent_samples_begin_no_component_from_rounding(amnesic
     u = samples(5, 2)
     space = learn(np.concatenate([np.repeat(u[:1], 5, axis=0), u, u, u]), amnesic=amnesic, ramp=0)
     assert np.all(np.isfinite(space.vectors))
-    basis, variances = incremental_pca.components(space)
+    basis, variances = incremental_pca.principal_components(space)
     assert np.all(variances[:2] > 0)
     assert np.all(variances[2:] == 0)
     np.testing.assert_array_equal(basis[:, 2:], 0)
     np.testing.assert_allclose(basis @ (basis.T @ u.T), u.T, atol=1e-4)
-    assert incremental_pca.contribution(space) == pytest.approx(1, abs=1e-5)
+    assert incremental_pca.explained_variance_ratio(space) == pytest.approx(1, abs=1e-5)
 
 
 def test_the_spectrum_of_the_specification_is_found_from_forty_seeds(x64):
     # Section 2.11: n = 1680, l = 2. The axes of the distribution are the coordinates.
     u = STD * jax.random.normal(jax.random.key(0), (40, 1680, SIZE))
-    found = jax.jit(jax.vmap(lambda one: incremental_pca.components(learn(one))))(u)
+    found = jax.jit(jax.vmap(lambda one: incremental_pca.principal_components(learn(one))))(u)
     aligned = np.abs(np.diagonal(found.basis[:, :NUM_COMPONENTS], axis1=1, axis2=2))
     assert np.min(aligned) >= 0.98
     ratio = np.asarray(found.variances) / STD[:NUM_COMPONENTS] ** 2
@@ -107,7 +107,7 @@ def test_the_spectrum_of_the_specification_is_found_from_forty_seeds(x64):
 def test_the_basis_is_orthonormal_sorted_and_keeps_the_signs_of_its_vectors(x64):
     space = learn(samples(6, 300), 3)
     shuffled = space._replace(vectors=space.vectors[jnp.array([2, 0, 1])])
-    basis, variances = incremental_pca.components(shuffled)
+    basis, variances = incremental_pca.principal_components(shuffled)
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
     assert np.all(np.diff(variances) < 0)
     np.testing.assert_allclose(variances, np.sort(np.linalg.norm(space.vectors, axis=1))[::-1])
@@ -120,21 +120,21 @@ def test_the_basis_is_orthonormal_sorted_and_keeps_the_signs_of_its_vectors(x64)
 
 def test_the_contribution_is_the_share_of_the_mean_square_that_is_explained(x64):
     u = STD * np.random.default_rng(7).normal(size=(1680, SIZE))
-    assert incremental_pca.contribution(incremental_pca.start(SIZE, NUM_COMPONENTS)) == 0
+    assert incremental_pca.explained_variance_ratio(incremental_pca.start(SIZE, NUM_COMPONENTS)) == 0
     space = learn(u, amnesic=0.0)
     explained = np.linalg.norm(space.vectors, axis=1).sum()
     # What the first components leave was left by younger, worse ones: an error that decays as the inverse of n.
     np.testing.assert_allclose(explained + space.residual_energy, np.mean(np.sum(u**2, axis=1)), rtol=0.02)
     true_share = np.sum(STD[:NUM_COMPONENTS] ** 2) / np.sum(STD**2)
-    assert incremental_pca.contribution(space) == pytest.approx(true_share, abs=0.01)
-    assert incremental_pca.contribution(learn(u, 2)) == pytest.approx(52 / np.sum(STD**2), abs=0.03)
+    assert incremental_pca.explained_variance_ratio(space) == pytest.approx(true_share, abs=0.01)
+    assert incremental_pca.explained_variance_ratio(learn(u, 2)) == pytest.approx(52 / np.sum(STD**2), abs=0.03)
 
 
 def test_single_precision_finds_the_same_components():
     u = samples(8, 400)
-    single = incremental_pca.components(learn(u, 3))
+    single = incremental_pca.principal_components(learn(u, 3))
     with jax.enable_x64(True):
-        double = incremental_pca.components(learn(u, 3))
+        double = incremental_pca.principal_components(learn(u, 3))
     assert single.basis.dtype == jnp.float32
     np.testing.assert_allclose(single.basis, double.basis, atol=1e-4)
     np.testing.assert_allclose(single.variances, double.variances, rtol=1e-4)
@@ -145,7 +145,7 @@ def test_an_update_is_differentiable_also_before_there_is_anything(x64):
 
     @jax.jit
     def variance(deviations):
-        return jnp.sum(incremental_pca.components(learn(deviations, 3)).variances ** 2)
+        return jnp.sum(incremental_pca.principal_components(learn(deviations, 3)).variances ** 2)
 
     gradient = jax.jit(jax.grad(variance))
     step = 1e-6 * jnp.asarray(np.random.default_rng(9).normal(size=u.shape))
@@ -167,9 +167,9 @@ def test_coordinates_are_carried_over_to_a_new_mean_and_basis(x64):
     full, mean, new_mean, coordinates = map(
         jnp.asarray, (full, rng.normal(size=6), rng.normal(size=6), rng.normal(size=(2, 9)))
     )
-    new = incremental_pca.transfer(coordinates, mean, full[:, :2], new_mean, full)
+    new = incremental_pca.change_basis(coordinates, mean, full[:, :2], new_mean, full)
     np.testing.assert_allclose(new_mean[:, None] + full @ new, mean[:, None] + full[:, :2] @ coordinates, atol=1e-13)
-    kept = incremental_pca.transfer(coordinates, mean, full[:, :2], mean, full[:, :2])
+    kept = incremental_pca.change_basis(coordinates, mean, full[:, :2], mean, full[:, :2])
     np.testing.assert_allclose(kept, coordinates, atol=1e-13)
 
 
@@ -180,7 +180,7 @@ def test_moments_are_those_of_numpy_wherever_the_data_lie(x64):
     seen = x[np.all(np.isfinite(x), axis=1)]
     np.testing.assert_allclose(moments.mean, seen.mean(0), rtol=1e-13)
     np.testing.assert_allclose(moments.scatter / 199, np.cov(seen.T), rtol=1e-10, atol=1e-10)
-    basis, variances = incremental_pca.principal(moments, 3)
+    basis, variances = incremental_pca.exact_principal_components(moments, 3)
     values, vectors = np.linalg.eigh(np.cov(seen.T))
     np.testing.assert_allclose(variances, values[:-4:-1], rtol=1e-10)
     np.testing.assert_allclose(np.abs(np.sum(basis * vectors[:, :-4:-1], axis=0)), 1, rtol=1e-10)
@@ -189,7 +189,10 @@ def test_moments_are_those_of_numpy_wherever_the_data_lie(x64):
 def test_incremental_and_exact_components_agree_in_the_long_run(x64):
     u = STD * np.random.default_rng(13).normal(size=(5000, SIZE))
     moments = moments_of(u)
-    exact, candid = incremental_pca.principal(moments, 3), incremental_pca.components(learn(u, 3, amnesic=0.0))
+    exact, candid = (
+        incremental_pca.exact_principal_components(moments, 3),
+        incremental_pca.principal_components(learn(u, 3, amnesic=0.0)),
+    )
     assert np.all(np.abs(np.sum(exact.basis * candid.basis, axis=0)) > 0.999)
     np.testing.assert_allclose(candid.variances, exact.variances, rtol=0.02)
 
@@ -199,4 +202,4 @@ def test_numbers_of_components_that_cannot_be_are_rejected(num_components):
     with pytest.raises(ValueError, match="num_components must be from 1 to 8"):
         incremental_pca.start(8, num_components)
     with pytest.raises(ValueError, match="num_components must be from 1 to 8"):
-        incremental_pca.principal(incremental_pca.start_moments(8), num_components)
+        incremental_pca.exact_principal_components(incremental_pca.start_moments(8), num_components)

@@ -135,7 +135,7 @@ def test_noise_adapts_to_speed_and_grows_with_the_interval():
 def test_a_given_diffusion_is_kept():
     ys, taus = simulate(4)
     fit = diffusion.start(jnp.array([0.7, 0.2]), slope=0.0)
-    state, _ = run(make_filter(fit=fit, update_fit=diffusion.keep), jax.random.key(4), ys, taus)
+    state, _ = run(make_filter(fit=fit, update_fit=diffusion.fixed), jax.random.key(4), ys, taus)
     jax.tree.map(np.testing.assert_array_equal, state.fit, fit)
     np.testing.assert_allclose(state.spread[:2], taus[-1] * np.array([0.7, 0.2]), rtol=1e-6)
 

@@ -10,7 +10,7 @@ from jaxfilters.models.gesture.rejection import LEAVING, threshold_log_likelihoo
 
 def test_it_is_the_threshold_model_of_the_symbols_side_by_side():
     rng = np.random.default_rng(0)
-    chain = hmm.from_topology(hmm.left_right(4), first=hmm.first_only(4))
+    chain = hmm.from_topology(hmm.left_right(4), initial=hmm.left_right_initial(4))
     ones = []
     for _ in range(3):
         transition = np.where(np.exp(chain.log_transition) > 0, rng.uniform(0.2, 1, (4, 4)), 0)
@@ -20,14 +20,14 @@ def test_it_is_the_threshold_model_of_the_symbols_side_by_side():
     models = jax.tree.map(lambda *leaves: jnp.stack(leaves), *ones)
     codes = jnp.asarray(rng.integers(5, size=(30, 7)))
     lengths = jnp.array([30, 29, 1, 0, 12, 30, 5])
-    whole = hmm.threshold(hmm.side_by_side(ones, leaving=LEAVING))
+    whole = hmm.threshold_model(hmm.parallel_composition(ones, exit_probability=LEAVING))
     expected = hmm.log_evidence(whole, jax.vmap(whole.log_likelihoods, -1, -1)(codes), lengths)
     seen = jax.vmap(lambda model: jax.vmap(model.log_likelihoods, -1, -1)(codes))(models)
     np.testing.assert_allclose(threshold_log_likelihood(models, seen, lengths), expected, rtol=1e-5, atol=1e-4)
 
 
 def test_what_no_state_can_produce_is_impossible_and_nan_is():
-    chain = hmm.from_topology(hmm.left_right(2), first=hmm.first_only(2))
+    chain = hmm.from_topology(hmm.left_right(2), initial=hmm.left_right_initial(2))
     models = jax.tree.map(lambda leaf: leaf[None], chain)
     seen = jnp.zeros((1, 3, 2, 3)).at[0, 1, :, 1].set(-jnp.inf).at[0, 2, :, 2].set(jnp.nan)
     found = threshold_log_likelihood(models, seen, jnp.full(3, 3))

@@ -52,7 +52,7 @@ def test_symbols_of_other_writers_are_recognised_with_confidence(symbols):
 
 
 def test_what_is_no_symbol_is_rejected_and_symbols_are_not(symbols):
-    bar = hmm.threshold(network(symbols))
+    bar = hmm.threshold_model(network(symbols))
     strokes, _ = collection(2, 12)
     assert np.mean(recognise(symbols, strokes_last(strokes), bar).label >= 0) >= 0.95
     rng = np.random.default_rng(3)
@@ -64,7 +64,7 @@ def test_what_is_no_symbol_is_rejected_and_symbols_are_not(symbols):
 
 def test_any_number_of_strokes_is_judged_as_each_alone(symbols):
     strokes, _ = collection(2, 12)
-    expected = recognise(symbols, strokes_last(strokes), hmm.threshold(network(symbols)), margin=0.1)
+    expected = recognise(symbols, strokes_last(strokes), hmm.threshold_model(network(symbols)), margin=0.1)
     num_strokes = len(strokes)
     many = np.tile(strokes_last(strokes), 3)
     assert many.shape[-1] > CHUNK
