@@ -113,7 +113,7 @@ def extended_kalman(
         residual: `(y, y_hat) -> y - y_hat`, (m,), for observations that wrap around, such as angles.
         iterations: Steps of every measurement update: 1 is the plain update; more are damped Gauss-Newton steps,
             halved until they lower the cost, for precise measurements that are strongly nonlinear within the prior's
-            spread. Meant for `taylor` and `second_order`; no more than 2 to 10 are usual.
+            spread. Meant for `taylor`, whose cost they lower; 2 to 10 are usual.
         iterate_to: The point that more than one iteration approaches. "mean" is the mean of the posterior to the
             second order of Laplace's expansion, which needs second derivatives of `observe`. "mode" is the most
             probable state, the classical iterated extended Kalman filter. Do not use "mode" where the posterior is

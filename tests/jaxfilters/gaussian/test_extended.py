@@ -138,7 +138,7 @@ def distances(x):
 
 NONLINEAR = {
     "taylor": taylor,
-    "second_order": second_order_covariance_only,
+    "second_order_covariance_only": second_order_covariance_only,
     "cubature": cubature,
     "unscented": unscented(0.8, 2.0, 0.5),
 }

@@ -8,8 +8,8 @@ from jaxfilters.gaussian.linearize import cubature, second_order, second_order_c
 
 STRATEGIES = {
     "taylor": taylor,
-    "second_order": second_order_covariance_only,
-    "second_order_bias": second_order,
+    "second_order_covariance_only": second_order_covariance_only,
+    "second_order": second_order,
     "cubature": cubature,
     "unscented": unscented(),
     "unscented_wide": unscented(1.3, 0.0, 1.0),
