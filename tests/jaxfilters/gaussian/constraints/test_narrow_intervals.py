@@ -93,16 +93,21 @@ NORMALS = {
 }
 
 
-@pytest.mark.parametrize("frames", [1, 6])
-@pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
-@pytest.mark.parametrize("name", NORMALS)
+CASES = [(name, root, 6) for name in NORMALS for root in (False, True)] + [("3-D", False, 1), ("2-D", True, 1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "root", "frames"), CASES)
 def test_evidence_and_gradients_of_narrow_intervals_in_single_precision(x64, name, root, frames):
     normals = jnp.asarray(NORMALS[name], jnp.float32)
     n = normals.shape[1]
     y = single(READINGS[:frames, :n])
     filtered = jax.jit(jax.value_and_grad(partial(filtered_evidence, normals=normals, root=root)))
     exact = jax.jit(jax.value_and_grad(partial(exact_evidence, normals=double(normals))))
-    for width in WIDTHS:
+    # A covariance in single precision does not represent smaller variances along an oblique normal: section 6 of the
+    # derivation.
+    narrowest = 3e-3 if name == "2-D oblique" and not root else 0.0
+    for width in (width for width in WIDTHS if width >= narrowest):
         theta = problem(n, width)
         value, gradients = filtered(theta, y)
         expected, expected_gradients = exact(double(theta), double(y))
@@ -122,6 +127,7 @@ def test_evidence_and_gradients_of_narrow_intervals_in_single_precision(x64, nam
                 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
 def test_wide_intervals_in_single_and_in_double_precision_agree(x64, root):
     normals = jnp.eye(3)
