@@ -49,7 +49,9 @@ def truncate(
 ) -> tuple[Belief, Sites, TruncationInfo]:
     """Moments of a belief truncated to all rows, its sites, and diagnostics.
 
-    A single row is exact. Derivatives are those of the fixed point, by the implicit function theorem.
+    A single row is exact. With float32 covariances, rows that are neither parallel to an axis nor wider than 3e-3 prior
+    standard deviations lose accuracy when they are applied repeatedly; a `GaussianRoot` keeps it. Derivatives are those
+    of the fixed point, by the implicit function theorem.
 
     Args:
         belief: The belief to truncate, a `Gaussian` or `GaussianRoot` of n components. It contains `sites` already.

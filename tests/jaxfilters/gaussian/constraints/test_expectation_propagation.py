@@ -94,7 +94,7 @@ def test_independent_rows_are_met_exactly(x64, form):
 
 
 def test_two_rows_in_the_plane(x64, form):
-    # The example of the specification, section 2.10: mean (-0.137, 0.898), variance (0.081, 0.067).
+    # The quadrature gives mean (-0.137, 0.898) and variance (0.081, 0.067).
     mean, variance, mass = strip()
     np.testing.assert_allclose([*mean, *variance], [-0.137, 0.898, 0.081, 0.067], atol=1.5e-3)
     belief = in_five(form, np.zeros(2), np.linalg.cholesky([[1, 0.8], [0.8, 1]]))
@@ -133,7 +133,7 @@ def test_random_beliefs_agree_with_samples_and_do_not_depend_on_the_order(x64, r
         error, sequential = (np.linalg.norm(np.linalg.solve(root, g.mean - exact)) for g in (truncated, one_by_one))
         errors.append(error)
         sequential_errors.append(sequential)
-        # Whitened, four standard errors of the samples beside the bias of the method, as the specification has it.
+        # Whitened, four standard errors of the samples beside the bias of the method.
         assert error <= 0.05 + 4 * noise
         assert abs(info.log_mass - np.log(inside.mean())) <= 0.05 + 4 / np.sqrt(inside.sum())
     assert np.median(errors) <= 0.3 * np.median(sequential_errors)
