@@ -49,10 +49,11 @@ def check_scalar(name: str, value: Any, condition: str, holds: Callable[[np.ndar
         condition: The condition in words, e.g. "at least 1".
         holds: The condition as a function of the number.
     """
+    is_number = isinstance(value, int | float | np.number | np.ndarray | jax.Array) and not isinstance(value, bool)
+    if not is_number or not (jnp.issubdtype(jnp.result_type(value), jnp.floating) or _is_integer(value)):
+        raise TypeError(f"{name} must be a number, {condition}; got {value!r}.")
     if jnp.shape(value) != ():
         raise ValueError(f"{name} must be a single number, {condition}; got an array of shape {jnp.shape(value)}.")
-    if not jnp.issubdtype(jnp.result_type(value), jnp.floating) and not _is_integer(value):
-        raise TypeError(f"{name} must be a number, {condition}; got {value!r}.")
     number = concrete(value)
     if number is not None and not holds(number):
         raise ValueError(f"{name} must be {condition}; got {number}.")

@@ -49,10 +49,10 @@ def exact_log_evidence(theta):
 
 @jax.jit
 def many_gradients(keys, theta):
-    def log_evidence(theta, key):
+    def of_theta(theta, key):
         return log_evidence(particle_filter(theta, num_particles=1000), key, jnp.asarray(YS, jnp.float32))
 
-    return jax.vmap(jax.grad(log_evidence), in_axes=(None, 0))(theta, keys)
+    return jax.vmap(jax.grad(of_theta), in_axes=(None, 0))(theta, keys)
 
 
 def test_the_default_is_the_score_of_every_parameter():
@@ -141,13 +141,13 @@ def test_a_filter_with_transport_is_smooth(x64):
     # The same key on both sides of a difference: with plain resampling it would jump.
     @jax.jit
     @jax.value_and_grad
-    def log_evidence(theta):
+    def of_theta(theta):
         pf = particle_filter(theta, num_particles=20, scheme=transport(0.3), ess_threshold=1.0)
         return log_evidence(pf, KEY, jnp.asarray(YS))
 
     theta, steps = jnp.asarray(THETA), 1e-4 * np.eye(3)
-    differences = [(log_evidence(theta + step)[0] - log_evidence(theta - step)[0]) / 2e-4 for step in steps]
-    np.testing.assert_allclose(log_evidence(theta)[1], differences, rtol=1e-3)
+    differences = [(of_theta(theta + step)[0] - of_theta(theta - step)[0]) / 2e-4 for step in steps]
+    np.testing.assert_allclose(of_theta(theta)[1], differences, rtol=1e-3)
 
 
 @pytest.mark.parametrize("scheme", [soft(0.5), transport()], ids=["soft", "transport"])

@@ -313,7 +313,7 @@ def test_an_observed_linear_state_matches_the_joint_kalman_filter(builder):
 def test_exactly_one_kind_of_observation():
     prior = Gaussian(jnp.zeros(1), jnp.eye(1))
     for given in ({}, {"observe": observe_both, "log_likelihood": log_likelihood}):
-        with pytest.raises(ValueError, match="Exactly one of log_likelihood and observe"):
+        with pytest.raises(ValueError, match=r"Exactly one of log_likelihood .* and observe"):
             rao_blackwell(sample_prior, prior, dynamics, num_particles=8, noise_dim=1, **given)
 
 

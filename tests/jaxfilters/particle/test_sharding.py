@@ -123,10 +123,10 @@ def test_what_does_not_fit_the_devices_is_refused(found):
     refusals = found["refusals"]
     assert "num_particles must be a multiple of the 4 devices along 'particles'; got 41" in refusals["number"]
     assert refusals["placed_number"] == refusals["number"]
-    assert "axis must be one of the mesh's, particles; got 'rows'" in refusals["axis"]
-    assert "island_threshold must be a share of the devices, at least 0; got -1.0" in refusals["threshold"]
+    assert "axis must be one of those of the mesh, particles; got 'rows'" in refusals["axis"]
+    assert "island_threshold must be a fraction of the number of devices, at least 0; got -1.0" in refusals["threshold"]
     assert "filter must not be tempered" in refusals["temper"]
-    assert "sequences must be a multiple of the 4 devices along 'particles'; got 5" in refusals["sequences"]
+    assert "multiple of the 4 devices along 'particles'; got the shape (5, 3)" in refusals["sequences"]
     assert "filter must be made by bootstrap, rao_blackwell or rao_blackwell_shared" in refusals["kind"]
 
 

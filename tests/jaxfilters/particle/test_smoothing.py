@@ -111,7 +111,7 @@ def test_what_is_impossible_is_not_drawn():
 
 def test_wrong_arguments_are_rejected():
     history = History(jnp.zeros((3, 2)), jnp.zeros((3, 2)), jnp.zeros((3, 2), jnp.int32))
-    with pytest.raises(ValueError, match="num_paths must be at least 1; got 0"):
+    with pytest.raises(ValueError, match="num_paths must be an integer of at least 1; got 0"):
         backward_sampling(KEY, history, log_transition, num_paths=0)
-    with pytest.raises(ValueError, match="controls must be as long as history, 3; got"):
+    with pytest.raises(ValueError, match="controls must have as many frames as history, 3; got"):
         backward_sampling(KEY, history, log_transition, jnp.zeros(2), num_paths=5)
