@@ -134,6 +134,7 @@ def test_a_fixed_diffusion_does_not_depend_on_speed_and_is_not_learnt():
     np.testing.assert_allclose(diffusion.spread(diffusion.keep(fit, scale, scale), 7 * scale), 2 * SCALE, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_fits_learn_in_a_batch_and_are_differentiable():
     velocities, changes = (jnp.asarray(numbers) for numbers in steps(7, 4))
     fit = diffusion.start(jnp.asarray(SCALE))
