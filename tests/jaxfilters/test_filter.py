@@ -57,6 +57,7 @@ def test_a_filter_built_again_from_the_same_functions_compiles_nothing():
     assert not TRACES
 
 
+@pytest.mark.system
 def test_scan_equals_a_loop_of_steps():
     pf = make_filter()
     init_key, scan_key = jax.random.split(KEY)
@@ -68,6 +69,7 @@ def test_scan_equals_a_loop_of_steps():
     np.testing.assert_allclose(infos.log_evidence[-1], info.log_evidence, rtol=1e-4)
 
 
+@pytest.mark.system
 def test_vmap_over_keys_equals_single_runs():
     pf, keys = make_filter(), jax.random.split(KEY, 3)
     together = jax.vmap(log_evidence, in_axes=(None, 0, None))(pf, keys, OBSERVATIONS)

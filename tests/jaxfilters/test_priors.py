@@ -30,6 +30,7 @@ def chi_squared(particles):
     return np.concatenate([x.mean(1) ** 2 * count, ((x @ x.T / count - np.eye(len(P))) ** 2 / variance).ravel()])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("prior", [from_noise(start, StandardNormal(3)), gaussian_prior(Gaussian(MEAN, ROOT @ ROOT.T))])
 def test_an_ensemble_and_single_particles_have_the_moments_of_the_prior(prior):
     together = sample_ensemble(jax.random.key(0), prior, 20_000)
@@ -41,6 +42,7 @@ def test_an_ensemble_and_single_particles_have_the_moments_of_the_prior(prior):
         assert np.all(chi_squared(pose) < 4.5**2)
 
 
+@pytest.mark.system
 def test_a_filter_with_such_a_prior_differs_only_by_its_draws_and_gives_gradients():
     """Against the Kalman update of one reading: 4.5 standard errors of the mean of 20 000 particles."""
     read = lambda x, y: -0.5 * (y - x[0]) ** 2

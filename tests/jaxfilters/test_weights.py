@@ -30,6 +30,7 @@ def test_infinite_weights_share_everything():
     np.testing.assert_allclose(weights.linear(jnp.array([INF, 3.0, INF, -INF])), [0.5, 0, 0.5, 0])
 
 
+@pytest.mark.system
 def test_derivative_of_the_log_sum_is_the_weights_also_beside_dead_particles(x64):
     log_weights = jnp.array([0.3, -INF, -2.0, 1.0])
     gradient = jax.grad(lambda lw: weights.normalize(lw)[1])(log_weights)

@@ -51,6 +51,7 @@ def rotation_error(hand, states, truth):
     return np.degrees(2 * np.arccos(np.clip(np.abs(q @ p), 0, 1)))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("turned", [(0, 0, 0), (35, 0, 0), (0, 0, 120), (0, 170, 0), (20, 30, -60)])
 def test_the_true_pose_is_among_the_starts(scene, turned):
     hand, starts = scene

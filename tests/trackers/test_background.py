@@ -173,6 +173,7 @@ def test_wrong_images_are_named():
         background("median").prime([])
 
 
+@pytest.mark.system
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "least"), [("median", 0.84), ("mog2", 0.78), ("knn", 0.76)])
 def test_real_people_are_found_as_in_the_silhouettes_of_the_recording(data_dir, name, least):

@@ -105,6 +105,7 @@ def test_values_are_those_of_vmap(name: str) -> None:
     assert_same(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), last), expected)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", OF_VECTOR)
 def test_a_function_alone_is_unchanged(name: str) -> None:
     function = OF_VECTOR[name]
@@ -116,6 +117,7 @@ def smooth_sum(tree) -> jax.Array:
     return sum(jnp.sum(jnp.sin(leaf)) for leaf in leaves) + 0.0
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", OF_VECTOR)
 def test_derivatives_are_those_of_vmap_in_either_order(name: str) -> None:
     function = OF_VECTOR[name]

@@ -74,6 +74,7 @@ def expected():
         return jax.jit(jax.value_and_grad(exact))(THETA)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("options", LINEAR.values(), ids=LINEAR)
 def test_the_gradient_is_that_of_the_joint_gaussian(x64, expected, options):
     density = fit.log_evidence(KEY, lambda theta: filter_of(theta, **options), jnp.asarray(YS))
@@ -90,6 +91,7 @@ CURVED = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("options", CURVED.values(), ids=CURVED)
 def test_the_gradient_of_a_curved_model_agrees_with_differences(options):
     density = fit.log_evidence(KEY, lambda theta: filter_of(theta, bend=1.0, **options), jnp.asarray(YS))

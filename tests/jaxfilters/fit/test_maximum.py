@@ -94,6 +94,7 @@ def structured(data, theta):
     return -50 * jnp.sum(off**2) + gaussian + jnp.sum(counts * jnp.log(theta["shares"]))
 
 
+@pytest.mark.system
 def test_rotations_covariances_and_shares_have_their_closed_forms(x64):
     directions = RNG.normal(size=(8, 3))
     seen = Rotation.from_rotvec([0.5, 1.8, -0.6]).apply(directions) + 0.1 * RNG.normal(size=(8, 3))

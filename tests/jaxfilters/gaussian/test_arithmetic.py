@@ -49,6 +49,7 @@ def textbook_update(mean, P, y, H, R):
     return mean + K @ (y - H @ mean), P - K @ H @ P, log_evidence, nis
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("n", "m", "width"), [(3, 2, 3), (2, 4, 6), (10, 3, 12), (10, 9, 7)])
 def test_prediction_and_update_agree_with_textbook(x64, rng, name, n, m, width):
     arithmetic = ARITHMETICS[name]
@@ -82,6 +83,7 @@ def test_prediction_and_update_agree_with_textbook(x64, rng, name, n, m, width):
     np.testing.assert_allclose(shifted.mean, expected[0], atol=1e-9)
 
 
+@pytest.mark.system
 def test_masked_components_are_as_if_they_were_not_there(x64, rng, name):
     arithmetic = ARITHMETICS[name]
     belief = belief_in(name, rng.normal(size=3), rng.normal(size=(3, 3)))
@@ -142,6 +144,7 @@ def test_what_is_certain_stays_so_without_nan(x64, rng, name):
     assert np.isfinite(jax.grad(lambda root: run(root)[1].log_evidence)(jnp.asarray(root))).all()
 
 
+@pytest.mark.system
 def test_gradient_of_the_evidence_agrees_with_differences(x64, rng, name):
     arithmetic = ARITHMETICS[name]
     belief = belief_in(name, rng.normal(size=2), np.tril(rng.normal(size=(2, 2))))
@@ -220,6 +223,7 @@ def test_beliefs_map_over_the_last_axis(rng, name):
         np.testing.assert_allclose(infos.log_evidence[i], info.log_evidence, atol=1e-4)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("size", [2, 10])
 def test_a_component_that_repeats_others_is_left_out_and_counted(x64, rng, name, size):
     arithmetic = ARITHMETICS[name]
@@ -242,6 +246,7 @@ def test_a_component_that_repeats_others_is_left_out_and_counted(x64, rng, name,
     assert np.isfinite(jax.grad(lambda H: run(H)[1].log_evidence)(jnp.asarray(H))).all()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("size", [3, 10])
 def test_nothing_that_is_not_finite_leaves_unannounced(rng, name, size):
     arithmetic = ARITHMETICS[name]
@@ -303,6 +308,7 @@ def test_more_noise_counts_as_noise(x64, rng, name):
     np.testing.assert_allclose(root @ root.T, np.diag([1.0, 0.0]) * (both_R @ both_R.T), atol=1e-12)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("name", "size"), [("joseph", 3), ("joseph", 9), ("fast", 9), ("square_root", 9)])
 def test_derivatives_agree_with_differences(x64, rng, name, size):
     arithmetic = ARITHMETICS[name]
@@ -327,6 +333,7 @@ def test_derivatives_agree_with_differences(x64, rng, name, size):
     check_grads(jax.jit(figures), (root, F, H, root_R, y), order=1, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.system
 def test_second_derivatives_agree_with_differences(x64, rng, name):
     H, root, y = (jnp.asarray(rng.normal(size=shape)) for shape in ((10, 9), (9, 9), 10))
 
@@ -366,6 +373,7 @@ def test_smoothing_agrees_with_the_joint_posterior(x64, rng, name, n, width):
     np.testing.assert_allclose(covariance_of(smoothed), expected_P, atol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("n", [4, 12])
 def test_roots_of_any_rank(x64, rng, n):
     A = rng.normal(size=(n, 2))

@@ -29,6 +29,7 @@ def random_problem(seed, n=4, m=3):
     )
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(3))
 def test_considering_is_schmidts_filter(x64, seed):
     m, P, H, R, y = random_problem(seed)

@@ -44,6 +44,7 @@ def moments(state, info):
     return jnp.mean(state.particles, axis=1), jnp.cov(state.particles), info.log_evidence
 
 
+@pytest.mark.system
 def test_mean_covariance_and_evidence_are_those_of_the_kalman_filter():
     """Within 4 standard errors over 40 ensembles, beside a bias of 1 / N, here a fiftieth of the standard errors."""
     ys, controls = jnp.asarray(YS, jnp.float32), jnp.linspace(-1.0, 1.0, 6)

@@ -85,6 +85,7 @@ LINEAR = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("options", LINEAR.values(), ids=LINEAR)
 def test_all_are_the_kalman_filter_where_the_model_is_linear(x64, options):
     seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
@@ -99,6 +100,7 @@ def test_all_are_the_kalman_filter_where_the_model_is_linear(x64, options):
     np.testing.assert_array_equal(infos.num_invalid, 0)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("arithmetic", [arithmetics.joseph, arithmetics.square_root])
 def test_what_was_not_read_is_left_out_counted_and_differentiated(x64, arithmetic):
     seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
@@ -144,6 +146,7 @@ NONLINEAR = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("linearize", NONLINEAR.values(), ids=NONLINEAR)
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_masked_components_are_as_if_they_were_not_there(x64, linearize, iterations):
@@ -165,6 +168,7 @@ def test_masked_components_are_as_if_they_were_not_there(x64, linearize, iterati
     np.testing.assert_allclose(info.log_evidence, expected_info.log_evidence, atol=1e-10)
 
 
+@pytest.mark.system
 def test_iterations_reach_the_most_probable_state(x64):
     # A whole Gauss-Newton step overshoots: seen from the mean, the angle hardly changes with x.
     P, R = np.array([[9.0, 1.0], [1.0, 4.0]]), 0.01 * np.eye(2)
@@ -193,6 +197,7 @@ def test_iterations_reach_the_most_probable_state(x64):
     )
 
 
+@pytest.mark.system
 def test_angles_may_wrap(x64):
     # The same two bearings, once where the angle jumps, once turned by half a turn to where it does not.
     def wrap(y, y_hat):
@@ -215,6 +220,7 @@ def test_angles_may_wrap(x64):
         assert (abs(info.innovation) < 1).all()
 
 
+@pytest.mark.system
 def test_a_prediction_that_is_not_finite_is_left_out_and_announced():
     belief, R = Gaussian(jnp.array([-1.0, 2.0]), jnp.eye(2)), 0.1 * jnp.eye(2)
     observe = lambda x: jnp.array([jnp.log(x[0]), x[1]])
@@ -242,6 +248,7 @@ def two_vectors(q):
     return jnp.concatenate([back @ UP, back @ NORTH])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("arithmetic", "linearize"),
     [(arithmetics.joseph, second_order_covariance_only), (arithmetics.square_root, cubature)],
@@ -279,6 +286,7 @@ def test_attitude_from_two_vectors_is_as_certain_as_it_says(arithmetic, lineariz
     np.testing.assert_allclose(np.linalg.norm(last.mean, axis=1), 1, atol=1e-6)
 
 
+@pytest.mark.system
 def test_the_gradient_is_that_of_the_exact_evidence(x64):
     def exact(F):
         # Everything that is random, one below the other: the first state, and the noise of each step.
@@ -315,6 +323,7 @@ def wander(scale, x, dt):
     return x + 0.1 * jnp.sin(scale * x)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("linearize", "arithmetic", "iterations"),
     [(second_order_covariance_only, arithmetics.joseph, 3), (cubature, arithmetics.square_root, 1)],

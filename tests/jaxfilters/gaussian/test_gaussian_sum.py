@@ -241,6 +241,7 @@ def test_an_update_that_breaks_leaves_the_others_alone():
     np.testing.assert_allclose(state.components.mean, np.array([(-3.0, 0.0), (-2.0, 0.0)]) @ F.T, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_one_program_for_all_frames_and_sequences_and_a_right_gradient(x64):
     traces = []
 

@@ -40,6 +40,7 @@ def test_a_linear_function_is_itself(x64, rng, form, strategy, n):
     np.testing.assert_allclose(found.residual_root @ found.residual_root.T, np.zeros((4, 4)), atol=1e-18)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("strategy", STRATEGIES.values(), ids=STRATEGIES)
 def test_directions_without_variance_do_no_harm(x64, rng, form, strategy):
     A, mean, root = rng.normal(size=(2, 10)), rng.normal(size=10), np.tril(rng.normal(size=(10, 10)))

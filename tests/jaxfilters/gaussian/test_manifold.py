@@ -41,6 +41,7 @@ def test_products_of_the_same_blocks_compile_once():
     assert jax.tree.structure(hashable(BODY)) != jax.tree.structure(hashable(euclidean))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("form", [Gaussian, GaussianRoot])
 def test_a_belief_seen_from_elsewhere_and_settled_again_is_itself(x64, rng, form):
     x = body(rng)
@@ -53,6 +54,7 @@ def test_a_belief_seen_from_elsewhere_and_settled_again_is_itself(x64, rng, form
         np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
+@pytest.mark.system
 def test_covariances_follow_the_tangent_space(x64, rng):
     # Draws about x, far from it, have their covariance in the tangent space at their own mean.
     x, offset = jnp.asarray(unit(rng)), jnp.array([0.9, -0.6, 0.4])

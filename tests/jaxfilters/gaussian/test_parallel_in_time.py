@@ -51,6 +51,7 @@ def covariances(beliefs):
     return np.array([np.asarray(b.root) @ np.asarray(b.root).T for b in beliefs])
 
 
+@pytest.mark.system
 def test_the_beliefs_are_those_of_the_sequential_filter_and_smoother(x64):
     model = VARYING
     ys = np.where(SEEN, YS, np.nan)
@@ -65,6 +66,7 @@ def test_the_beliefs_are_those_of_the_sequential_filter_and_smoother(x64):
         np.testing.assert_allclose(roots @ roots.transpose(0, 2, 1), covariances(one_by_one), atol=1e-8)
 
 
+@pytest.mark.system
 def test_masked_readings_do_not_matter_and_the_evidence_differentiates(x64):
     prior = GaussianRoot(jnp.asarray(MEAN), jnp.asarray(ROOT))
     # Few frames: every round of the scan is compiled, and its derivative.
@@ -83,6 +85,7 @@ def test_masked_readings_do_not_matter_and_the_evidence_differentiates(x64):
     np.testing.assert_allclose(slope, differences, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_float32_keeps_the_evidence_of_certain_readings():
     # The process noise is a million times that of the readings.
     model = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), CONSTANT._replace(root_R=1e-3 * CONSTANT.root_R))

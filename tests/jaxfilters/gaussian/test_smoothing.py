@@ -68,6 +68,7 @@ def joint_posterior():
 CURVED = Manifold(add, displacement)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("arithmetic", "options"),
     [

@@ -89,6 +89,7 @@ def test_the_gradient_is_the_expected_statistics_and_agrees_with_differences(x64
     check_grads(hmm.log_evidence, (model, e), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_sequences_along_the_last_axis_under_vmap_and_padded_are_those_on_their_own(x64):
     lengths = np.array([7, 0, 1, 9])
     model, e = chain(6), scores(7, 9, batch=(4,))

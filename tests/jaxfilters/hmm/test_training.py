@@ -94,6 +94,7 @@ def test_many_models_are_trained_at_once_by_vmap(x64):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-10), together, alone)
 
 
+@pytest.mark.system
 def test_the_model_that_drew_the_data_is_found_again():
     truth = hmm.from_probabilities(
         [1.0, 0.0],

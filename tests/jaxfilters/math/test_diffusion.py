@@ -136,6 +136,7 @@ def test_a_fixed_diffusion_does_not_depend_on_speed_and_is_not_learnt():
     )
 
 
+@pytest.mark.system
 def test_fits_learn_in_a_batch_and_are_differentiable():
     velocities, changes = (jnp.asarray(numbers) for numbers in steps(7, 4))
     fit = diffusion.start(jnp.asarray(SCALE))

@@ -48,6 +48,7 @@ def test_logarithm_in_float32_is_right_to_rounding(rng, angle):
         np.testing.assert_allclose(turned, Rotation.from_rotvec(angle * axis).as_matrix(), atol=2e-6)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("angle", ANGLES)
 def test_derivatives_are_finite_and_right_at_every_angle(x64, rng, angle):
     rotvec = jnp.asarray(angle * axes(rng)[0])
@@ -63,6 +64,7 @@ def test_derivatives_are_finite_and_right_at_every_angle(x64, rng, angle):
             np.testing.assert_allclose(d_log @ d_exp, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.system
 def test_product_matrices_and_inverse_agree_with_scipy(x64, rng):
     a, b = Rotation.random(50, random_state=1), Rotation.random(50, random_state=2)
     p, q = jnp.asarray(scalar_first(a[0])), jnp.asarray(scalar_first(b[0]))
@@ -101,6 +103,7 @@ def test_mean_ignores_signs_and_returns_what_all_agree_on(x64, rng):
     np.testing.assert_allclose(abs(expected @ scalar_first(oracle)), 1, atol=1e-14)
 
 
+@pytest.mark.system
 def test_mean_has_the_right_derivative_even_of_like_rotations(x64, rng):
     log_weights = jnp.log(jnp.array([0.5, 0.3, 0.2]))
     same = jnp.tile(lie.so3_exp(jnp.array([0.1, -0.5, 0.3]))[:, None], 3)

@@ -145,6 +145,7 @@ def test_linear_problems_with_bounds_equal_bvls():
     assert_allclose(found.value, scipy.optimize.lsq_linear(A, b, (lower, upper), tol=1e-14).x, atol=1e-8)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_derivatives_of_bounded_solutions_by_finite_differences():
     A, b, c, *_ = (jnp.asarray(leaf[250]) for leaf in problems())

@@ -111,6 +111,7 @@ def test_scipy_finds_nothing_better(x64):
     assert float(found.energy) <= peer.cost * (1 + 1e-6)
 
 
+@pytest.mark.system
 def test_it_runs_in_single_precision_and_under_vmap():
     starts, data = zip(*(problem(seed) for seed in range(3)), strict=True)
     stack = lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in leaves])

@@ -80,6 +80,7 @@ def keep_belief(state, info):
     return state.estimate, variance, info.log_evidence
 
 
+@pytest.mark.system
 def test_estimates_are_those_of_a_kalman_filter_that_coasts_and_learns():
     ys, taus = simulate(0)
     keys = jax.random.split(jax.random.key(0), 40)
@@ -218,6 +219,7 @@ def test_filters_compile_once_and_run_together_as_they_do_alone(partitions):
     np.testing.assert_allclose(together, alone, rtol=1e-4)
 
 
+@pytest.mark.system
 def test_the_evidence_is_differentiable_in_the_parameters():
     ys, taus = simulate(11)
     pf = make_filter(partitions=Partitions(consecutive(2, 1)))

@@ -67,6 +67,7 @@ def make_filter(noise_std=0.4, **options):
     return bootstrap(sample_prior, move_by_noise, model.log_likelihood, **options)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("ess_threshold", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("scheme", [resampling.systematic, resampling.multinomial])
 def test_evidence_is_unbiased(ess_threshold, scheme):
@@ -93,6 +94,7 @@ def test_keys_and_normals_both_give_the_posterior_mean():
         assert abs(weights.mean(state.particles, state.log_weights) - exact_mean) < 0.014
 
 
+@pytest.mark.system
 def test_score_matches_the_exact_one():
     # 400 independent estimates at N = 1000; their bias is O(1/N), below the 4 sigma of the z-test.
     ys = simulate(2, 10)

@@ -74,6 +74,7 @@ def test_soft_resampling_leaves_the_evidence_unbiased():
     assert abs(z) < 4
 
 
+@pytest.mark.system
 def test_soft_weights_are_corrected_and_differentiated(x64):
     log_weights = jnp.log(jnp.asarray(RNG.dirichlet(np.ones(6)))).at[2].set(-jnp.inf)
     log_weights = weights.normalize(log_weights)[0]
@@ -108,6 +109,7 @@ SHARES[4] = 0
 SHARES /= SHARES.sum()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("regularization", [0.5, 0.1])
 def test_the_plan_is_that_of_sinkhorn(x64, regularization):
     found = transport_plan(jnp.asarray(CLOUD), jnp.log(jnp.asarray(SHARES)), regularization)

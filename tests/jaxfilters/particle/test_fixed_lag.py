@@ -43,6 +43,7 @@ def delayed(state, info):
     return state.delayed, info.log_evidence
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("arithmetic", [arithmetics.joseph, arithmetics.square_root])
 def test_beliefs_are_those_of_the_smoother_of_what_was_seen(x64, arithmetic):
     root = arithmetic is arithmetics.square_root
@@ -88,6 +89,7 @@ def window_and_history(state, info):
     return state.delayed, keep_history(state.inner, info)
 
 
+@pytest.mark.system
 def test_delayed_particles_are_those_of_the_lineages():
     pf = bootstrap(sample_prior, move, log_likelihood, num_particles=30, noise=StandardNormal(1))
     ys, controls = jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32)
@@ -135,6 +137,7 @@ def looked_at(num_particles):
     return guided(inner, lambda particles, log_weights, y: Guidance(y, jnp.eye(1) / 0.16))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("make", [layered, lambda: looked_at(40)], ids=["layered", "guided"])
 def test_filters_that_move_or_resample_in_their_update_keep_their_lineages(make):
     ys = jnp.asarray(YS, jnp.float32)
@@ -143,6 +146,7 @@ def test_filters_that_move_or_resample_in_their_update_keep_their_lineages(make)
         np.testing.assert_array_equal(found[-1], trajectories(history)[-1 - LAG])
 
 
+@pytest.mark.system
 def test_delayed_particles_of_a_guided_filter_have_the_mean_of_the_kalman_smoother():
     F, Q, H = np.array([[1, 0.3], [0, 0.9]]), np.diag([0.1, 0.2]), np.array([[1.0, 0]])
     model = extended_kalman(

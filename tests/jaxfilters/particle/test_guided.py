@@ -73,6 +73,7 @@ def exact_log_evidence(ys):
     return float(total)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("guide", "scheme"), [(look, systematic), (look_past, systematic), (look_nowhere, systematic), (look, soft(0.6))]
 )
@@ -86,6 +87,7 @@ def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
     assert abs((ratio.mean() - 1) / (ratio.std(ddof=1) / np.sqrt(ratio.size))) < 4
 
 
+@pytest.mark.system
 def test_a_good_guide_keeps_more_particles_alive():
     ys = jnp.asarray(simulate(), dtype=float)
     with_guide = run(guided(make_inner(), look), jax.random.key(2), ys, collect=keep_info)[1]
@@ -103,6 +105,7 @@ def test_an_unseen_frame_is_a_plain_prediction():
     assert np.all(np.isfinite(state.ensemble.particles))
 
 
+@pytest.mark.system
 def test_importance_weights_restore_the_prior():
     # 4e5 draws; each moment within 4 standard errors of the truth.
     rng = np.random.default_rng(3)

@@ -141,6 +141,7 @@ def test_where_nothing_explains_the_observation_weights_are_even_and_the_evidenc
             assert np.all(np.isfinite(after))
 
 
+@pytest.mark.system
 def test_ancestors_lead_back_through_both_resamplings():
     particles = jnp.stack([jnp.arange(8.0), jnp.zeros(8)])
     ancestors = jnp.array([0, 0, 1, 3, 3, 3, 6, 7], dtype=jnp.int32)
@@ -151,6 +152,7 @@ def test_ancestors_lead_back_through_both_resamplings():
     np.testing.assert_array_equal(after[0], 3)
 
 
+@pytest.mark.system
 def test_the_gradient_of_the_evidence_is_that_of_the_closed_form_on_the_drawn_particles(x64):
     particles = moved(jax.random.key(5), 1000)
 

@@ -129,6 +129,7 @@ def test_joint_kalman_filter_has_the_papers_spread():
     np.testing.assert_allclose(np.sqrt(np.diagonal(covariances[-1])), [0.113, 2.27], rtol=0.004)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("name", "pose", "velocity", "evidence"), [("exact", 0.005, 0.05, 0.4), ("plug_in_corrected", 0.007, 0.07, 0.5)]
 )
@@ -232,6 +233,7 @@ def test_changing_the_unit_of_time_changes_nothing():
         np.testing.assert_allclose(milliseconds * 1e6, seconds, rtol=1e-12)
 
 
+@pytest.mark.system
 def test_without_information_exact_keeps_the_open_loop_spread_and_paper_loses_it():
     def flat(x, y):
         del x, y
@@ -252,6 +254,7 @@ def test_without_information_exact_keeps_the_open_loop_spread_and_paper_loses_it
     assert spread["plug_in"] < 0.8 * P[0, 0]
 
 
+@pytest.mark.system
 def test_own_and_shared_covariance_give_the_same_filter():
     ys = jnp.asarray(simulate(20), dtype=float)
     shared = run(make_filter(num_particles=200), jax.random.key(1), ys)[0]
@@ -317,6 +320,7 @@ def test_exactly_one_kind_of_observation():
             rao_blackwell(sample_prior, prior, dynamics, num_particles=8, noise_dim=1, **given)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("proposal", [exact, plug_in, plug_in_corrected])
 def test_gradient_is_finite(proposal):
     pf = make_filter(proposal, num_particles=50, ess_threshold=0.5)

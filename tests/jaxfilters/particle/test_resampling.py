@@ -38,6 +38,7 @@ def normalised(log_weights):
     return w / w.sum()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("name", SCHEMES)
 def test_ancestors_are_sorted_weighted_indices_with_the_counts_of_their_scheme(name, n):
@@ -121,6 +122,7 @@ def test_a_million_ancestors_are_those_of_exact_arithmetic(x64, dtype):
     assert np.mean(ancestors != expected) <= (1e-3 if dtype == jnp.float32 else 1e-8)
 
 
+@pytest.mark.system
 def test_running_totals_are_exact_and_never_decrease():
     rng = np.random.default_rng(1)
     w = (rng.random((500, 32)) ** 8 * (rng.random((500, 32)) < 0.7)).astype(np.float32)
@@ -137,6 +139,7 @@ def test_running_totals_are_exact_and_never_decrease():
     np.testing.assert_array_equal(prefix.running_count(jnp.asarray(counts)).ravel(), np.cumsum(counts))
 
 
+@pytest.mark.system
 def test_schemes_map_compile_and_pass_no_derivative(scheme):
     log_weights = jnp.stack([uneven(100, seed) for seed in range(3)], axis=-1)
     keys = jax.random.split(jax.random.key(1), 3)

@@ -66,6 +66,7 @@ def check_unbiased(runs):
         assert abs(unbiased.mean()) < 4 * unbiased.std(ddof=1) / np.sqrt(ratio.size)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("which", ["islands_0.0", "islands_0.5", "islands_1.0", "marginalised"])
 def test_evidence_and_posterior_are_unbiased_however_often_islands_exchange(found, which):
     check_unbiased(found[which])

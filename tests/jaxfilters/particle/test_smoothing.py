@@ -56,6 +56,7 @@ def filtered(key, num_particles, ys, controls):
     return run(pf, key, ys, controls, collect=keep_history)[1]
 
 
+@pytest.mark.system
 def test_both_smoothers_agree_with_the_joint_gaussian():
     # Means over independent runs; their bias, O(1/N), is far below four standard errors of the mean.
     ys, controls = simulate(0)

@@ -41,6 +41,7 @@ def link_vectors(hand, x):
     return links / np.linalg.norm(links, axis=2, keepdims=True)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("pivot_at_wrist", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_mirror_flips_the_depth_keeps_the_length_and_moves_the_tip_as_stated(seed, pivot_at_wrist, random_state):
@@ -62,6 +63,7 @@ def test_mirror_flips_the_depth_keeps_the_length_and_moves_the_tip_as_stated(see
         assert abs(float(mirrored.change)) <= np.pi
 
 
+@pytest.mark.system
 def test_amplitude_is_the_cosine_of_sight_and_finger_plane(random_state):
     hand = articulated_hand(five_fingers())
     x = jnp.asarray(random_state(np.random.default_rng(0), hand.layout))
@@ -108,6 +110,7 @@ def test_indices_may_be_traced(random_state):
             np.testing.assert_allclose(row, mirror(x, hand, finger, link).x, atol=1e-12)
 
 
+@pytest.mark.system
 def test_a_finger_plane_across_the_line_of_sight_has_finite_derivatives():
     # The palm's edge towards the camera: fingers bend within the image plane.
     q = Rotation.from_euler("y", -90, degrees=True) * Rotation.from_quat(FACING, scalar_first=True)

@@ -57,6 +57,7 @@ def test_line_and_its_derivatives_have_the_analytic_form(seed):
     np.testing.assert_allclose(np.stack(slopes.rho), [(1 - share) * n, share * n], atol=1e-12)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_lines_without_length_have_finite_derivatives(dtype):
     p = jnp.array([3.0, -4.0], dtype)

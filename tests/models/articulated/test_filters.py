@@ -128,6 +128,7 @@ def test_a_pose_that_is_held_teaches_nothing_more(hand, limits):
     assert nees.sum() < stats.chi2.ppf(1 - 1e-4, 24)
 
 
+@pytest.mark.system
 def test_the_evidence_of_a_mode_is_that_of_the_innovation_where_the_image_is_linear(x64, limits):
     hand = synthetic.paper_hand()
     sequence = synthetic.simulate_paper(jax.random.key(0))
@@ -187,6 +188,7 @@ def test_both_poses_of_one_link_are_found_from_separated_points(x64):
     assert abs(np.rad2deg(math.sqrt(belief.covariance[1, 1])) - 1.48) < 0.1
 
 
+@pytest.mark.system
 def test_a_limit_on_the_length_narrows_the_angle(x64):
     # Figures 2 and 3 (E3): a link of unknown length and angle to the image plane, against its posterior on a grid.
     intervals = []
@@ -225,6 +227,7 @@ def _grid_posterior(link):
     return means, deviations, (density * off[0] * off[1]).sum() / math.prod(deviations)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("frame", "estimates"), [(16, 1), (18, 2), (20, 1)])
 def test_two_estimates_at_the_critical_pose_of_which_limits_leave_one_two_frames_on(limits, frame, estimates):
     # Figures 8 and 9 (E4) by the paper's filter, with the first finger in the plane of the line of sight and features
@@ -285,6 +288,7 @@ def _keep_counts(state, info):
     return info.num_hypotheses, jnp.sum(info.fates[:, 1:3] != gaussian_sum.UNUSED)
 
 
+@pytest.mark.system
 def test_a_feature_far_from_its_prediction_is_left_out(hand, limits):
     sequence = synthetic.simulate_paper(jax.random.key(2))
     prior = Gaussian(sequence.states[0], 1e-4 * jnp.eye(LAYOUT.size))

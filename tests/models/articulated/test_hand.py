@@ -71,6 +71,7 @@ def test_distances_of_lines_are_measured_from_the_origin(random_state, x64):
     np.testing.assert_allclose(moved, expected, atol=1e-11)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     "hand_of", [two_fingers, lambda: articulated_hand(Layout(2, 3), projection=Perspective(camera()))]
 )
@@ -88,6 +89,7 @@ def test_derivative_of_observe_is_that_of_central_differences(seed, hand_of, ran
     np.testing.assert_allclose(difference / np.abs(slope).max(), slope / np.abs(slope).max(), atol=1e-8)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("x64_on", [True, False])
 def test_values_and_derivatives_are_finite_for_lines_without_length(x64_on):
     with jax.enable_x64(x64_on):
@@ -146,6 +148,7 @@ def test_noise_of_the_observation_follows_the_rows():
     np.testing.assert_allclose(hand.observation_noise(), np.diag(std**2), rtol=1e-6)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("position_size", [2, 3])
 @pytest.mark.parametrize("features", [FULL, PAPER_EXPERIMENT, KEYPOINTS])
 def test_five_fingers_have_consistent_shapes(features, position_size, random_state):

@@ -53,6 +53,7 @@ def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
     np.testing.assert_array_equal(after[layout.static], x[layout.static])
 
 
+@pytest.mark.system
 def test_angles_that_nobody_sees_come_to_the_spread_of_hands():
     layout = five_fingers()
     ease = relaxed_angles(layout).ravel()

@@ -123,6 +123,7 @@ def features_of(image, pose):
     return rows
 
 
+@pytest.mark.system
 def test_axes_and_tips_of_protrusions_are_those_of_the_fingers(hand, states, measured):
     y, mask = measured
     residual = np.asarray(jax.vmap(hand.residual)(y, jax.vmap(hand.observe)(states)))
@@ -136,6 +137,7 @@ def test_axes_and_tips_of_protrusions_are_those_of_the_fingers(hand, states, mea
     assert np.asarray(mask)[:, kinds == "alpha"].mean(axis=0).min() > 0.6
 
 
+@pytest.mark.system
 def test_lengths_and_angles_are_found_from_a_silhouette(hand, states, measured):
     y, mask = measured
     free = np.zeros(LAYOUT.size, bool)

@@ -47,6 +47,7 @@ def face(plane_scene, x64):
     return Registered(plane_scene)
 
 
+@pytest.mark.system
 def test_shifts_by_fractions_of_a_pixel_are_found(face):
     """Patches that are moved across the line of sight; 0.02 px are what bilinear interpolation of the waves leaves."""
     rng = np.random.default_rng(0)
@@ -91,6 +92,7 @@ def noisy(face, pose, std, draws, smooth=0.0):
     return jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(key, draws))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("std", [3.0, 10.0])
 def test_covariances_are_honest_about_white_noise(face, std):
     """Variances of 200 alignments of 12 landmarks: the mean of 2400 squares is within 4 sqrt(2 / 2400) = 12 % of them.
@@ -147,6 +149,7 @@ def test_places_follow_the_slopes_as_derivatives_say(face, head_poses):
         np.testing.assert_allclose(difference, size * found.by_slope[..., axis], atol=0.05 * 0.02)
 
 
+@pytest.mark.system
 def test_slopes_that_are_learnt_are_those_of_the_planes(plane_scene, head_poses, x64):
     """Normals that are up to 20 degrees wrong; the rise is measured along the first camera's line of sight."""
     assumed = plane_scene.normals + np.random.default_rng(6).uniform(-0.25, 0.25, (6, 3))

@@ -186,6 +186,7 @@ def test_a_point_behind_the_camera_is_a_large_residual_and_no_nan(x64):
     assert np.isfinite(_residuals(face(), rig(), views_of(preset()), behind, HELD)).all()
 
 
+@pytest.mark.system
 def test_a_past_is_the_gaussian_that_it_says(x64):
     """Energies of two people differ by what was measured, also where that tells nothing of a direction."""
     rng = np.random.default_rng(11)
@@ -208,6 +209,7 @@ def test_a_past_is_the_gaussian_that_it_says(x64):
     assert added[0] - added[1] == pytest.approx(told(true) - told(other), rel=1e-4)
 
 
+@pytest.mark.system
 def test_a_past_that_tells_nothing_changes_nothing(x64):
     views = views_of(truth(13), noise=np.random.default_rng(2).normal(0, 1, (NUM, 10, 2)))
     one, _ = _adjusted(views, preset(), HELD)

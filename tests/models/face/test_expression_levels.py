@@ -53,6 +53,7 @@ def test_wrong_sequences_are_refused():
         sampled_levels(neutral[None] * jnp.nan, neutral, mouth_width)
 
 
+@pytest.mark.system
 def test_people_are_aligned_whatever_their_heads_did(x64):
     draw = np.random.default_rng(3)
     straight = generator_shapes(jax.random.key(0), people_of(jax.random.key(1), 4), 0.0)

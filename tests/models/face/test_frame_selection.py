@@ -114,6 +114,7 @@ def test_what_a_frame_tells_is_the_schur_complement(x64, scene):
     np.testing.assert_allclose(found.information, N[11:, 11:] - cross.T @ np.linalg.solve(own, cross), atol=2e-5)
 
 
+@pytest.mark.system
 def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, scene):
     face, rig, view, frame = scene
     found = told(face, rig, view, frame, Prior(1.0, 0.8))

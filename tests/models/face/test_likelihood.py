@@ -90,6 +90,7 @@ def slopes(images, templates, uv):
     return jax.grad(lambda uv: jnp.sum(likelihood.scores(images, templates, uv)))(uv)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("spread", [10.0, 90.0])
 def test_scores_can_be_differentiated(x64, spread):
     images, templates, uv = scene(spread, num=6, dtype=jnp.float64)

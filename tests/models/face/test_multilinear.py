@@ -93,6 +93,7 @@ def test_rows_of_the_factors_reproduce_the_training_faces(x64, tensor, model):
         np.testing.assert_allclose(covariance, sample + least * np.eye(len(sample)), atol=1e-12)
 
 
+@pytest.mark.system
 def test_as_many_parameters_as_examples_have_a_covariance_of_full_rank():
     """Five expressions in five parameters: their sample covariance alone is singular."""
     shapes = generator_shapes(jax.random.key(3), people_of(jax.random.key(2), 6))[:, :5]
@@ -150,6 +151,7 @@ def test_missing_faces_are_completed(x64, shapes, model):
     np.testing.assert_allclose(with_all.tensor, model.tensor, atol=1e-9)
 
 
+@pytest.mark.system
 def test_a_person_is_fitted_and_an_unknown_one_less_well(x64, tensor, model):
     known = []
     for person in range(3):

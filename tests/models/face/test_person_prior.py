@@ -71,6 +71,7 @@ def variance_of_sizes():
     return slope @ face().identity_covariance @ slope
 
 
+@pytest.mark.system
 def test_near_the_mean_person_the_identity_is_as_likely_as_its_covariance_says(x64):
     rng = np.random.default_rng(0)
     apart = 1e-4 * np.asarray(face().identity_std) * rng.normal(size=12)

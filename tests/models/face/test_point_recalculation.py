@@ -98,6 +98,7 @@ def test_a_window_beyond_the_border_stays_at_the_estimate(scene):
     assert np.isfinite(info.residual[1:]).all()
 
 
+@pytest.mark.system
 def test_rendered_landmarks_are_found_from_four_pixels_away():
     """Oracle 14: one face, and another frame of it a moment later; 0.27 px were reached by the specification's."""
     rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))

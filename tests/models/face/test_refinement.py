@@ -118,6 +118,7 @@ def some_seen():
     return jnp.ones((2, 10), bool).at[0, 3].set(False).at[:, 7].set(False)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("outlier", [0.0, 3.0])
 def test_the_fit_is_the_least_squares_of_scipy(face, outlier):
     """The same Student residuals, a number each landmark, with the covariances at the solution.
@@ -186,6 +187,7 @@ def test_the_covariance_is_inverse_expected_information_and_a_bias_of_whole_imag
     )
 
 
+@pytest.mark.system
 def test_covariances_are_true_over_many_draws(face):
     """Errors over their covariance: 8 in the mean of 2000 Gaussian draws.
 
@@ -215,6 +217,7 @@ def test_covariances_are_true_over_many_draws(face):
     assert 0.7 * LOOSE_STD**2 < np.asarray(excess).mean() < 2 * LOOSE_STD**2
 
 
+@pytest.mark.system
 def test_covariances_are_true_under_the_noise_of_student(face):
     """Landmarks whose four rows together are as long as Student's t makes them; 2000 draws of eight numbers.
 
@@ -246,6 +249,7 @@ def test_covariances_are_true_under_the_noise_of_student(face):
     assert np.asarray(misfit).mean() == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.system
 def test_only_alignments_tell_their_misfit(face):
     """Errors of landmarks twice as large as claimed; a looseness hides them but across the epipolar lines."""
 

@@ -21,6 +21,7 @@ def taught():
         return learn(shapes, identities=8, expressions=4), shapes
 
 
+@pytest.mark.system
 def test_the_covariance_is_what_the_estimates_scatter_by(x64, taught):
     """200 people of the model with four expressions each, and noise of `MEASURED_MM`.
 
@@ -44,6 +45,7 @@ def test_the_covariance_is_what_the_estimates_scatter_by(x64, taught):
     assert np.sqrt(np.mean(np.square(left_over))) < 0.6 * MEASURED_MM
 
 
+@pytest.mark.system
 def test_a_training_person_is_known_within_the_training_noise(x64, taught):
     """Its mean face, from identity and offset with the mean expression of the training set."""
     face, shapes = taught
@@ -61,6 +63,7 @@ def test_a_training_person_is_known_within_the_training_noise(x64, taught):
         assert np.sqrt(np.mean(missing**2)) < 0.6
 
 
+@pytest.mark.system
 def test_hypotheses_are_the_model_and_one_of_each_person(x64, taught):
     face, shapes = taught
     known = remember(face, shapes[:3])

@@ -164,6 +164,7 @@ def slope_of_log_likelihood(pose_and_scale, camera, observed):
     return gibbs_sq(costs, 0.02) + gibbs_abs(costs, 0.02)
 
 
+@pytest.mark.system
 def test_gradient_of_rendering_and_cost_is_finite(random_pose):
     rng = np.random.default_rng(0)
     camera = kinect_v2().crop(jnp.array([192.0, 148.0]), (64, 64), 2)

@@ -16,6 +16,7 @@ TESSELLATIONS = {608: dict(), 1520: dict(sections=10, latitudes=1)}
 EXACT = 1e-14
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", SEEDS)
 def test_part_frames_match_homogeneous_matrices(seed, random_pose, phalanx_frames_oracle):
     pose = random_pose(np.random.default_rng(seed))

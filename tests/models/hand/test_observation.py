@@ -34,6 +34,7 @@ def test_a_window_holds_the_pixels_its_camera_says(stride, center):
     assert np.all(np.abs(corner + stride * np.array([14.5, 9.5]) - middle) <= 0.5 + 1e-3)
 
 
+@pytest.mark.system
 def test_only_the_hand_is_left():
     depth = np.array(render(CAMERA, POSE))
     scene = np.where(np.isinf(depth), 2.0, depth)
@@ -51,6 +52,7 @@ def test_only_the_hand_is_left():
     np.testing.assert_array_equal(kept[hand], scene[hand])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("cost_of", [union, rendered])
 @pytest.mark.parametrize("form", [gibbs_abs, gibbs_sq])
 def test_the_true_pose_is_the_most_likely(cost_of, form):
@@ -63,6 +65,7 @@ def test_the_true_pose_is_the_most_likely(cost_of, form):
     assert np.all(values[1:] < values[0] - 0.03)
 
 
+@pytest.mark.system
 def test_angles_beyond_their_limits_are_unlikely():
     image = hand_image(CAMERA, render(CAMERA, POSE))
     likelihood = HandLikelihood(CapsuleHand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)
@@ -72,6 +75,7 @@ def test_angles_beyond_their_limits_are_unlikely():
     np.testing.assert_allclose(difference, -0.5 * 3.0**2 - cost, rtol=1e-4)
 
 
+@pytest.mark.system
 def test_a_triangle_hand_is_likeliest_where_the_capsules_are_and_grows_with_its_scale():
     image = hand_image(CAMERA, render(CAMERA, POSE))
     mesh = HandLikelihood(triangle_hand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)

@@ -46,6 +46,7 @@ def test_size_and_noise_of_a_rendered_hand_are_learnt_through_the_renderer():
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.15)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("softness", [0.05, 40.0])
 def test_the_density_is_that_of_a_pixel_worked_out_by_hand(softness):
     """One pixel that the hand covers, wholly or in part, with a reading 4 mm off, background, or none."""

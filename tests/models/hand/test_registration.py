@@ -50,6 +50,7 @@ def test_nearest_hand_pixel_by_brute_force():
     assert np.isfinite(observed.ravel()[nearest]).all()
 
 
+@pytest.mark.system
 def test_gradient_of_the_surface_term_against_finite_differences():
     # Outline and front off: what is left is smooth where no pixel changes its closest capsule. Weights are held fixed
     # (iteratively reweighted least squares), which a wide robust function makes exact to (residual / width)^2 = 1e-4.
@@ -80,6 +81,7 @@ def test_gradient_of_the_surface_term_against_finite_differences():
         np.testing.assert_allclose(gradient, numeric, rtol=1e-3, atol=1e-3 * float(jnp.abs(numeric).max()))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(4))
 def test_a_displaced_hand_is_pulled_back(seed):
     # Displaced by 8 mm, 0.1 rad and 8 degrees in every coordinate, seen in pixels that are 8 mm wide.
@@ -110,6 +112,7 @@ def search(observed, sighting):
     return find_start(NEAR_CAMERA, observed, sighting, likelihood, jnp.asarray(SCALES))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_a_hand_of_unknown_size_is_found_without_a_start(scale):
     truth = open_palm(jnp.array([0.02, 0.09, 0.7])).at[7:].set(jnp.tile(jnp.deg2rad(jnp.array([5.0, 8.0, 12.0])), 5))

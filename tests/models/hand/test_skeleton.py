@@ -127,6 +127,7 @@ def test_left_thumb_of_an_open_palm_is_on_the_left():
     assert joints[JOINT_NAMES.index("thumb_4"), 0] < joints[JOINT_NAMES.index("little_4"), 0]
 
 
+@pytest.mark.system
 def test_scale_stretches_the_hand_from_the_wrist(random_pose):
     pose = random_pose(np.random.default_rng(0))
     scaled = forward_kinematics(jnp.asarray(pose), hand_geometry().scaled(1.2))
@@ -172,6 +173,7 @@ def test_retract_turns_about_the_axes_of_the_palm():
     assert fingers[2] == pytest.approx(-0.095, abs=1e-12)
 
 
+@pytest.mark.system
 def test_vmap_over_the_last_axis_equals_a_loop(random_pose):
     rng = np.random.default_rng(0)
     poses = jnp.asarray(np.stack([random_pose(rng) for _ in range(7)], axis=-1))
@@ -182,6 +184,7 @@ def test_vmap_over_the_last_axis_equals_a_loop(random_pose):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[..., i], b, atol=EXACT), mapped, single)
 
 
+@pytest.mark.system
 def test_derivative_is_that_of_central_differences(random_pose):
     pose = jnp.asarray(random_pose(np.random.default_rng(1)))
     geometry = hand_geometry()

@@ -132,6 +132,7 @@ def test_faces_are_neutral_and_then_move_as_recorded():
     np.testing.assert_allclose(course[75], [0.75, 0.1])
 
 
+@pytest.mark.system
 def test_attributes_are_linear_on_every_triangle():
     """An attribute that is linear in space has at each pixel its value at the point that the depth image shows."""
     draw = np.random.default_rng(3)
@@ -173,6 +174,7 @@ def test_the_landmarks_of_the_mean_face_are_those_of_the_specification(ict):
         assert width.max() < 45
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_recorded_faces_open_their_mouths_and_turn(ict, data_dir):
     strengths = livelink_course(read_livelink(data_dir / "livelinkface_take", ict.names), 300)
@@ -191,6 +193,7 @@ def test_recorded_faces_open_their_mouths_and_turn(ict, data_dir):
     assert np.all(sequence.uv68[0, :, 8, 1] > sequence.uv[0, :, :, 1].max(axis=1))
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_a_cascade_for_real_faces_finds_rendered_ones(ict):
     """Eight of ten people or more; the box holds the eyes and the mouth."""

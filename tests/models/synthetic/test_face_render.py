@@ -58,6 +58,7 @@ def expected_patches(scene, camera, pixels):
     return total
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("camera", [0, 1])
 def test_patches_are_where_their_planes_meet_the_rays(scene, added, camera):
     """Noise of a difference of means: 0.71; its rms over 200 pixels is below 0.86 (4 sigma of the rms)."""
@@ -70,6 +71,7 @@ def test_patches_are_where_their_planes_meet_the_rays(scene, added, camera):
     assert np.sqrt(np.mean(error**2)) < 0.86
 
 
+@pytest.mark.system
 def test_the_projected_landmark_is_the_centre_of_its_patch(scene):
     """One bright spot in place of waves: its weighted centre is within 0.15 px of the projection where planes face us.
 

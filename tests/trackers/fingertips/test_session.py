@@ -54,6 +54,7 @@ def circle(n):
     return np.stack([320 + 80 * np.cos(angle), 300 - 80 * np.sin(angle)], axis=1)
 
 
+@pytest.mark.system
 def test_a_stroke_with_the_thumb_folded_is_a_symbol_in_its_place():
     strokes = []
 

@@ -164,6 +164,7 @@ def play(frames, state=None):
 INDEX, MIDDLE, THUMB = (-39.0, -108.0), (0.0, -125.0), (-80.0, -45.0)
 
 
+@pytest.mark.system
 def test_a_finger_is_given_up_when_its_prediction_is_too_uncertain():
     """After six misses while the palm is seen; who comes back has a new name."""
     both, one = shown([INDEX, MIDDLE]), shown([MIDDLE])

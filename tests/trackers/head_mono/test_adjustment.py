@@ -174,6 +174,7 @@ def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
     assert bool(does)
 
 
+@pytest.mark.system
 def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, seen):
     """Pose and expression are solved for anew for 4000 persons drawn from the posterior, with a linear camera.
 

@@ -68,6 +68,7 @@ def bin_of(value):
     return int(BINS * np.sqrt(value / 256))
 
 
+@pytest.mark.system
 def test_shirts_and_trousers_are_told_apart(found):
     """Nearly all of either half has one colour: at the waist the drawn line and the middle of the outline differ."""
     histograms, good = found[0]()

@@ -159,6 +159,7 @@ def test_the_score_never_decreases_within_a_frame(scene):
         np.testing.assert_allclose(report.score[0], score(silhouette(state.xy[0]), silhouette(point)), rtol=1e-5)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("region", [None, around_candidates])
 def test_the_order_of_people_who_are_apart_means_nothing(region):
     """Oracle 14."""
@@ -170,6 +171,7 @@ def test_the_order_of_people_who_are_apart_means_nothing(region):
     np.testing.assert_allclose(first.xy, second.xy[::-1], atol=1e-5)
 
 
+@pytest.mark.system
 def test_either_nesting_of_the_loops_follows_two_people():
     truth, starts = [(-1.3, 1.2), (-0.8, 1.7)], [(-1.2, 1.3), (-0.7, 1.65)]
     for turns in (PaperConfig().turns, people_outside):
@@ -235,6 +237,7 @@ def test_endpoints_are_those_of_the_specification():
     np.testing.assert_allclose(foot, [109, 132.9], atol=0.1)
 
 
+@pytest.mark.system
 def test_obstacles_hide_people_by_distance_on_the_floor_or_by_depth():
     """A wall 0.8 m high hides the legs of whoever is behind it; both measures agree for upright things."""
     floor, pixel = scene_of(patches=WALL), scene_of(patches=WALL, occlusion=PER_PIXEL)

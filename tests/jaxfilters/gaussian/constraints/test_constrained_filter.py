@@ -75,6 +75,7 @@ def test_the_evidence_is_that_of_the_data_and_of_the_inequalities(x64):
     np.testing.assert_allclose(infos.least_distance[0], (0.5 - 0.2) / np.sqrt(1 / 3), rtol=1e-9)
 
 
+@pytest.mark.system
 def test_gradients_pass_through(x64):
     @jax.jit
     @jax.value_and_grad

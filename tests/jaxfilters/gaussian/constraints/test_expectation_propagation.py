@@ -65,6 +65,7 @@ def strip(points=400):
     return mean, np.array([density @ x**2, density @ (given.var() + given.mean() ** 2)]) / mass - mean**2, mass
 
 
+@pytest.mark.system
 def test_one_row_is_met_exactly(x64, rng, form):
     belief = form(rng.normal(size=5), rng.normal(size=(5, 5)))
     normal = rng.normal(size=5)
@@ -168,6 +169,7 @@ def observe(belief, y, H, deviation):
     return arithmetic.update(belief, jnp.atleast_1d(y), jnp.asarray(H)[None], jnp.atleast_2d(noise))
 
 
+@pytest.mark.system
 def test_sites_carried_between_measurements_are_as_good_as_all_at_once(x64, rng, form):
     prior = form(rng.normal(size=5), rng.normal(size=(5, 5)))
     _, _, A, a, b = (x[0] for x in random_boxes(rng, 1))
@@ -237,6 +239,7 @@ def test_rows_that_cannot_be_met_are_named_and_nothing_is_nan(x64, form, dtype):
     np.testing.assert_allclose(info.distances, constraint_distances(belief, constraints))
 
 
+@pytest.mark.system
 def test_gradients_are_finite_where_nothing_can_be_met(x64):
     belief, constraints = contradictory(lambda mean, root: Gaussian(jnp.asarray(mean), jnp.asarray(root**2)), "float32")
     total = lambda belief, constraints: sum(
@@ -273,6 +276,7 @@ def test_float32_agrees_with_float64_and_keeps_a_covariance(x64, rng, form):
     assert max(mass_errors) < 0.5
 
 
+@pytest.mark.system
 def test_gradients_agree_with_differences(x64, rng, form):
     m, root, A, a, b = (x[0] for x in random_boxes(rng, 1))
     a = np.maximum(a, -20)
@@ -308,6 +312,7 @@ def test_damping_and_patience_change_the_way_and_not_the_result(x64, rng, form):
     assert (int(hasty.sweeps), bool(hasty.converged)) == (2, False)
 
 
+@pytest.mark.system
 def test_beliefs_map_over_any_axis_and_compile_once(rng, form):
     traces = []
     means, roots, normals, lower, upper = random_boxes(rng, 4)

@@ -107,6 +107,7 @@ def test_a_narrow_interval_has_the_variance_of_a_uniform_variable(x64, start):
     np.testing.assert_allclose(log_mass, np.log(width) - middle**2 / 2 - np.log(2 * np.pi) / 2, rtol=1e-10)
 
 
+@pytest.mark.system
 def test_moments_are_continuous_where_the_method_changes(x64):
     # From narrow to wide, and along the tail, through every change of method: no step beyond rounding.
     width = jnp.linspace(0.2, 4, 2001)
