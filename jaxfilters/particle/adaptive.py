@@ -114,7 +114,7 @@ def adaptive_diffusion(
         steady_std: Standard deviations `(d - m,)` of the random walks; `None` if m = d.
         low: Lower limit of the standard deviation, in each coordinate's unit per unit of time; a number or `(m,)`.
         high: Upper limit of the same.
-        update_fit: `diffusion.update`, `diffusion.fixed`, or `jax.tree_util.Partial(diffusion.update, forgetting=0.99)`.
+        update_fit: `diffusion.update`, `diffusion.fixed`, or a partial of the former with a `forgetting` below 1.
         partitions: Evaluates every observation in two stages, see `Partitions`; `None` in one.
         mode_distance: Argument `distance` of `mean_around_mode`.
         scheme: Function of `jaxfilters.resampling`; of `jaxfilters.differentiable_resampling` also `soft(...)`, and

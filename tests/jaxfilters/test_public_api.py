@@ -1,5 +1,7 @@
 """Every filter by its public name: built, run and differentiated with nothing imported but `jaxfilters as jf`."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -173,6 +175,14 @@ def test_every_public_name_can_be_loaded():
     for name in jf.__all__:
         assert getattr(jf, name) is not None
     assert set(jf.__all__) <= set(dir(jf))
+
+
+def test_every_builder_has_cases_of_bad_input():
+    text = "".join(path.read_text() for path in Path(__file__).with_name("bad_input").glob("test_*.py"))
+    functions = [name for name in jf.__all__ if type(getattr(jf, name)).__name__ == "function"]
+    assert len(functions) > 15
+    built = [name for name in functions if name not in ("keep_all", "keep_info", "init", "step", "predict", "update")]
+    assert not [name for name in built if f"jf.{name}(" not in text]
 
 
 def test_a_name_of_the_previous_version_says_what_it_is_called_now():
