@@ -13,6 +13,8 @@ Example:
     [0 0 1]
 """
 
+from jaxfilters.hmm.decoding import Path as Path
+from jaxfilters.hmm.decoding import viterbi as viterbi
 from jaxfilters.hmm.emissions import Codes as Codes
 from jaxfilters.hmm.emissions import DiagonalGaussian as DiagonalGaussian
 from jaxfilters.hmm.emissions import Emission as Emission
@@ -35,13 +37,11 @@ from jaxfilters.hmm.online import ChainInfo as ChainInfo
 from jaxfilters.hmm.online import ChainState as ChainState
 from jaxfilters.hmm.online import online as online
 from jaxfilters.hmm.recursions import Filtered as Filtered
-from jaxfilters.hmm.recursions import Path as Path
 from jaxfilters.hmm.recursions import Posterior as Posterior
 from jaxfilters.hmm.recursions import backward as backward
 from jaxfilters.hmm.recursions import forward as forward
 from jaxfilters.hmm.recursions import log_evidence as log_evidence
 from jaxfilters.hmm.recursions import posterior as posterior
-from jaxfilters.hmm.recursions import viterbi as viterbi
 from jaxfilters.hmm.spotting import Candidate as Candidate
 from jaxfilters.hmm.spotting import SpotterInfo as SpotterInfo
 from jaxfilters.hmm.spotting import SpotterState as SpotterState

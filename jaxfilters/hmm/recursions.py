@@ -1,4 +1,4 @@
-r"""The forward, backward, forward-backward and Viterbi recursions, from log-likelihoods of the states.
+r"""The forward, backward and forward-backward recursions, from log-likelihoods of the states.
 
 Probabilities are scaled, and their scales are added as logarithms: with $e_t(j) = \log p(y_t \mid s_t = j)$
 
@@ -6,7 +6,8 @@ $$\log \alpha_t(j) = \log \sum_i \alpha_{t-1}(i) A_{ij} + e_t(j)$$
 
 where the sum is a matrix product and $\alpha$ is rescaled by about its largest element in every frame (L. Rabiner,
 "A tutorial on hidden Markov models", Proc. IEEE 77(2), 1989, equations 19-35). A state whose log probability is 147
-nats below that of the best one in float32, 1000 in float64, counts as impossible; `viterbi` has no such limit.
+nats below that of the best one in float32, 1000 in float64, counts as impossible; `viterbi` has no such
+limit.
 
 `log_likelihoods` are `(T, Q)`, or `(T, Q, n)` for n sequences: with the sequences last this is vector arithmetic, a
 third faster than `vmap` over a first axis, which works as well. NaN counts as `-inf`. `lengths` (n,) are the numbers of
@@ -23,15 +24,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Array, Float
 
-from jaxfilters.hmm.model import HiddenMarkovModel, check_model
+from jaxfilters.hmm.log_likelihoods import Lengths, as_column, check_shapes, inside_sequences, usable
+from jaxfilters.hmm.model import HiddenMarkovModel
 
-_UNROLLED = 16
-"""Largest number of states for which the Viterbi maximum is written out as operations on vectors."""
 _BLOCK = 16
 """Number of frames whose scales are added together: operations on many frames at once use longer vectors."""
-Lengths = Int[Array, "*batch"] | None
 
 
 class Filtered(NamedTuple):
@@ -56,15 +55,6 @@ class Posterior(NamedTuple):
     """Expected number of transitions from i to j at [i, j], summed over the sequences."""
 
 
-class Path(NamedTuple):
-    """The most probable sequence of states, the Viterbi path."""
-
-    states: Int32[Array, "t *batch"]
-    """-1 in padding and for impossible sequences."""
-    log_probability: Float[Array, "*batch"]
-    """Joint log probability log p(s_1:T, y_1:T) of the path and the observations."""
-
-
 @jax.jit
 def log_evidence(
     model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"], lengths: Lengths = None
@@ -86,7 +76,7 @@ def log_evidence(
     Raises:
         ValueError: If the shapes do not match.
     """
-    _check(model, log_likelihoods, lengths)
+    check_shapes(model, log_likelihoods, lengths)
     return _log_evidence(model.log_initial, model.log_transition, log_likelihoods, lengths)
 
 
@@ -105,9 +95,9 @@ def forward(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"
         >>> print(jf.hmm.forward(model, log_likelihoods).probabilities.shape)
         (3, 2)
     """
-    _check(model, log_likelihoods, lengths)
+    check_shapes(model, log_likelihoods, lengths)
     total, scaled, shifts = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths)
-    inside = _inside(log_likelihoods, lengths)
+    inside = inside_sequences(log_likelihoods, lengths)
     sums = jnp.sum(scaled, axis=1)
     before = jnp.concatenate([jnp.ones_like(sums[:1]), sums[:-1]])
     alive = before > 0
@@ -131,15 +121,15 @@ def backward(
     Raises:
         ValueError: If the shapes do not match.
     """
-    _check(model, log_likelihoods, lengths)
+    check_shapes(model, log_likelihoods, lengths)
     if len(log_likelihoods) < 2:
         return jnp.zeros_like(log_likelihoods)
     A = jnp.exp(model.log_transition)
-    inside = _inside(log_likelihoods, lengths)
+    inside = inside_sequences(log_likelihoods, lengths)
 
     def step(following: Array, inputs: tuple) -> tuple[Array, Array]:
         frame, is_inside = inputs
-        scaled, shift = _scaled(following + _usable(frame))
+        scaled, shift = _scaled(following + usable(frame))
         log_beta = jnp.where(is_inside, jnp.log(_matmul(A, scaled)) + shift, 0.0)
         return log_beta, log_beta
 
@@ -159,101 +149,24 @@ def posterior(
     Raises:
         ValueError: If the shapes do not match.
     """
-    _check(model, log_likelihoods, lengths)
+    check_shapes(model, log_likelihoods, lengths)
     A = jnp.exp(model.log_transition)
     total, scaled, _ = _forward(model.log_initial, model.log_transition, log_likelihoods, lengths)
-    inside = _inside(log_likelihoods, lengths)
+    inside = inside_sequences(log_likelihoods, lengths)
     states, ratios = _smoothed(A, scaled, inside)
     return Posterior(total, states, _expected_transitions(A, scaled, ratios))
-
-
-@jax.jit
-def viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"], lengths: Lengths = None) -> Path:
-    """The Viterbi algorithm: the most probable sequence of states, or any of several equally probable ones.
-
-    Arguments are those of `log_evidence`.
-
-    Raises:
-        ValueError: If the shapes do not match.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> import jaxfilters as jf
-        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
-        >>> log_likelihoods = jnp.log(jnp.array([[0.9, 0.1], [0.6, 0.4], [0.01, 0.99]]))
-        >>> print(jf.hmm.viterbi(model, log_likelihoods).states)
-        [0 0 1]
-    """
-    _check(model, log_likelihoods, lengths)
-    inside = _inside(log_likelihoods, lengths)
-    initial = _column(model.log_initial, log_likelihoods)
-
-    def step(best: Array, inputs: tuple) -> tuple[Array, Array]:
-        frame, is_first, is_inside = inputs
-        reached, origin = best_predecessor(best, model.log_transition)
-        after = jnp.where(is_first, initial, reached) + _usable(frame)
-        return jnp.where(is_inside, after, best), origin
-
-    def back(state: Array, inputs: tuple) -> tuple[Array, Array]:
-        origin, is_inside = inputs
-        earlier = jnp.take_along_axis(origin, state[None], axis=0)[0].astype(jnp.int32)
-        return jnp.where(is_inside, earlier, state), state
-
-    start = jnp.zeros((len(initial), *inside.shape[1:]), log_likelihoods.dtype)
-    is_first = jnp.arange(len(log_likelihoods)) == 0
-    best, origins = jax.lax.scan(step, start, (log_likelihoods, is_first, inside))
-    last = jnp.argmax(best, axis=0).astype(jnp.int32)
-    _, states = jax.lax.scan(back, last, (origins, inside), reverse=True)
-    log_probability = jnp.max(best, axis=0)
-    return Path(jnp.where(inside & (log_probability > -jnp.inf), states, -1), log_probability)
-
-
-def best_predecessor(
-    score: Float[Array, "q *batch"], log_transition: Float[Array, "q q"]
-) -> tuple[Float[Array, "q *batch"], Int[Array, "q *batch"]]:
-    """The best score with which each state is reached in one transition, and its predecessor, the first of equals."""
-    num_states = len(score)
-    steps = log_transition.reshape(num_states, num_states, *[1] * (score.ndim - 1))
-    if num_states > _UNROLLED:
-        reached = score[:, None] + steps
-        return jnp.max(reached, axis=0), jnp.argmax(reached, axis=0).astype(jnp.int32)
-    # A running maximum over whole vectors, because a reduction that also returns the index is not vectorised.
-    best = score[0] + steps[0]
-    origin = jnp.zeros(best.shape, jnp.int8)
-    for i in range(1, num_states):
-        candidate = score[i] + steps[i]
-        better = candidate > best
-        best, origin = jnp.where(better, candidate, best), jnp.where(better, jnp.int8(i), origin)
-    return best, origin
-
-
-def _check(model: HiddenMarkovModel, log_likelihoods: Array, lengths: Array | None) -> None:
-    """Reject shapes that do not match, at trace time."""
-    check_model(model)
-    shape, num_states = jnp.shape(log_likelihoods), model.log_initial.shape[0]
-    if len(shape) < 2 or shape[1] != num_states:
-        raise ValueError(
-            f"log_likelihoods must be (T, Q) or (T, Q, n) with the {num_states} states of the model; got {shape}."
-        )
-    if lengths is None:
-        return
-    if jnp.shape(lengths) != shape[2:] or not jnp.issubdtype(jnp.result_type(lengths), jnp.integer):
-        raise ValueError(
-            f"lengths must be integers {shape[2:]}, one for each sequence of log_likelihoods {shape}; "
-            f"got {jnp.result_type(lengths)} {jnp.shape(lengths)}."
-        )
 
 
 @jax.custom_vjp
 def _log_evidence(log_initial, log_transition, log_likelihoods, lengths):
     step = _step(log_initial, log_transition, log_likelihoods)
     num_frames, batch = len(log_likelihoods), log_likelihoods.shape[2:]
-    inside = None if lengths is None else _inside(log_likelihoods, lengths)
+    inside = None if lengths is None else inside_sequences(log_likelihoods, lengths)
 
     def block(carry: tuple, first: Any, count: int = _BLOCK) -> tuple[tuple, None]:
         scaled, total = carry
         here = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, count)
-        frames, is_inside = _usable(here(log_likelihoods)), jax.tree.map(here, inside)
+        frames, is_inside = usable(here(log_likelihoods)), jax.tree.map(here, inside)
         scaled, shifts = jax.lax.scan(step, scaled, (frames, jnp.arange(count) + first == 0, is_inside))
         return (scaled, _add_compensated(total, jnp.sum(shifts, axis=0))), None
 
@@ -269,7 +182,7 @@ def _log_evidence(log_initial, log_transition, log_likelihoods, lengths):
 
 def _log_evidence_forward(log_initial, log_transition, log_likelihoods, lengths):
     total, scaled, _ = _forward(log_initial, log_transition, log_likelihoods, lengths)
-    return total, (log_transition, scaled, _inside(log_likelihoods, lengths))
+    return total, (log_transition, scaled, inside_sequences(log_likelihoods, lengths))
 
 
 def _log_evidence_backward(residuals, cotangent):
@@ -288,12 +201,12 @@ _log_evidence.defvjp(_log_evidence_forward, _log_evidence_backward)
 def _forward(log_initial, log_transition, log_likelihoods, lengths) -> tuple[Array, Array, Array]:
     """Log p(y_1:T), and for every frame the scaled probabilities and their log scale."""
     step = _step(log_initial, log_transition, log_likelihoods)
-    inside = None if lengths is None else _inside(log_likelihoods, lengths)
+    inside = None if lengths is None else inside_sequences(log_likelihoods, lengths)
 
     def accumulate(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
         scaled, total = carry
         frame, *rest = inputs
-        scaled, shift = step(scaled, (_usable(frame), *rest))
+        scaled, shift = step(scaled, (usable(frame), *rest))
         return (scaled, _add_compensated(total, shift)), (scaled, shift)
 
     zero = jnp.zeros(log_likelihoods.shape[2:], log_likelihoods.dtype)
@@ -306,7 +219,7 @@ def _forward(log_initial, log_transition, log_likelihoods, lengths) -> tuple[Arr
 def _step(log_initial, log_transition, log_likelihoods) -> Callable:
     """The function that advances scaled probabilities by one frame, from usable log-likelihoods."""
     A_transposed = jnp.exp(log_transition).T
-    initial = jnp.exp(_column(log_initial, log_likelihoods))
+    initial = jnp.exp(as_column(log_initial, log_likelihoods))
 
     def step(scaled: Array, inputs: tuple) -> tuple[Array, Array]:
         frame, is_first, is_inside = inputs
@@ -399,25 +312,6 @@ def _headroom(values: Array) -> float:
 def _normalized(values: Array, axis: int) -> Array:
     total = jnp.sum(values, axis=axis, keepdims=True)
     return jnp.where(total > 0, values / jnp.where(total > 0, total, 1.0), 0.0)
-
-
-def _usable(log_likelihoods: Array) -> Array:
-    return jnp.where(
-        jnp.isnan(log_likelihoods), -jnp.inf, jnp.minimum(log_likelihoods, jnp.finfo(log_likelihoods.dtype).max)
-    )
-
-
-def _inside(log_likelihoods: Array, lengths: Array | None) -> Bool[Array, "t *batch"]:
-    num_frames, batch = len(log_likelihoods), log_likelihoods.shape[2:]
-    if lengths is None:
-        return jnp.ones((num_frames, *batch), bool)
-    frames = jnp.arange(num_frames).reshape(-1, *[1] * len(batch))
-    return jnp.broadcast_to(frames < lengths, (num_frames, *batch))
-
-
-def _column(log_initial: Array, log_likelihoods: Array) -> Array:
-    """The initial log probabilities with one further axis for each axis of sequences."""
-    return log_initial.reshape(-1, *[1] * (log_likelihoods.ndim - 2))
 
 
 def _matmul(a: Array, b: Array) -> Array:

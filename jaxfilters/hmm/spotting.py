@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
+from jaxfilters.hmm.decoding import best_predecessor
 from jaxfilters.hmm.model import HiddenMarkovModel, check_model
 from jaxfilters.hmm.networks import Network, threshold_model
-from jaxfilters.hmm.recursions import best_predecessor
 from jaxfilters.typing import AnyKey
 
 
