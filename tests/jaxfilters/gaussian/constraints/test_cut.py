@@ -29,7 +29,7 @@ def covariance_of(belief):
 
 
 def transformed_cut(m, Q, phi, b):
-    """Equations 21 to 29 of Shimada et al. (1997), with two misprints corrected, and scipy's moments."""
+    """Equations 21 to 29 of Shimada et al. (1997), with its misprints corrected, and scipy's moments."""
     D, T = np.linalg.eigh(Q)
     w = np.sqrt(D) * (T.T @ phi)
     s = np.linalg.norm(w)
@@ -92,7 +92,7 @@ def test_what_is_uncorrelated_stays_and_nothing_widens(x64, rng, form):
 
 
 def test_half_spaces_in_a_row_depend_on_their_order_and_intervals_do_not(x64, form):
-    # Values of scipy's truncated normal distribution, one after the other.
+    # Reference values, to the digits printed.
     belief = form([0.3], np.eye(1))
     for normal, mean, variance in ((1.0, 0.0586, 0.1670), (-1.0, -0.0458, 0.1814)):
         constraints = linear_constraints([[normal]], -0.5, 0.5)
