@@ -50,7 +50,7 @@ def test_a_robot_is_found_where_it_is_among_wild_ranges():
     assert 0.5 < np.mean(squared[50:]) < 5
     assert np.sqrt(np.mean(np.sum(error[50:, :2] ** 2, axis=-1))) < 0.25
     heard_wild = np.any(heard & wild & (np.abs(ranges - 1.5 - 1.05 * true) > 3), axis=-1)
-    assert np.all(np.asarray(infos.trust)[heard_wild] < 0.5)
+    assert np.all(np.asarray(infos.inlier_probability)[heard_wild] < 0.5)
     assert heard_wild.sum() >= 3
 
 
