@@ -165,10 +165,10 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def check_positive(name: str, value: float | Array) -> None:
-    """Reject numbers that are not positive.
+    """Reject numbers that are not positive, where they are known before a program runs.
 
     Raises:
         ValueError: If a number is zero, negative or NaN.
     """
-    if not np.all(np.asarray(value) > 0):
+    if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
         raise ValueError(f"{name} must be positive; got {value}.")

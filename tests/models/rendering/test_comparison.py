@@ -38,6 +38,7 @@ def stacked(capsules, axis):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=axis), *capsules)
 
 
+@pytest.mark.system
 def test_terms_against_the_rendered_image(x64, camera, kind, random_transform):
     shape, T, observed = kind.shape(), random_transform(8), observed_image(camera.shape)
     terms = kind.compare(camera, shape, T, observed, MAX_ERROR)
@@ -46,6 +47,7 @@ def test_terms_against_the_rendered_image(x64, camera, kind, random_transform):
     np.testing.assert_allclose(terms, expected, rtol=1e-12)
 
 
+@pytest.mark.system
 def test_counts_of_a_large_image_do_not_overflow(camera, random_capsules):
     """Both counts of a small image share one word; 2^16 pixels and more need two."""
     near = random_capsules(0, 1)
@@ -58,6 +60,7 @@ def test_counts_of_a_large_image_do_not_overflow(camera, random_capsules):
     assert terms.rendered_count == terms.overlap_count == rendered
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("axis", [0, -1])
 def test_a_batch_is_each_in_turn(camera, random_capsules, axis):
     observed = observed_image(camera.shape)
@@ -68,6 +71,7 @@ def test_a_batch_is_each_in_turn(camera, random_capsules, axis):
         np.testing.assert_allclose([leaf[index] for leaf in together], compare(capsules), rtol=1e-5)
 
 
+@pytest.mark.system
 def test_batches_of_batches_and_of_images(camera, random_capsules):
     images = jnp.stack([observed_image(camera.shape, seed) for seed in range(2)])
     many = stacked([random_capsules(seed) for seed in range(3)], -1)
@@ -83,6 +87,7 @@ def test_batches_of_batches_and_of_images(camera, random_capsules):
     np.testing.assert_allclose([leaf[1] for leaf in of_batches], each[1], rtol=1e-5)
 
 
+@pytest.mark.system
 def test_whole_images_at_once_equal_windows_in_turn(monkeypatch, camera, random_capsules):
     """What runs on an accelerator, run here, for an image of a size that no other test has: its program is new."""
     observed = observed_image(camera.shape)
@@ -102,6 +107,7 @@ def test_whole_images_at_once_equal_windows_in_turn(monkeypatch, camera, random_
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3), at_once, in_turn)
 
 
+@pytest.mark.system
 def test_derivatives_against_those_of_the_rendered_image(x64, camera, kind, random_transform):
     """In camera, pose and largest error; the image's own derivative is tested elsewhere."""
     shape, T, observed = kind.shape(), random_transform(8), observed_image(camera.shape)
@@ -118,6 +124,7 @@ def test_derivatives_against_those_of_the_rendered_image(x64, camera, kind, rand
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9), gradient, expected)
 
 
+@pytest.mark.system
 def test_forward_and_batched_derivatives(x64, camera, random_capsules):
     observed = observed_image(camera.shape)
     many = [random_capsules(seed) for seed in range(3)]
@@ -187,6 +194,7 @@ for index in range(7):
 """
 
 
+@pytest.mark.system
 def test_two_devices_share_the_poses_of_a_sequence():
     """In a process of its own, because the number of devices is fixed when JAX starts; seven poses leave one over."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}

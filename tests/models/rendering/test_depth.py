@@ -17,6 +17,7 @@ def render_at(kind, camera, shape):
     return jax.jit(lambda pose: kind.render(camera, shape, RigidTransform(pose[:4], pose[4:])))
 
 
+@pytest.mark.system
 def test_derivative_against_central_differences(x64, camera, kind, random_transform):
     T = random_transform(8)
     pose = jnp.concatenate([T.rotation, T.translation])
@@ -33,6 +34,7 @@ def test_derivative_against_central_differences(x64, camera, kind, random_transf
         assert np.quantile(error, 0.995) < 1e-6
 
 
+@pytest.mark.system
 def test_forward_and_reverse_derivatives_agree(x64, camera, kind, random_transform):
     shape, T = kind.shape(), random_transform(3)
     weights = jnp.asarray(np.random.default_rng(0).normal(size=camera.shape))
@@ -62,6 +64,7 @@ def _floats(shape):
     return [leaf for leaf, f in zip(leaves, is_float, strict=True) if f], rebuilt
 
 
+@pytest.mark.system
 def test_a_region_with_a_stride_is_part_of_the_image(x64, camera, kind, random_transform):
     shape, T = kind.shape(), random_transform(1)
     whole = np.asarray(kind.render(camera, shape, T))
@@ -69,6 +72,7 @@ def test_a_region_with_a_stride_is_part_of_the_image(x64, camera, kind, random_t
     np.testing.assert_allclose(part, whole[3:43:2, 5:55:2], rtol=1e-12)
 
 
+@pytest.mark.system
 def test_a_batch_is_each_in_turn(x64, camera, kind, random_transform):
     shape = kind.shape()
     poses = [random_transform(seed) for seed in range(3)]
@@ -79,6 +83,7 @@ def test_a_batch_is_each_in_turn(x64, camera, kind, random_transform):
         np.testing.assert_allclose(image, render(T), rtol=1e-9)
 
 
+@pytest.mark.system
 def test_whole_images_at_once_equal_windows_in_turn(x64, monkeypatch, camera, kind, random_transform):
     """What runs on an accelerator, run here, for a window of a size that no other test has: its program is new."""
     shape, T = kind.shape(), random_transform(2)
@@ -89,12 +94,14 @@ def test_whole_images_at_once_equal_windows_in_turn(x64, monkeypatch, camera, ki
     assert asked
 
 
+@pytest.mark.system
 def test_nothing_behind_the_camera_is_seen(camera, kind, random_transform):
     T = random_transform(2)
     behind = RigidTransform(T.rotation, T.translation * jnp.asarray([1, 1, -1.0]))
     assert np.all(np.isinf(kind.render(camera, kind.shape(), behind)))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("depth_of_center", [-0.5, -0.02, 0.0, 0.05, 0.5, 1e4])
 def test_gradients_are_finite_wherever_the_object_is(camera, kind, random_transform, depth_of_center):
     shape, T = kind.shape(), random_transform(6)

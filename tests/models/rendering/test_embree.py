@@ -47,6 +47,7 @@ def check_agreement(ours, theirs):
     assert both.sum() / (np.isfinite(ours) | np.isfinite(theirs)).sum() > 0.995
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(2))
 def test_against_embree(kind, random_transform, embree, seed):
     camera = Pinhole.from_intrinsics((365.0, 365.0), (63.5, 63.5), (128, 128))

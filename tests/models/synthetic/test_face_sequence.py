@@ -17,6 +17,7 @@ def disturbed():
     return sequence(jax.random.key(0), "slow", 360, 3, deform=True, occlusion=True)
 
 
+@pytest.mark.system
 def test_images_are_the_same_however_they_are_asked_for(disturbed):
     together = disturbed.frames(10, 14)
     np.testing.assert_array_equal(disturbed.frames(12, 14), together[2:])

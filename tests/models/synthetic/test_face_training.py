@@ -57,6 +57,7 @@ def test_an_additive_model_has_no_more_ranks_than_parts(x64):
     np.testing.assert_allclose(own, shapes, atol=1e-12)
 
 
+@pytest.mark.system
 def test_people_of_the_ict_model_have_their_own_strengths(small_ict):
     shapes = ict_shapes(jax.random.key(3), small_ict, 5, landmarks=tuple(range(68)))
     assert shapes.shape == (5, len(ICT_EXPRESSIONS), 68, 3)
@@ -75,6 +76,7 @@ def test_missing_expressions_are_named():
         expression_weights(tuple(name for name in NAMES if name not in ("jawOpen", "browDown_L")))
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_the_ict_model_is_learnt_in_68_landmarks(x64, data_dir):
     model = read_ict(data_dir / "ict_face_model")

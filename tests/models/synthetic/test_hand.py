@@ -49,6 +49,7 @@ def test_a_key_decides_the_motion(kind):
     assert not np.allclose(simulate(jax.random.key(1), 20), simulate(jax.random.key(2), 20))
 
 
+@pytest.mark.system
 def test_first_steps_of_data_a_have_the_stated_deviation():
     keys = jax.random.split(jax.random.key(1), 4000)
     first = jax.vmap(lambda key: local(open_palm(jnp.array(START)), simulate_poses_a(key, 1)[0]))(keys)
@@ -64,6 +65,7 @@ def test_data_a_spreads_with_time_whatever_the_frame_interval():
     np.testing.assert_allclose(ratio, 1, atol=4 * np.sqrt(2 / 2000))
 
 
+@pytest.mark.system
 def test_data_b_integrates_a_damped_random_walk_of_its_velocity():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(2), 40)
@@ -117,6 +119,7 @@ def test_scripted_motion_is_the_circle_and_then_the_fist():
     assert np.abs(fingers[-1]).max() < 1e-5
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", MOTIONS)
 def test_sequence_shows_the_true_hand_before_a_wall(kind):
     sequence = simulate_sequence(jax.random.key(3), kind, num_frames=3)
@@ -137,6 +140,7 @@ def test_sequence_shows_the_true_hand_before_a_wall(kind):
         assert abs(np.mean(image > 2900) - 1) < 0.06
 
 
+@pytest.mark.system
 def test_sequence_takes_another_hand_camera_and_sensor():
     camera = kinect_v2().crop(jnp.array([150.0, 100.0]), (200, 220))
     sequence = simulate_sequence(

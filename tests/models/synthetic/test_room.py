@@ -81,6 +81,7 @@ def test_a_camera_looks_where_it_is_told(pinhole):
     assert above[0] == pytest.approx(79.5, abs=0.01)
 
 
+@pytest.mark.system
 def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
     """They do not overlap in this image. OpenCV also fills pixels that the border only touches, of every part."""
     _, who = image_of(empty_room, people)
