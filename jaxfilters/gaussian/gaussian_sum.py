@@ -177,7 +177,7 @@ def _check_start(inner, start, capacity):
     log_weights = checks.concrete(start.log_weights)
     if log_weights is not None and not np.isfinite(np.max(log_weights)):
         raise ValueError(f"start.log_weights must have a finite maximum; got {np.max(log_weights)}.")
-    one = jax.eval_shape(inner.init, inner.params, jax.random.key(0))
+    one = jax.eval_shape(inner.init, inner.params, jax.eval_shape(jax.random.key, 0))
     # As text: structures compare as equal where two classes have the same number of fields.
     wanted, got = str(jax.tree.structure(one)), str(jax.tree.structure(start.components))
     if wanted != got:

@@ -10,6 +10,7 @@ system based on particle filtering with adaptive diffusion control", IAPR Confer
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float

@@ -175,7 +175,7 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
 
 
 def _checked(inner, constrain):
-    state = jax.eval_shape(inner.init, inner.params, jax.random.key(0))
+    state = jax.eval_shape(inner.init, inner.params, jax.eval_shape(jax.random.key, 0))
     if not isinstance(state, Gaussian | GaussianRoot):
         raise TypeError(
             f"inner: expected a filter whose state is a Gaussian or a GaussianRoot; its state is a "
