@@ -87,7 +87,7 @@ def without_docstring(path):
 
 
 def docstring_lines(function):
-    """Lines of the docstring, which help() shows on its own: arguments, errors and an example of a builder fill them."""
+    """Lines of the docstring of a function; those of builders hold arguments, errors and an example."""
     first = function.body[0]
     return first.end_lineno - first.lineno + 1 if ast.get_docstring(function) else 0
 
