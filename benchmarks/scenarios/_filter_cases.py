@@ -81,7 +81,7 @@ def particle(setting: Setting, num_particles: str, num_steps: str) -> Metrics:
     """The bootstrap filter of a state of ten numbers, resampling in every step."""
     count, full = setting.size(int(num_particles), 64), int(num_particles)
     problem = models.drift(setting.seed, setting.size(int(num_steps)))
-    run = jax.jit(log_evidence)
+    run = jax.jit(log_evidence_of)
     ours = partial(run, models.plain(problem.model, count))
     evidences: dict[str, peers.OfKey] = {"ours": lambda key: ours(key, problem.readings)}
     # cuthbert keeps the particles of every step.
@@ -103,7 +103,7 @@ def marginal(setting: Setting) -> Metrics:
     for suffix, size, linear_size, num_particles in (("", 1, 3, 1000), ("_wide", 3, 6, 2000)):
         problem = models.mixed(setting.seed, size, linear_size, setting.size(100))
         count = setting.size(num_particles, 64)
-        run = jax.jit(log_evidence)
+        run = jax.jit(log_evidence_of)
         evidences: dict[str, peers.OfKey] = {
             name: partial(_of_key, run, models.marginalised(problem.model, count, shared=shared), problem.readings)
             for name, shared in (("own", False), ("shared", True))
