@@ -63,6 +63,14 @@ class ExtendedKalman:
     arithmetic: Arithmetic = field(metadata={"static": True})
     iterations: int = field(metadata={"static": True})
 
+    def linear_transition(self, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
+        """Where the mean goes, and the transition as a linear function of increments, from the mean to there."""
+        return linear_transition(self, belief, control)
+
+    def process_noise_of(self, control: PyTree) -> Array:
+        """The process noise of one step, as the arithmetic wants it."""
+        return noise_of_step(self, control)
+
 
 def subtract(y: Float[Array, " m"], y_hat: Float[Array, " m"]) -> Float[Array, " m"]:
     """The difference of two observations that are vectors."""

@@ -18,7 +18,8 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.arithmetic import KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.extended import ExtendedKalman, Observation
+from jaxfilters.gaussian.extended import Observation
+from jaxfilters.gaussian.model import GaussianModel, model_of
 from jaxfilters.typing import AnyKey
 
 
@@ -55,14 +56,13 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
     Raises:
         ValueError: If `inner` is another kind of filter, or `outlier_noise` no covariance.
     """
-    if not isinstance(inner.params, ExtendedKalman) or not isinstance(inner.params.prior, Gaussian):
-        raise ValueError(
-            f"inner must be made by extended with a Gaussian prior; its parameters are {type(inner.params).__name__}."
-        )
-    if jnp.shape(outlier_noise) != jnp.shape(inner.params.observation_noise):
+    trusted = model_of(inner, "inner")
+    if not isinstance(trusted.prior, Gaussian):
+        raise ValueError(f"inner must have a Gaussian prior; got a {type(trusted.prior).__name__}.")
+    if jnp.shape(outlier_noise) != jnp.shape(trusted.observation_noise):
         raise ValueError(
             f"outlier_noise must be shaped as inner's observation_noise, "
-            f"{jnp.shape(inner.params.observation_noise)}; got {jnp.shape(outlier_noise)}."
+            f"{jnp.shape(trusted.observation_noise)}; got {jnp.shape(outlier_noise)}."
         )
     return Filter(Robust(inner, jnp.asarray(outlier_probability), outlier_noise), _init, _predict, _update)
 
@@ -91,7 +91,7 @@ def _update(model: Robust, key: AnyKey, belief: Gaussian, observation: PyTree) -
 
 
 def _merged(
-    model: ExtendedKalman, doubting: Gaussian, trusting: Gaussian, inlier_probability: Float[Array, ""]
+    model: GaussianModel, doubting: Gaussian, trusting: Gaussian, inlier_probability: Float[Array, ""]
 ) -> Gaussian:
     """One Gaussian for both; on a manifold the two tangent spaces are taken for one, as far as they are apart."""
     moved = model.manifold.local(doubting.mean, trusting.mean)

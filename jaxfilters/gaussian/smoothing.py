@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxfilters.filter import Filter, keep_all, run
-from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
+from jaxfilters.gaussian.model import GaussianModel, model_of
 from jaxfilters.typing import AnyKey, Mask
 
 
@@ -36,22 +36,21 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
     Raises:
         ValueError: If `filter` is another kind of filter, or `controls` has another length than `beliefs`.
     """
-    if not isinstance(filter.params, ExtendedKalman):
-        raise ValueError(f"filter must be made by extended; its parameters are {type(filter.params).__name__}.")
+    model = model_of(filter, "filter")
     length = beliefs.mean.shape[0]
     lengths = {leaf.shape[0] for leaf in jax.tree.leaves(controls)}
     if not lengths <= {length}:
         raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
-    return _backward(filter.params, beliefs, controls)
+    return _backward(model, beliefs, controls)
 
 
 @jax.jit
-def _backward(model: ExtendedKalman, beliefs: Belief, controls: PyTree) -> Belief:
+def _backward(model: GaussianModel, beliefs: Belief, controls: PyTree) -> Belief:
     def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
         belief, control = inputs
-        origin, ahead = linear_transition(model, belief, control)
+        origin, ahead = model.linear_transition(belief, control)
         known = to_tangent(model.manifold, origin, following)
-        noise = noise_of_step(model, control)
+        noise = model.process_noise_of(control)
         delta = model.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed

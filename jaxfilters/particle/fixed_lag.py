@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
+from jaxfilters.gaussian.model import model_of
 from jaxfilters.particle.differentiable_resampling import Transport
 from jaxfilters.typing import AnyKey
 
@@ -85,8 +85,7 @@ def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
         ValueError: If `inner` is another kind of filter, or `lag < 1`.
     """
     _check(lag)
-    if not isinstance(inner.params, ExtendedKalman):
-        raise ValueError(f"inner must be made by extended; its parameters are {type(inner.params).__name__}.")
+    model_of(inner, "inner")
     return Filter(FixedLag(inner, control, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
 
 
@@ -166,17 +165,17 @@ def _update_beliefs(
 
 
 def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
-    extended = model.inner.params
+    linear = model.inner.params
     # Before the first frame there are only copies of the prior, which nothing moved.
     exists = jnp.arange(model.lag) >= model.lag - state.frames
 
     def step(following: Belief, inputs: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
         belief, control, exists = inputs
-        origin, ahead = linear_transition(extended, belief, control)
-        known = to_tangent(extended.manifold, origin, following)
-        noise = noise_of_step(extended, control)
-        delta = extended.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
-        smoothed = retract_belief(extended.manifold, belief.mean, delta)
+        origin, ahead = linear.linear_transition(belief, control)
+        known = to_tangent(linear.manifold, origin, following)
+        noise = linear.process_noise_of(control)
+        delta = linear.arithmetic.rts(increments(belief), known, ahead.F, noise, ahead.value, ahead.lost_root)
+        smoothed = retract_belief(linear.manifold, belief.mean, delta)
         return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], state.window)

@@ -1,6 +1,5 @@
 """Kalman filter atoms on covariances, with Joseph's form of the update: never indefinite by subtraction."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian.arithmetic import covariance, factor, info
@@ -37,7 +36,7 @@ def condition(
 
     NaN in the innovation becomes NaN in the shift and in the log density.
     """
-    return covariance.condition(_form, P, H, R, innovation, jnp.ones(innovation.shape, bool))
+    return covariance.condition(_form, P, H, R, innovation)
 
 
 def rts(
