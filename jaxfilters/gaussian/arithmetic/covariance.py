@@ -27,7 +27,9 @@ def predict(
     lost: Float[Array, "k _"] | None = None,
 ) -> Gaussian:
     """Belief in `x' = F x + b + q`, q ~ N(0, Q); `lost` is a root of more noise."""
-    return Gaussian(factor.apply(F, belief.mean) + b, factor.turned(F, belief.covariance) + total(Q, lost))
+    mean = factor.apply(F, belief.mean)
+    covariance = factor.turned(F, belief.covariance) + total(Q, lost)
+    return Gaussian(mean if isinstance(b, float) and b == 0.0 else mean + b, covariance)
 
 
 def noise_root(
@@ -63,8 +65,8 @@ class Usable(NamedTuple):
 
     rows: Bool[Array, " m"]
     """Neither masked nor invalid; the innovation is 0 in the other rows, where H and R may hold anything."""
-    mean: Float[Array, " n"]
-    """The predicted mean: where it is not finite, no row can be used."""
+    mean: Float[Array, " n"] | None
+    """The predicted mean, where `rows` do not depend on it: no row can be used where it is not finite."""
 
 
 Form = Callable[[Array, Array, Array, Array, Array], Array]
@@ -92,32 +94,30 @@ class _Whitening(NamedTuple):
     """The innovation covariance of the components that count, and what it was made of."""
 
     H: Float[Array, "m n"]
-    """Zero in rows that are not valid."""
+    """Finite."""
     R: Float[Array, "m m"]
-    """Zero in rows and columns that are not valid."""
+    """Finite."""
     PH: Float[Array, "n m"]
     """`P H^T`."""
-    upper: Float[Array, "m m"]
-    """U with `U^T U` the innovation covariance, rows and columns of the identity for components that do not count."""
+    L: Float[Array, "m m"]
+    """Lower root of the innovation covariance, rows and columns of the identity for components that do not count."""
     counts: Bool[Array, " m"]
     valid: Bool[Array, " m"]
     definite: Bool[Array, ""]
 
 
 def _condition(form, P, H, R, innovation, usable):
-    # Every product is A B or A B^T: XLA has no fast kernel for A^T B on a CPU. The innovation covariance is held as an
-    # upper factor: stored by rows, it is the lower factor stored by columns that LAPACK reads and writes.
+    # Every product is A B or A B^T: XLA has no fast kernel for A^T B on a CPU.
     whiten = _whitening_small if len(H) <= factor.UNROLLED else _whitening
     found = whiten(P, H, R, usable)
-    inverse = factor.inverse_of_upper(found.upper, found.counts)
-    W, whitened = linalg.matmul(found.PH, inverse), factor.apply(inverse.T, innovation)
-    gain = factor.outer(W, inverse)
-    log_density, nis = info.evidence(factor.diagonal(found.upper), found.counts, whitened)
-    root = jnp.where(found.counts, found.upper.T, 0.0)
+    inverse = factor.inverse(found.L, found.counts)
+    W, whitened = factor.outer(found.PH, inverse), factor.apply(inverse, innovation)
+    gain = linalg.matmul(W, inverse)
+    log_density, nis = info.evidence(factor.diagonal(found.L), found.counts, whitened)
     update = Update(
         factor.apply(W, whitened),
         form(P, found.H, found.R, gain, W),
-        root,
+        jnp.where(found.counts, found.L, 0.0),
         gain,
         jnp.where(found.definite, log_density, -jnp.inf),
         nis,
@@ -129,11 +129,11 @@ def _condition(form, P, H, R, innovation, usable):
 def _whitening_small(P, H, R, usable):
     valid = jnp.ones(H.shape[:1], bool)
     if usable is not None:
-        valid = materialized(_valid(usable.rows, usable.mean, H, R))
+        valid = materialized(usable.rows & _finite(H, R, usable.mean))
         H, R = _cleared(H, R, valid)
     PH = factor.outer(P, H)
     L, counts, definite = factor.independent_root(linalg.matmul(H, PH) + R)
-    return _Whitening(H, R, PH, L.T, counts, valid, definite)
+    return _Whitening(H, R, PH, L, counts, valid, definite)
 
 
 def _cleared(H, R, valid):
@@ -148,36 +148,32 @@ def _cleared(H, R, valid):
 
 
 def _whitening(P, H, R, usable):
-    def innovation_covariance(H, R):
-        PH = factor.outer(P, H)
-        return PH, linalg.matmul(H, PH) + R
+    valid = np.ones(H.shape[:1], bool)
+    if usable is not None:
+        valid = usable.rows & _finite(H, R, usable.mean)
+        # Rows that are not valid get no gain below; that nothing in them is NaN is all that they need.
+        H, R = (jnp.where(jnp.isfinite(A), A, 0.0) for A in (H, R))
+    PH = factor.outer(P, H)
+    L = factor.plain_root(linalg.matmul(H, PH) + R)
 
-    PH, S = innovation_covariance(H, R)
-    upper = factor.upper_root(S)
-    margins = factor.margins(upper)
-    if usable is None:
-        rows, mean = np.ones(H.shape[:1], bool), ()
-    else:
-        # NaN and infinity in H and R reach the margins: rows need no test of their own.
-        (rows, mean), margins = usable, jnp.where(usable.rows, margins, -1.0) + jnp.sum(0.0 * usable.mean)
+    def as_it_is(_H, _PH, _R, L, valid):
+        return L, valid, jnp.ones((), bool)
 
-    def as_it_is(H, R, rows, _mean, PH, upper):
-        return _Whitening(H, R, PH, upper, rows, rows, jnp.ones((), bool))
+    def repaired(H, PH, R, _L, valid):
+        # Computed again, because to keep it for this branch would cost the other a copy.
+        S = among(valid, linalg.matmul(H, PH) + R)
+        L, counts = factor.loosened_root(S)
+        return L, counts, jnp.any(counts) | jnp.all(S == 0)
 
-    def repaired(H, R, rows, mean, _PH, _upper):
-        if usable is not None:
-            rows = _valid(rows, mean, H, R)
-            H, R = info.observed(rows, H), among(rows, R)
-        PH, S = innovation_covariance(H, R)
-        upper, counts = factor.loosened_root(S)
-        return _Whitening(H, R, PH, upper, counts, rows, jnp.any(counts) | jnp.all(S == 0))
-
-    return jax.lax.cond(jnp.min(margins) > 0, as_it_is, repaired, H, R, rows, mean, PH, upper)
+    margins = jnp.where(valid, factor.margins(L), -1.0)
+    L, counts, definite = jax.lax.cond(jnp.min(margins) > 0, as_it_is, repaired, H, PH, R, L, valid)
+    return _Whitening(H, R, PH, L, counts, valid, definite)
 
 
-def _valid(rows, mean, H, R):
-    """Which of the rows are finite in H and R, none where the mean is not: sums show NaN and infinity."""
-    return rows & jnp.isfinite(jnp.sum(H, axis=1) + jnp.sum(R, axis=1) + jnp.sum(0.0 * mean))
+def _finite(H, R, mean):
+    """Which rows are finite in H and R, none where the mean is not: sums show NaN and infinity."""
+    sums = jnp.sum(H, axis=1) + jnp.sum(R, axis=1)
+    return jnp.isfinite(sums if mean is None else sums + jnp.sum(0.0 * mean))
 
 
 @condition.defjvp
@@ -190,7 +186,7 @@ def _condition_jvp(form, primals, tangents):
         dH, dR = info.observed(update.valid, dH), among(update.valid, dR)
     K, posterior = update.gain, update.covariance
     left = kept(K, H)
-    weights = factor.apply(inverse, whitened)
+    weights = factor.apply(inverse.T, whitened)
     pull = factor.apply(H.T, weights)
 
     unexplained = d_innovation - factor.apply(dH, factor.apply(P, pull)) - factor.apply(dR, weights)
@@ -203,7 +199,7 @@ def _condition_jvp(form, primals, tangents):
     covariance = factor.turned(left, dP) + factor.turned(K, dR) - KdH - KdH.T
 
     half = linalg.matmul(dH, PH)
-    precision = factor.outer(inverse, inverse)
+    precision = factor.inner(inverse, inverse)
     explained = jnp.outer(weights, weights)
 
     def along_S(M):
@@ -239,11 +235,12 @@ def update(
 ) -> tuple[Gaussian, info.KalmanInfo]:
     """Belief after a measurement, and its diagnostics: `update` of the arithmetic that has this form."""
     R = among(mask, total(R, lost))
-    y_hat = factor.apply(H, belief.mean) if y_hat is None else y_hat
+    # A product with the mean is not finite where the mean is not; of other predictions that is not known.
+    y_hat, mean = (factor.apply(H, belief.mean), None) if y_hat is None else (y_hat, belief.mean)
     read = jnp.isfinite(y) if mask is None else jnp.isfinite(y) & mask
     usable = jnp.isfinite(y - y_hat) if mask is None else jnp.isfinite(y - y_hat) & mask
     deviation = jnp.where(usable, y - y_hat, 0.0)
-    found = condition(form, belief.covariance, H, R, deviation, Usable(usable, belief.mean))
+    found = condition(form, belief.covariance, H, R, deviation, Usable(usable, mean))
     posterior = Gaussian(belief.mean + found.shift, found.covariance)
     used = info.used_rows(deviation, read, found.valid, mask)
     return posterior, info.report(used, found.root, info.Evidence(found.log_density, found.nis))

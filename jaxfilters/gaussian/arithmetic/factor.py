@@ -26,16 +26,16 @@ def root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.custom_jvp
 def _root(S):
-    def sound(_S, upper):
-        return upper, jnp.ones((), bool)
+    def sound(_S, L):
+        return L, jnp.ones((), bool)
 
-    def loose(S, _upper):
-        upper, counts = _loosened(S)
-        return jnp.where(counts[:, None], upper, 0.0), jnp.any(counts) | jnp.all(S == 0)
+    def loose(S, _L):
+        L, counts = _loosened(S)
+        return jnp.where(counts, L, 0.0), jnp.any(counts) | jnp.all(S == 0)
 
-    upper = upper_root(S)
-    upper, definite = jax.lax.cond(jnp.min(margins(upper)) > 0, sound, loose, S, upper)
-    return jnp.where(definite, upper.T, jnp.nan)
+    L = plain_root(S)
+    L, definite = jax.lax.cond(jnp.min(margins(L)) > 0, sound, loose, S, L)
+    return jnp.where(definite, L, jnp.nan)
 
 
 @_root.defjvp
@@ -56,30 +56,28 @@ def independent_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[
     return materialized(_without(L, counts)), counts, definite
 
 
-def upper_root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Upper U with `U^T U = S` by LAPACK; NaN where S is not positive definite.
-
-    Arrays are stored by rows, and LAPACK reads and writes columns: its lower factor is U without a copy.
-    """
-    return upper_part(jax.lax.linalg.cholesky_p.bind(S.T).T)
+def plain_root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Lower root of a positive definite S by LAPACK; NaN where it is not."""
+    # Of the transpose, which lies in memory as LAPACK wants it.
+    return lower_part(jax.lax.linalg.cholesky_p.bind(S.T))
 
 
-def margins(upper: Float[Array, "n n"]) -> Float[Array, " n"]:
+def margins(L: Float[Array, "n n"]) -> Float[Array, " n"]:
     """How far each variable is from depending on those before it, to rounding: positive where it does not.
 
-    NaN where `upper_root` found no factor.
+    NaN where `plain_root` found no root.
     """
-    pivots = diagonal(upper)
-    return pivots * pivots - _tolerance(upper) * jnp.sum(upper * upper, axis=0)
+    pivots = diagonal(L)
+    return pivots * pivots - _tolerance(L) * jnp.sum(L * L, axis=1)
 
 
 def loosened_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
-    """As `upper_root`, over the variables that do not depend on those before them, and which these are.
+    """As `plain_root`, over the variables that do not depend on those before them, and which these are.
 
     The other variables have rows and columns of the identity.
     """
-    upper, counts = _loosened(S)
-    return _without(upper, counts), counts
+    L, counts = _loosened(S)
+    return _without(L, counts), counts
 
 
 def _loosened(S):
@@ -87,8 +85,8 @@ def _loosened(S):
     # dependent ones with a pivot of that size. NaN compares as dependent.
     variance = diagonal(S)
     noise = _tolerance(S) * variance
-    upper = upper_root(S + diagonal_matrix(jnp.where(variance == 0, 1.0, noise)))
-    return upper, (diagonal(upper) ** 2 > 4 * noise) & (variance != 0)
+    L = plain_root(S + diagonal_matrix(jnp.where(variance == 0, 1.0, noise)))
+    return L, (diagonal(L) ** 2 > 4 * noise) & (variance != 0)
 
 
 def _tolerance(S):
@@ -99,12 +97,16 @@ def _without(root, counts):
     return jnp.where(counts[:, None] & counts, root, identity(root.shape[0], root.dtype))
 
 
-def inverse_of_upper(upper: Float[Array, "n n"], counts: Bool[Array, " n"]) -> Float[Array, "n n"]:
-    """Inverse of an upper triangular matrix, with columns of zeros for variables that do not count.
+def inverse(L: Float[Array, "n n"], counts: Bool[Array, " n"]) -> Float[Array, "n n"]:
+    """Inverse of a lower root, with rows and columns of zeros for variables that do not count.
 
-    Their rows and columns in `upper` are those of the identity.
+    In `L` they have rows and columns of the identity.
     """
-    return solve(upper.T, diagonal_matrix(counts.astype(upper.dtype))).T
+    right = diagonal_matrix(counts.astype(L.dtype))
+    if len(L) <= UNROLLED:
+        return linalg.solve_triangular(L, right)
+    # The transpose of what is stored by rows is stored by columns, as LAPACK wants it.
+    return jax.lax.linalg.triangular_solve(L.T, right, left_side=True, lower=False, transpose_a=True)
 
 
 def identity(n: int, dtype: DTypeLike) -> Shaped[Array | np.ndarray, "n n"]:
@@ -114,12 +116,13 @@ def identity(n: int, dtype: DTypeLike) -> Shaped[Array | np.ndarray, "n n"]:
 
 def diagonal_matrix(elements: Float[Array, " n"]) -> Float[Array, "n n"]:
     """The matrix with these elements on its diagonal, and zeros elsewhere."""
-    return jnp.where(identity(elements.size, bool), elements, jnp.zeros((), elements.dtype))
+    return jnp.where(_on_diagonal(elements.size), elements, jnp.zeros((), elements.dtype))
 
 
-def upper_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The elements on the diagonal and above it, zeros elsewhere, whatever is there."""
-    return jnp.where(np.tri(*A.shape, dtype=bool).T, A, 0.0) if len(A) <= _CONSTANT else jnp.triu(A)
+def _on_diagonal(n):
+    # Compiled into the loop that reads it: a constant would have to be copied where LAPACK wants columns.
+    rows, columns = (jax.lax.broadcasted_iota(jnp.int32, (n, n), axis) for axis in (0, 1))
+    return rows == columns
 
 
 def lower_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
