@@ -5,7 +5,7 @@ from dataclasses import field
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, Num, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.last_axis import batch_last
@@ -65,13 +65,13 @@ class Kalman:
 
 def kalman(
     prior: Gaussian | GaussianRoot,
-    F: Float[ArrayLike, "n n"],
-    Q: Float[ArrayLike, "n _"],
-    H: Float[ArrayLike, "m n"],
-    R: Float[ArrayLike, "m _"],
+    F: Num[ArrayLike, "..."],
+    Q: Num[ArrayLike, "..."],
+    H: Num[ArrayLike, "..."],
+    R: Num[ArrayLike, "..."],
     *,
-    b: Float[ArrayLike, " n"] | None = None,
-    d: Float[ArrayLike, " m"] | None = None,
+    b: Num[ArrayLike, "..."] | None = None,
+    d: Num[ArrayLike, "..."] | None = None,
     arithmetic: Arithmetic = arithmetics.joseph,
 ) -> Filter:
     """Kalman filter of `x' = F x + b + q`, `y = H x + d + r` with `q ~ N(0, Q)` and `r ~ N(0, R)`.
