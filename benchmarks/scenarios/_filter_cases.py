@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _filter_baselines as baselines
@@ -28,6 +27,7 @@ from jaxfilters.filter import log_evidence as log_evidence_of
 from jaxfilters.gaussian import arithmetic as arithmetics
 from jaxfilters.gaussian import smoothing
 from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.linear import kalman
 from jaxfilters.gaussian.linearize import unscented
 from jaxfilters.particle.resampling import systematic
 
@@ -53,11 +53,12 @@ class Setting(NamedTuple):
 
 
 def gaussian(setting: Setting) -> Metrics:
-    """One long sequence of 30 states and 20 sensors: KF, EKF, UKF, RTS smoother, gradient, call without `jit`."""
+    """One long sequence of 30 states and 20 sensors: KF, EKF, UKF, RTS smoothers, gradient, call without `jit`."""
     problem = coupled(setting.seed, num_steps=setting.size(500))
     found = _extended(setting, problem)
     found |= _pair(setting, "kf", problem, _linear_log_evidence, peers.dynamax_linear)
     unscented_peer = lambda problem: peers.dynamax_unscented(problem, _unscented(problem, problem.model))
+    found |= _pair(setting, "kf_rts", problem, _linear_smoothed_means, peers.dynamax_linear_smoother)
     found |= _pair(setting, "ukf", problem, _unscented_log_evidence, unscented_peer)
     return found | _pair(setting, "rts", problem, _smoothed_means, peers.dynamax_smoother)
 
@@ -81,7 +82,7 @@ def particle(setting: Setting, num_particles: str, num_steps: str) -> Metrics:
     """The bootstrap filter of a state of ten numbers, resampling in every step."""
     count, full = setting.size(int(num_particles), 64), int(num_particles)
     problem = models.drift(setting.seed, setting.size(int(num_steps)))
-    run = jax.jit(log_evidence)
+    run = jax.jit(log_evidence_of)
     ours = partial(run, models.plain(problem.model, count))
     evidences: dict[str, peers.OfKey] = {"ours": lambda key: ours(key, problem.readings)}
     # cuthbert keeps the particles of every step.
@@ -103,7 +104,7 @@ def marginal(setting: Setting) -> Metrics:
     for suffix, size, linear_size, num_particles in (("", 1, 3, 1000), ("_wide", 3, 6, 2000)):
         problem = models.mixed(setting.seed, size, linear_size, setting.size(100))
         count = setting.size(num_particles, 64)
-        run = jax.jit(log_evidence)
+        run = jax.jit(log_evidence_of)
         evidences: dict[str, peers.OfKey] = {
             name: partial(_of_key, run, models.marginalised(problem.model, count, shared=shared), problem.readings)
             for name, shared in (("own", False), ("shared", True))
@@ -225,8 +226,13 @@ def _extended_log_evidence(problem, arithmetic, model, readings):
 
 def _linear_log_evidence(problem, model, readings):
     Q, R = _noises(problem)
-    filter = extended_kalman(problem.start, Partial(_move_linearly, model), Q, Partial(_observe_linearly, model), R)
-    return log_evidence_of(filter, jax.random.key(0), readings)
+    return log_evidence_of(kalman(problem.start, model.A, Q, model.C, R), jax.random.key(0), readings)
+
+
+def _linear_smoothed_means(problem, model, readings):
+    Q, R = _noises(problem)
+    filter = kalman(problem.start, model.A, Q, model.C, R)
+    return smoothing.filter_and_smooth(filter, jax.random.key(0), readings)[0].mean
 
 
 def _unscented_log_evidence(problem, model, readings):
@@ -245,15 +251,6 @@ def _smoothed_means(problem, model, readings):
 def _noises(problem):
     size, count = problem.start.mean.size, problem.readings.shape[1]
     return problem.process_variance * jnp.eye(size), problem.reading_variance * jnp.eye(count)
-
-
-def _move_linearly(model, x, control):
-    del control
-    return model.A @ x
-
-
-def _observe_linearly(model, x):
-    return model.C @ x
 
 
 def _in_turn(scheme, keys, log_weights):

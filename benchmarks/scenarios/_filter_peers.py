@@ -102,22 +102,36 @@ def particles(problem: DriftProblem, num_particles: int) -> OfKey:
 def dynamax_linear(problem: Problem) -> Callable[[Any, Array], Array]:
     """Kalman filter of dynamax on the linear part of `Coupled`."""
     ssm = import_module("dynamax.linear_gaussian_ssm")
-    inference = import_module("dynamax.linear_gaussian_ssm.inference")
-    Q, R = _noises(problem)
-    mean, P = problem.start.mean, problem.start.covariance
 
     def log_evidence(model: Coupled, readings: Float[Array, "t m"]) -> Array:
-        nothing = jnp.zeros(mean.size), jnp.zeros((mean.size, 0)), jnp.zeros(readings.shape[1])
-        params = inference.ParamsLGSSM(
-            initial=inference.ParamsLGSSMInitial(mean=model.A @ mean, cov=model.A @ P @ model.A.T + Q),
-            dynamics=inference.ParamsLGSSMDynamics(weights=model.A, bias=nothing[0], input_weights=nothing[1], cov=Q),
-            emissions=inference.ParamsLGSSMEmissions(
-                weights=model.C, bias=nothing[2], input_weights=jnp.zeros((readings.shape[1], 0)), cov=R
-            ),
-        )
-        return ssm.lgssm_filter(params, readings).marginal_loglik
+        return ssm.lgssm_filter(_linear_params(problem, model), readings).marginal_loglik
 
     return log_evidence
+
+
+def dynamax_linear_smoother(problem: Problem) -> Callable[[Any, Array], Array]:
+    """Smoothed means of dynamax's Kalman filter on the linear part of `Coupled`."""
+    ssm = import_module("dynamax.linear_gaussian_ssm")
+
+    def means(model: Coupled, readings: Float[Array, "t m"]) -> Array:
+        return ssm.lgssm_smoother(_linear_params(problem, model), readings).smoothed_means
+
+    return means
+
+
+def _linear_params(problem, model):
+    inference = import_module("dynamax.linear_gaussian_ssm.inference")
+    Q, R = _noises(problem)
+    mean, P, num_readings = problem.start.mean, problem.start.covariance, model.C.shape[0]
+    return inference.ParamsLGSSM(
+        initial=inference.ParamsLGSSMInitial(mean=model.A @ mean, cov=model.A @ P @ model.A.T + Q),
+        dynamics=inference.ParamsLGSSMDynamics(
+            weights=model.A, bias=jnp.zeros(mean.size), input_weights=jnp.zeros((mean.size, 0)), cov=Q
+        ),
+        emissions=inference.ParamsLGSSMEmissions(
+            weights=model.C, bias=jnp.zeros(num_readings), input_weights=jnp.zeros((num_readings, 0)), cov=R
+        ),
+    )
 
 
 def dynamax_unscented(problem: Problem, filter: Filter) -> Callable[[Any, Array], Array]:

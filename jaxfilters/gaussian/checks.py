@@ -128,6 +128,16 @@ def belief(name: str, value: Any, kind: type) -> None:
         _finite(f"{name}.mean", mean)
 
 
+def arithmetic_of(prior: Any, arithmetic: Any) -> None:
+    """Raise an error unless `prior` is one possible belief, of the kind that an arithmetic takes."""
+    if not isinstance(prior, arithmetic.Belief):
+        kind = ValueError if isinstance(prior, Gaussian | GaussianRoot) else TypeError
+        raise kind(
+            f"prior must be a {arithmetic.Belief.__name__} for {arithmetic.__name__}; got a {type(prior).__name__}."
+        )
+    belief("prior", prior, arithmetic.Belief)
+
+
 def on_manifold(name: str, value: Gaussian | GaussianRoot, manifold: Any) -> None:
     """Raise an error unless the covariance of a belief has the dimensions of the tangent space at its mean."""
     spread, part = _spread(value)

@@ -75,6 +75,28 @@ class ExtendedKalman:
     iterations: int = field(metadata={"static": True})
     iterate_to: Literal["mean", "mode"] = field(metadata={"static": True}, default="mean")
 
+    def linear_transition(self, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
+        """The predicted mean, and the transition as a linear function of increments, from the mean to the predicted."""
+        transition = lambda x: checks.transitioned(self.transition, x, control)
+        if self.manifold.flat:
+            ahead = self.linearize(transition, belief)
+            return ahead.value, ahead._replace(value=jnp.zeros_like(ahead.value))
+        origin = transition(belief.mean)
+
+        def step(delta: Array) -> Array:
+            return self.manifold.local(origin, transition(self.manifold.retract(belief.mean, delta)))
+
+        return origin, self.linearize(step, increments(belief))
+
+    def process_noise_of(self, control: PyTree) -> Array:
+        """The process noise of one step: a covariance, or a root of it, as the arithmetic needs."""
+        if not callable(self.process_noise):
+            return self.process_noise
+        noise = self.process_noise(control)
+        is_root = isinstance(self.prior, GaussianRoot)
+        checks.noise("the result of process_noise", noise, dimension(self.prior), is_root=is_root)
+        return noise
+
 
 def extended_kalman(
     prior: Gaussian | GaussianRoot,
@@ -171,12 +193,7 @@ def extended_kalman(
 
 
 def _check(prior, process_noise, observation_noise, arithmetic, manifold):
-    if not isinstance(prior, arithmetic.Belief):
-        kind = ValueError if isinstance(prior, Gaussian | GaussianRoot) else TypeError
-        raise kind(
-            f"prior must be a {arithmetic.Belief.__name__} for {arithmetic.__name__}; got a {type(prior).__name__}."
-        )
-    checks.belief("prior", prior, arithmetic.Belief)
+    checks.arithmetic_of(prior, arithmetic)
     checks.on_manifold("prior", prior, manifold)
     is_root = isinstance(prior, GaussianRoot)
     checks.noise("observation_noise", observation_noise, None, is_root=is_root)
@@ -200,8 +217,8 @@ def _predict(model: ExtendedKalman, key: AnyKey, belief: Belief, control: PyTree
 
 
 def _ahead(model: ExtendedKalman, belief: Belief, control: PyTree) -> Belief:
-    origin, step = linear_transition(model, belief, control)
-    noise = noise_of_step(model, control)
+    origin, step = model.linear_transition(belief, control)
+    noise = model.process_noise_of(control)
     ahead = model.arithmetic.predict(increments(belief), step.F, noise, step.value, step.residual_root)
     # The mean is that of the step; F times a mean of zeros would be computed.
     return retract_belief(model.manifold, origin, with_mean(ahead, step.value))
@@ -210,13 +227,14 @@ def _ahead(model: ExtendedKalman, belief: Belief, control: PyTree) -> Belief:
 def _update(model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
     del key
     checks.state(belief, model.prior)
-    y = _measured(observation).y
+    y = as_observation(observation).y
     small = max(dimension(belief), y.size) <= factor.UNROLLED
     conditioned = batch_last(_conditioned) if small else _conditioned
     return conditioned(model, belief, observation)
 
 
-def _measured(observation: Any) -> Observation:
+def as_observation(observation: Any) -> Observation:
+    """An observation with what is known about it, given as such or as an array."""
     measured = observation if isinstance(observation, Observation) else Observation(observation)
     checks.observation(measured.y, measured.mask)
     return measured
@@ -235,30 +253,6 @@ def _conditioned(model: ExtendedKalman, belief: Belief, observation: PyTree) -> 
         iterations=model.iterations,
         iterate_to=model.iterate_to,
     )
-
-
-def linear_transition(model: ExtendedKalman, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
-    """The predicted mean, and the transition as a linear function of increments, from the mean to the predicted one."""
-    transition = lambda x: checks.transitioned(model.transition, x, control)
-    if model.manifold.flat:
-        ahead = model.linearize(transition, belief)
-        return ahead.value, ahead._replace(value=jnp.zeros_like(ahead.value))
-    origin = transition(belief.mean)
-
-    def step(delta: Array) -> Array:
-        return model.manifold.local(origin, transition(model.manifold.retract(belief.mean, delta)))
-
-    return origin, model.linearize(step, increments(belief))
-
-
-def noise_of_step(model: ExtendedKalman, control: PyTree) -> Array:
-    """The process noise of one step: a covariance, or a root of it, as the arithmetic needs."""
-    if not callable(model.process_noise):
-        return model.process_noise
-    noise = model.process_noise(control)
-    is_root = isinstance(model.prior, GaussianRoot)
-    checks.noise("the result of process_noise", noise, dimension(model.prior), is_root=is_root)
-    return noise
 
 
 def condition(
@@ -304,7 +298,7 @@ def condition(
         ValueError: If shapes do not fit one another.
         TypeError: If an argument is of another kind.
     """
-    y, mask, own_noise = _measured(measured)
+    y, mask, own_noise = as_observation(measured)
     name, noise = ("observation_noise", noise) if own_noise is None else ("Observation.noise", own_noise)
     is_root = isinstance(belief, GaussianRoot)
     if at is not None:

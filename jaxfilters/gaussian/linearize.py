@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._xla import last_axis
 from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.math import linalg
@@ -150,7 +151,7 @@ def _value_and_jacobian(f, x):
     def along(direction):
         return jax.jvp(f, (x,), (direction,))
 
-    value, F = jax.vmap(along, in_axes=-1, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
+    value, F = last_axis.vmap(along, out_axes=(None, -1))(factor.identity(x.size, x.dtype))
     # vmap leaves F transposed in memory. XLA would fold that into the products of F, for which it then has no fast
     # kernel on a CPU; behind the barrier it makes a copy.
     return value, F if max(F.shape) <= factor.UNROLLED else jax.lax.optimization_barrier(F)

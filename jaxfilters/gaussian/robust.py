@@ -19,7 +19,8 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.extended import ExtendedKalman, Observation
+from jaxfilters.gaussian.extended import Observation
+from jaxfilters.gaussian.model import GaussianModel, model_of
 from jaxfilters.typing import AnyKey
 
 
@@ -76,10 +77,11 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
         [True, False, True]
     """
     checks.is_filter("inner", inner)
-    if not isinstance(inner.params, ExtendedKalman) or not isinstance(inner.params.prior, Gaussian):
+    model = model_of(inner, "inner")
+    if not isinstance(model.prior, Gaussian):
         raise ValueError(
-            "inner must be made by extended_kalman (or kalman, unscented_kalman, cubature_kalman) with a Gaussian "
-            f"prior; its parameters are {type(inner.params).__name__}."
+            "inner must be made by kalman or extended_kalman (or unscented_kalman, cubature_kalman) with a Gaussian "
+            f"prior; its prior is a {type(model.prior).__name__}."
         )
     checks.probability("outlier_probability", outlier_probability)
     checks.shaped(
@@ -113,7 +115,7 @@ def _update(model: Robust, key: AnyKey, belief: Gaussian, observation: PyTree) -
     )
 
 
-def _merged(model: ExtendedKalman, inlier: Gaussian, outlier: Gaussian, probability: Float[Array, ""]) -> Gaussian:
+def _merged(model: GaussianModel, inlier: Gaussian, outlier: Gaussian, probability: Float[Array, ""]) -> Gaussian:
     """One Gaussian with the moments of both; on a manifold the tangent spaces at the two means are taken to be one."""
     apart = model.manifold.local(outlier.mean, inlier.mean)
     covariance = probability * inlier.covariance + (1 - probability) * outlier.covariance

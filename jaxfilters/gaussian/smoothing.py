@@ -6,8 +6,8 @@ from jaxtyping import PyTree
 
 from jaxfilters.filter import Filter, keep_all, run
 from jaxfilters.gaussian import checks
-from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
+from jaxfilters.gaussian.model import GaussianModel, model_of
 from jaxfilters.typing import AnyKey, Mask
 
 
@@ -32,7 +32,8 @@ def filter_and_smooth(
         ValueError: If `filter` is another kind of filter, or lengths differ.
         TypeError: If `filter` is no filter.
     """
-    _check_filter(filter)
+    checks.is_filter("filter", filter)
+    model_of(filter, "filter")
     _, (beliefs, infos) = run(filter, key, observations, controls, mask=mask, collect=keep_all)
     return rts(filter, beliefs, controls), infos
 
@@ -69,30 +70,22 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
         >>> bool((smoothed.covariance[:-1] < beliefs.covariance[:-1]).all())
         True
     """
-    _check_filter(filter)
-    length = checks.beliefs("beliefs", beliefs, filter.params.prior)
+    checks.is_filter("filter", filter)
+    model = model_of(filter, "filter")
+    length = checks.beliefs("beliefs", beliefs, model.prior)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(controls)}
     if not lengths <= {(length,)}:
         raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
-    return _backward(filter.params, beliefs, controls)
-
-
-def _check_filter(filter: Filter) -> None:
-    checks.is_filter("filter", filter)
-    if not isinstance(filter.params, ExtendedKalman):
-        raise ValueError(
-            "filter must be made by extended_kalman, unscented_kalman, cubature_kalman or kalman; "
-            f"its parameters are {type(filter.params).__name__}."
-        )
+    return _backward(model, beliefs, controls)
 
 
 @jax.jit
-def _backward(model: ExtendedKalman, beliefs: Belief, controls: PyTree) -> Belief:
+def _backward(model: GaussianModel, beliefs: Belief, controls: PyTree) -> Belief:
     def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
         belief, control = inputs
-        origin, ahead = linear_transition(model, belief, control)
+        origin, ahead = model.linear_transition(belief, control)
         next_belief = to_tangent(model.manifold, origin, following)
-        noise = noise_of_step(model, control)
+        noise = model.process_noise_of(control)
         delta = model.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed

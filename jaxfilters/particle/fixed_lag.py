@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Int, PyTree
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
-from jaxfilters.gaussian.extended import ExtendedKalman, linear_transition, noise_of_step
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
+from jaxfilters.gaussian.model import model_of
 from jaxfilters.particle.differentiable_resampling import Transport
 from jaxfilters.typing import AnyKey
 
@@ -111,11 +111,7 @@ def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
     """
     checks.is_filter("inner", inner)
     _check(lag)
-    if not isinstance(inner.params, ExtendedKalman):
-        raise ValueError(
-            "inner must be made by extended_kalman, unscented_kalman, cubature_kalman or kalman; "
-            f"its parameters are {type(inner.params).__name__}."
-        )
+    model_of(inner, "inner")
     return Filter(FixedLag(inner, control, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
 
 
@@ -195,19 +191,17 @@ def _update_beliefs(
 
 
 def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
-    extended = model.inner.params
+    linear = model.inner.params
     # Before the first frame there are only copies of the prior, with no transition between them.
     exists = jnp.arange(model.lag) >= model.lag - state.frames
 
     def step(following: Belief, inputs: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
         belief, control, exists = inputs
-        origin, ahead = linear_transition(extended, belief, control)
-        next_belief = to_tangent(extended.manifold, origin, following)
-        noise = noise_of_step(extended, control)
-        delta = extended.arithmetic.rts(
-            increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root
-        )
-        smoothed = retract_belief(extended.manifold, belief.mean, delta)
+        origin, ahead = linear.linear_transition(belief, control)
+        next_belief = to_tangent(linear.manifold, origin, following)
+        noise = linear.process_noise_of(control)
+        delta = linear.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
+        smoothed = retract_belief(linear.manifold, belief.mean, delta)
         return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], state.window)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters._xla.materialize import materialized
@@ -23,22 +24,24 @@ def predict(
     F: Float[Array, "k n"],
     Q: Float[Array, "k k"],
     b: Float[Array, " k"] | float = 0.0,
-    lost: Float[Array, "k _"] | None = None,
+    added_root: Float[Array, "k _"] | None = None,
 ) -> Gaussian:
-    """Belief in `x' = F x + b + q`, q ~ N(0, Q); `lost` is a root of more noise."""
-    return Gaussian(factor.apply(F, belief.mean) + b, factor.turned(F, belief.covariance) + total(Q, lost))
+    """Belief in `x' = F x + b + q`, q ~ N(0, Q); `added_root` is a root of more noise."""
+    mean = factor.apply(F, belief.mean)
+    covariance = factor.turned(F, belief.covariance) + total(Q, added_root)
+    return Gaussian(mean if isinstance(b, float) and b == 0.0 else mean + b, covariance)
 
 
 def noise_root(
-    R: Float[Array, "m m"], mask: Bool[Array, " m"] | None = None, lost: Float[Array, "m _"] | None = None
+    R: Float[Array, "m m"], mask: Bool[Array, " m"] | None = None, added_root: Float[Array, "m _"] | None = None
 ) -> Float[Array, "m m"]:
-    """Lower root of the noise R and of what is lost beside it, zero where masked."""
-    return factor.root(among(mask, total(R, lost)))
+    """Lower root of the noise R and of what is added to it by a root, zero where masked."""
+    return factor.root(among(mask, total(R, added_root)))
 
 
-def total(Q: Float[Array, "k k"], lost: Float[Array, "k _"] | None) -> Float[Array, "k k"]:
-    """Covariance of the noise Q and of what is lost beside it, of which a root is given."""
-    return Q if lost is None or lost.shape[1] == 0 else Q + factor.outer(lost, lost)
+def total(Q: Float[Array, "k k"], added_root: Float[Array, "k _"] | None) -> Float[Array, "k k"]:
+    """Covariance of the noise Q and of what is added to it by a root, of which a root is given."""
+    return Q if added_root is None or added_root.shape[1] == 0 else Q + factor.outer(added_root, added_root)
 
 
 class Update(NamedTuple):
@@ -51,8 +54,19 @@ class Update(NamedTuple):
     """Lower root of the innovation covariance; zero rows and columns for components that add nothing."""
     gain: Float[Array, "n m"]
     log_density: Float[Array, ""]
-    """`-inf` where the innovation covariance is not positive semidefinite; then all else is as if nothing was seen."""
+    """`-inf` where the innovation covariance is not positive semidefinite; then all else is as without observation."""
     nis: Float[Array, ""]
+    valid: Bool[Array, " m"]
+    """Which components have a usable reading, and finite rows of H and R."""
+
+
+class Usable(NamedTuple):
+    """Which readings can be used."""
+
+    rows: Bool[Array, " m"]
+    """Neither masked nor invalid; the innovation is 0 in the other rows, where H and R may hold anything."""
+    mean: Float[Array, " n"] | None
+    """The predicted mean, where `rows` do not depend on it: no row can be used where it is not finite."""
 
 
 Form = Callable[[Array, Array, Array, Array, Array], Array]
@@ -66,53 +80,110 @@ def condition(
     H: Float[Array, "m n"],
     R: Float[Array, "m m"],
     innovation: Float[Array, " m"],
-    seen: Bool[Array, " m"],
+    usable: Usable | None = None,
 ) -> Update:
-    """The update with what was seen, and with the covariance that `form` makes of it.
+    """The update with the usable components, and with the covariance that `form` makes of it.
 
-    `innovation` is 0 where nothing was seen; there H and R may hold anything. The derivative takes P and R to be
-    symmetric and the gain to be optimal.
+    Without `usable` all components are used, and nothing is tested. The derivative takes P and R to be symmetric and
+    the gain to be optimal.
     """
-    return _condition(form, P, *_cleared(H, R, seen), innovation)[0]
+    return _condition(form, P, H, R, innovation, usable)[0]
 
 
-def _condition(form, P, H, R, innovation):
+class _Whitening(NamedTuple):
+    """The innovation covariance of the components that count, and what it was made of."""
+
+    H: Float[Array, "m n"]
+    """Finite."""
+    R: Float[Array, "m m"]
+    """Finite."""
+    PH: Float[Array, "n m"]
+    """`P H^T`."""
+    L: Float[Array, "m m"]
+    """Lower root of the innovation covariance, rows and columns of the identity for components that do not count."""
+    counts: Bool[Array, " m"]
+    valid: Bool[Array, " m"]
+    definite: Bool[Array, ""]
+
+
+def _condition(form, P, H, R, innovation, usable):
     # Every product is A B or A B^T: XLA has no fast kernel for A^T B on a CPU.
-    PH = factor.outer(P, H)
-    L, counts, definite = factor.independent_root(linalg.matmul(H, PH) + R)
-    inverse = factor.solve(L, jnp.diag(counts.astype(L.dtype)))
-    W, whitened = factor.outer(PH, inverse), factor.apply(inverse, innovation)
+    whiten = _whitening_small if len(H) <= factor.UNROLLED else _whitening
+    found = whiten(P, H, R, usable)
+    inverse = factor.inverse(found.L, found.counts)
+    W, whitened = factor.outer(found.PH, inverse), factor.apply(inverse, innovation)
     gain = linalg.matmul(W, inverse)
-    log_density, nis = info.evidence(factor.diagonal(L), counts, whitened)
+    log_density, nis = info.evidence(factor.diagonal(found.L), found.counts, whitened)
     update = Update(
         factor.apply(W, whitened),
-        form(P, H, R, gain, W),
-        jnp.where(counts, L, 0.0),
+        form(P, found.H, found.R, gain, W),
+        jnp.where(found.counts, found.L, 0.0),
         gain,
-        jnp.where(definite, log_density, -jnp.inf),
+        jnp.where(found.definite, log_density, -jnp.inf),
         nis,
+        found.valid,
     )
-    return update, inverse, whitened, PH
+    return update, found, inverse, whitened
 
 
-def _cleared(H: Array, R: Array, seen: Array) -> tuple[Array, Array]:
+def _whitening_small(P, H, R, usable):
+    valid = jnp.ones(H.shape[:1], bool)
+    if usable is not None:
+        valid = materialized(usable.rows & _finite(H, R, usable.mean))
+        H, R = _cleared(H, R, valid)
+    PH = factor.outer(P, H)
+    L, counts, definite = factor.independent_root(linalg.matmul(H, PH) + R)
+    return _Whitening(H, R, PH, L, counts, valid, definite)
+
+
+def _cleared(H, R, valid):
     def clear(H, R):
-        return info.observed(seen, H), among(seen, R)
+        return info.observed(valid, H), among(valid, R)
 
     if max(H.shape) <= factor.UNROLLED:
         H, R = clear(H, R)
         return materialized(H), materialized(R)
     # Selections would be computed inside the products that follow, and slow them down by more than a branch costs.
-    return jax.lax.cond(jnp.all(seen), lambda H, R: (H, R), clear, H, R)
+    return jax.lax.cond(jnp.all(valid), lambda H, R: (H, R), clear, H, R)
+
+
+def _whitening(P, H, R, usable):
+    valid = np.ones(H.shape[:1], bool)
+    if usable is not None:
+        valid = usable.rows & _finite(H, R, usable.mean)
+        # Rows that are not valid get no gain below; that nothing in them is NaN is all that they need.
+        H, R = (jnp.where(jnp.isfinite(A), A, 0.0) for A in (H, R))
+    PH = factor.outer(P, H)
+    L = factor.plain_root(linalg.matmul(H, PH) + R)
+
+    def as_it_is(_H, _PH, _R, L, valid):
+        return L, valid, jnp.ones((), bool)
+
+    def repaired(H, PH, R, _L, valid):
+        # Computed again, because to keep it for this branch would cost the other a copy.
+        S = among(valid, linalg.matmul(H, PH) + R)
+        L, counts = factor.loosened_root(S)
+        return L, counts, jnp.any(counts) | jnp.all(S == 0)
+
+    margins = jnp.where(valid, factor.margins(L), -1.0)
+    L, counts, definite = jax.lax.cond(jnp.min(margins) > 0, as_it_is, repaired, H, PH, R, L, valid)
+    return _Whitening(H, R, PH, L, counts, valid, definite)
+
+
+def _finite(H, R, mean):
+    """Which rows are finite in H and R, none where the mean is not: sums show NaN and infinity."""
+    sums = jnp.sum(H, axis=1) + jnp.sum(R, axis=1)
+    return jnp.isfinite(sums if mean is None else sums + jnp.sum(0.0 * mean))
 
 
 @condition.defjvp
 def _condition_jvp(form, primals, tangents):
-    P, H, R, innovation, seen = primals
+    P, H, R, innovation, usable = primals
     dP, dH, dR, d_innovation, _ = tangents
-    H, R = _cleared(H, R, seen)
-    dH, dR = info.observed(seen, dH), among(seen, dR)
-    update, inverse, whitened, PH = _condition(form, P, H, R, innovation)
+    update, found, inverse, whitened = _condition(form, P, H, R, innovation, usable)
+    H, R, PH = found.H, found.R, found.PH
+    if usable is not None:
+        dH, dR = info.observed(update.valid, dH), among(update.valid, dR)
     K, posterior = update.gain, update.covariance
     left = kept(K, H)
     weights = factor.apply(inverse.T, whitened)
@@ -143,12 +214,13 @@ def _condition_jvp(form, primals, tangents):
     root = factor.root_tangent(update.root, dS)
     seen_less = linalg.matmul(left, factor.outer(dP, H)) + factor.outer(posterior, dH)
     gain = linalg.matmul(seen_less - linalg.matmul(K, half + dR), precision)
-    return update, Update(shift, covariance, root, gain, log_density, nis)
+    valid = np.zeros(update.valid.shape, jax.dtypes.float0)
+    return update, Update(shift, covariance, root, gain, log_density, nis, valid)
 
 
 def kept(gain: Float[Array, "n m"], H: Float[Array, "m n"]) -> Float[Array, "n n"]:
     """What of a deviation from the mean remains after the update, `I - K H`."""
-    return jnp.eye(gain.shape[0], dtype=gain.dtype) - linalg.matmul(gain, H)
+    return factor.identity(gain.shape[0], gain.dtype) - linalg.matmul(gain, H)
 
 
 def update(
@@ -159,14 +231,19 @@ def update(
     R: Float[Array, "m m"],
     y_hat: Float[Array, " m"] | None,
     mask: Bool[Array, " m"] | None,
-    lost: Float[Array, "m _"] | None,
+    added_root: Float[Array, "m _"] | None,
 ) -> tuple[Gaussian, info.KalmanInfo]:
     """Belief after a measurement, and its diagnostics: `update` of the arithmetic that has this form."""
-    R = among(mask, total(R, lost))
-    usable = info.rows(belief.mean, y, H, R, y_hat, mask)
-    found = condition(form, belief.covariance, H, R, usable.deviation, usable.seen)
+    R = among(mask, total(R, added_root))
+    # A product with the mean is not finite where the mean is not; of other predictions that is not known.
+    y_hat, mean = (factor.apply(H, belief.mean), None) if y_hat is None else (y_hat, belief.mean)
+    read = jnp.isfinite(y) if mask is None else jnp.isfinite(y) & mask
+    usable = jnp.isfinite(y - y_hat) if mask is None else jnp.isfinite(y - y_hat) & mask
+    deviation = jnp.where(usable, y - y_hat, 0.0)
+    found = condition(form, belief.covariance, H, R, deviation, Usable(usable, mean))
     posterior = Gaussian(belief.mean + found.shift, found.covariance)
-    return posterior, info.report(usable, found.root, info.Evidence(found.log_density, found.nis))
+    used = info.used_rows(deviation, read, found.valid, mask)
+    return posterior, info.report(used, found.root, info.Evidence(found.log_density, found.nis))
 
 
 def rts(
@@ -176,11 +253,11 @@ def rts(
     F: Float[Array, "k n"],
     Q: Float[Array, "k k"],
     b: Float[Array, " k"] | float,
-    lost: Float[Array, "k _"] | None,
+    added_root: Float[Array, "k _"] | None,
 ) -> Gaussian:
     """Belief given the future too: `rts` of the arithmetic that has this form."""
     surprise = following.mean - factor.apply(F, belief.mean) - b
-    found = condition(form, belief.covariance, F, total(Q, lost), surprise, jnp.ones(surprise.shape, bool))
+    found = condition(form, belief.covariance, F, total(Q, added_root), surprise)
     return Gaussian(belief.mean + found.shift, found.covariance + factor.turned(found.gain, following.covariance))
 
 

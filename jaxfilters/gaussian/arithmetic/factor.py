@@ -4,13 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, DTypeLike, Float, Shaped
 
 from jaxfilters._xla.materialize import materialized
 from jaxfilters.math import linalg
 
 UNROLLED = 8
 """Up to this size `linalg.cholesky` is algebra on the elements, which finds dependent variables itself."""
+_CONSTANT = 128
+"""Up to this size identity matrices are written into the program."""
 
 
 def root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -24,8 +26,16 @@ def root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.custom_jvp
 def _root(S):
-    L, counts = _pivots(S, lambda L, independent: jnp.where(independent, L, 0.0))
-    return jnp.where(jnp.any(counts) | jnp.all(S == 0), L, jnp.nan)
+    def sound(_S, L):
+        return L, jnp.ones((), bool)
+
+    def loose(S, _L):
+        L, counts = _loosened(S)
+        return jnp.where(counts, L, 0.0), jnp.any(counts) | jnp.all(S == 0)
+
+    L = plain_root(S)
+    L, definite = jax.lax.cond(jnp.min(margins(L)) > 0, sound, loose, S, L)
+    return jnp.where(definite, L, jnp.nan)
 
 
 @_root.defjvp
@@ -36,51 +46,98 @@ def _root_jvp(primals, tangents):
 
 
 def independent_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"], Bool[Array, ""]]:
-    """The lower root of S over its independent variables, which they are, and whether S is positive semidefinite.
+    """The lower root of a small S over its independent variables, which they are, and whether S is semidefinite.
 
     The other variables have rows and columns of the identity; where S is not positive semidefinite, all have.
     """
-    if S.shape[0] > UNROLLED:
-        L, counts = _pivots(S, _without)
-        return L, counts, jnp.any(counts) | jnp.all(S == 0)
     L = linalg.cholesky(S)
     definite = ~jnp.any(jnp.isnan(diagonal(L)))
     counts = (diagonal(L) > 0) & definite
     return materialized(_without(L, counts)), counts, definite
 
 
-def _without(L, counts):
-    return jnp.where(counts[:, None] & counts, L, np.eye(L.shape[0], dtype=L.dtype))
-
-
-def _pivots(S, drop):
-    """The root as `drop(L, independent)` leaves it, and which variables are independent of those before them."""
-    n, variance = S.shape[0], diagonal(S)
-    tolerance = n * float(jnp.finfo(S.dtype).eps)
+def plain_root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Lower root of a positive definite S by LAPACK; NaN where it is not."""
     # Of the transpose, which lies in memory as LAPACK wants it.
-    L = jax.lax.linalg.cholesky(S.T, symmetrize_input=False)
+    return lower_part(jax.lax.linalg.cholesky_p.bind(S.T))
 
-    def loosen(S, L):
-        # LAPACK stops at the first pivot that is not positive. A little noise on every variable lets it pass, and
-        # leaves dependent ones with a pivot of that size. NaN compares as dependent.
-        del L
-        noise = tolerance * variance
-        L = jax.lax.linalg.cholesky(S + jnp.diag(jnp.where(variance == 0, 1.0, noise)), symmetrize_input=False)
-        independent = (diagonal(L) ** 2 > 4 * noise) & (variance != 0)
-        return drop(L, independent), independent
 
-    sound = jnp.all(diagonal(L) ** 2 > tolerance * variance)
-    return jax.lax.cond(sound, lambda _S, L: (L, jnp.ones(n, bool)), loosen, S, L)
+def margins(L: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """How far each variable is from depending on those before it, to rounding: positive where it does not.
+
+    NaN where `plain_root` found no root.
+    """
+    pivots = diagonal(L)
+    return pivots * pivots - _tolerance(L) * jnp.sum(L * L, axis=1)
+
+
+def loosened_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
+    """As `plain_root`, over the variables that do not depend on those before them, and which these are.
+
+    The other variables have rows and columns of the identity.
+    """
+    L, counts = _loosened(S)
+    return _without(L, counts), counts
+
+
+def _loosened(S):
+    # LAPACK stops at the first pivot that is not positive. A little noise on every variable lets it pass, and leaves
+    # dependent ones with a pivot of that size. NaN compares as dependent.
+    variance = diagonal(S)
+    noise = _tolerance(S) * variance
+    L = plain_root(S + diagonal_matrix(jnp.where(variance == 0, 1.0, noise)))
+    return L, (diagonal(L) ** 2 > 4 * noise) & (variance != 0)
+
+
+def _tolerance(S):
+    return S.shape[0] * float(jnp.finfo(S.dtype).eps)
+
+
+def _without(root, counts):
+    return jnp.where(counts[:, None] & counts, root, identity(root.shape[0], root.dtype))
+
+
+def inverse(L: Float[Array, "n n"], counts: Bool[Array, " n"]) -> Float[Array, "n n"]:
+    """Inverse of a lower root, with rows and columns of zeros for variables that do not count.
+
+    In `L` they have rows and columns of the identity.
+    """
+    right = diagonal_matrix(counts.astype(L.dtype))
+    if len(L) <= UNROLLED:
+        return linalg.solve_triangular(L, right)
+    # The transpose of what is stored by rows is stored by columns, as LAPACK wants it.
+    return jax.lax.linalg.triangular_solve(L.T, right, left_side=True, lower=False, transpose_a=True)
+
+
+def identity(n: int, dtype: DTypeLike) -> Shaped[Array | np.ndarray, "n n"]:
+    """The identity matrix. A small one is a constant of the program: no code is compiled that makes it."""
+    return np.eye(n, dtype=dtype) if n <= _CONSTANT else jnp.eye(n, dtype=dtype)
+
+
+def diagonal_matrix(elements: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """The matrix with these elements on its diagonal, and zeros elsewhere."""
+    return jnp.where(_on_diagonal(elements.size), elements, jnp.zeros((), elements.dtype))
+
+
+def _on_diagonal(n):
+    # Compiled into the loop that reads it: a constant would have to be copied where LAPACK wants columns.
+    rows, columns = (jax.lax.broadcasted_iota(jnp.int32, (n, n), axis) for axis in (0, 1))
+    return rows == columns
+
+
+def lower_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The elements on the diagonal and below it, zeros elsewhere, whatever is there."""
+    return jnp.where(np.tri(*A.shape, dtype=bool), A, 0.0) if len(A) <= _CONSTANT else jnp.tril(A)
 
 
 def root_tangent(L: Float[Array, "n n"], dS: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Change of the lower root L for a change of `L L^T`; none in columns that are zero."""
     fixed = diagonal(L) == 0
     # With X = L^-1 dS L^-T, dL = L Y has Y + Y^T = X and Y lower: its diagonal is half of X's.
-    complete = L + jnp.diag(fixed.astype(L.dtype))
+    complete = L + diagonal_matrix(fixed.astype(L.dtype))
     X = solve(complete, solve(complete, 0.5 * (dS + dS.T)).T)
-    Y = jnp.tril(X) - 0.5 * jnp.diag(diagonal(X))
-    return jnp.tril(linalg.matmul(complete, jnp.where(fixed, 0.0, Y)))
+    Y = lower_part(X) - 0.5 * diagonal_matrix(diagonal(X))
+    return lower_part(linalg.matmul(complete, jnp.where(fixed, 0.0, Y)))
 
 
 def solve(L: Float[Array, "n n"], b: Float[Array, "n m"]) -> Float[Array, "n m"]:
@@ -90,9 +147,10 @@ def solve(L: Float[Array, "n n"], b: Float[Array, "n m"]) -> Float[Array, "n m"]
 
 def diagonal(A: Float[Array, "n n"]) -> Float[Array, " n"]:
     """The diagonal elements; of a small matrix as slices, which stay vector arithmetic over an ensemble."""
-    if A.shape[0] <= UNROLLED:
-        return jnp.stack([A[i, i] for i in range(A.shape[0])])
-    return jnp.diagonal(A)
+    n = A.shape[0]
+    if n <= UNROLLED:
+        return jnp.stack([A[i, i] for i in range(n)])
+    return jax.lax.slice(A.reshape(n * n), (0,), (n * n,), (n + 1,))
 
 
 def apply(A: Float[Array, "n m"], x: Float[Array, " m"]) -> Float[Array, " n"]:

@@ -22,13 +22,13 @@ def update(
     R: Float[Array, "m m"],
     y_hat: Float[Array, " m"] | None = None,
     mask: Bool[Array, " m"] | None = None,
-    lost: Float[Array, "m _"] | None = None,
+    added_root: Float[Array, "m _"] | None = None,
 ) -> tuple[Gaussian, info.KalmanInfo]:
     """Belief after seeing `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics; as `joseph.update`.
 
     The covariance is `P - W W^T` with `W = P H^T S^-1/2`.
     """
-    return covariance.update(_form, belief, y, H, R, y_hat, mask, lost)
+    return covariance.update(_form, belief, y, H, R, y_hat, mask, added_root)
 
 
 def rts(
@@ -37,10 +37,10 @@ def rts(
     F: Float[Array, "k n"],
     Q: Float[Array, "k k"],
     b: Float[Array, " k"] | float = 0.0,
-    lost: Float[Array, "k _"] | None = None,
+    added_root: Float[Array, "k _"] | None = None,
 ) -> Gaussian:
     """Belief given the future too, from `following`, that of the next step given the same; as `joseph.rts`."""
-    return covariance.rts(_form, belief, following, F, Q, b, lost)
+    return covariance.rts(_form, belief, following, F, Q, b, added_root)
 
 
 def _form(P, H, R, gain, W):

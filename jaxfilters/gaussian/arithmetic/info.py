@@ -64,8 +64,18 @@ def rows(
     ones = jnp.where(jnp.isfinite(mean), jnp.ones_like(mean), jnp.nan)
     shown = factor.apply(H, ones) + factor.apply(noise, jnp.ones(noise.shape[1], noise.dtype)) + y_hat
     seen = materialized(read & jnp.isfinite(shown))
-    wanted = jnp.ones(y.shape, bool) if mask is None else mask
-    return Rows(jnp.where(seen, y - y_hat, 0.0), seen, jnp.sum(wanted & ~seen, dtype=jnp.int32), jnp.any(read & ~seen))
+    return used_rows(jnp.where(seen, y - y_hat, 0.0), read, seen, mask)
+
+
+def used_rows(
+    deviation: Float[Array, " m"],
+    read: Bool[Array, " m"],
+    seen: Bool[Array, " m"],
+    mask: Bool[Array, " m"] | None,
+) -> Rows:
+    """The rows of a measurement, of which `read` are finite and not masked, and `seen` can be used."""
+    invalid = ~seen if mask is None else mask & ~seen
+    return Rows(deviation, seen, jnp.sum(invalid, dtype=jnp.int32), jnp.any(read & ~seen))
 
 
 def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Any:
@@ -87,9 +97,9 @@ def evidence(diagonal: Float[Array, " m"], counts: Bool[Array, " m"], whitened: 
 
     `diagonal` is that of the innovation's root, 1 for the other components; their part of `whitened` is 0.
     """
-    nis = jnp.sum(whitened * whitened)
-    log_scale = jnp.sum(jnp.log(diagonal)) + 0.5 * math.log(2 * math.pi) * jnp.sum(counts)
-    return Evidence(-0.5 * nis - log_scale, nis)
+    # One sum, which is one loop: separate ones would be compiled for the scale, the rank and the length.
+    terms = 0.5 * whitened * whitened + jnp.where(counts, jnp.log(diagonal) + 0.5 * math.log(2 * math.pi), 0.0)
+    return Evidence(-jnp.sum(terms), jnp.sum(whitened * whitened))
 
 
 def report(usable: Rows, root: Float[Array, "m m"], found: Evidence) -> KalmanInfo:

@@ -1,6 +1,5 @@
 """Kalman filter atoms on covariances, with Joseph's form of the update: never indefinite by subtraction."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian.arithmetic import covariance, factor, info
@@ -18,16 +17,17 @@ def update(
     R: Float[Array, "m m"],
     y_hat: Float[Array, " m"] | None = None,
     mask: Bool[Array, " m"] | None = None,
-    lost: Float[Array, "m _"] | None = None,
+    added_root: Float[Array, "m _"] | None = None,
 ) -> tuple[Gaussian, info.KalmanInfo]:
-    """Belief after seeing `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics.
+    """Belief after the observation `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics.
 
-    `y_hat` is `H mean` unless given: for a nonlinear observation it is the predicted one, and H its Jacobian. `lost` is
-    a root of more noise. Components where `mask` is False are as if they were not there, whatever `y`, `y_hat` and the
-    rows of `H`, `R` and `lost` hold, NaN included; so are those that the diagnostics call invalid or deficient. The
+    `y_hat` is `H mean` unless given; for a nonlinear observation it is the predicted one, and H its Jacobian.
+    `added_root` is a root of more noise. Components where `mask` is False have no effect, whatever `y`, `y_hat` and the
+    rows of `H`, `R` and `added_root` hold, NaN included. Neither have those that the diagnostics count as invalid or
+    deficient. The
     covariance is `(I - K H) P (I - K H)^T + K R K^T` (R. Bucy, P. Joseph, "Filtering for stochastic processes", 1968).
     """
-    return covariance.update(_form, belief, y, H, R, y_hat, mask, lost)
+    return covariance.update(_form, belief, y, H, R, y_hat, mask, added_root)
 
 
 def condition(
@@ -37,7 +37,7 @@ def condition(
 
     NaN in the innovation becomes NaN in the shift and in the log density.
     """
-    return covariance.condition(_form, P, H, R, innovation, jnp.ones(innovation.shape, bool))
+    return covariance.condition(_form, P, H, R, innovation)
 
 
 def rts(
@@ -46,7 +46,7 @@ def rts(
     F: Float[Array, "k n"],
     Q: Float[Array, "k k"],
     b: Float[Array, " k"] | float = 0.0,
-    lost: Float[Array, "k _"] | None = None,
+    added_root: Float[Array, "k _"] | None = None,
 ) -> Gaussian:
     """Belief given the future too, from `following`, that of the next step given the same.
 
@@ -54,7 +54,7 @@ def rts(
     x'; what is not known of x' comes on top: no covariance is subtracted (H. Rauch, F. Tung, C. Striebel, "Maximum
     likelihood estimates of linear dynamic systems", AIAA J. 3(8), 1965).
     """
-    return covariance.rts(_form, belief, following, F, Q, b, lost)
+    return covariance.rts(_form, belief, following, F, Q, b, added_root)
 
 
 def _form(P, H, R, gain, W):

@@ -20,10 +20,10 @@ def predict(
     F: Float[Array, "k n"],
     root_Q: Float[Array, "k _"],
     b: Float[Array, " k"] | float = 0.0,
-    lost: Float[Array, "k _"] | None = None,
+    added_root: Float[Array, "k _"] | None = None,
 ) -> GaussianRoot:
-    """Belief in `x' = F x + b + root_Q q`, q ~ N(0, I); `lost` is a root of more noise."""
-    parts = [linalg.matmul(F, belief.root), root_Q, *([] if lost is None else [lost])]
+    """Belief in `x' = F x + b + root_Q q`, q ~ N(0, I); `added_root` is a root of more noise."""
+    parts = [linalg.matmul(F, belief.root), root_Q, *([] if added_root is None else [added_root])]
     return GaussianRoot(factor.apply(F, belief.mean) + b, linalg.tria(jnp.hstack(parts)))
 
 
@@ -34,17 +34,19 @@ def update(
     root_R: Float[Array, "m _"],
     y_hat: Float[Array, " m"] | None = None,
     mask: Bool[Array, " m"] | None = None,
-    lost: Float[Array, "m _"] | None = None,
+    added_root: Float[Array, "m _"] | None = None,
 ) -> tuple[GaussianRoot, info.KalmanInfo]:
-    """Belief after seeing `y = y_hat + H (x - mean) + root_R r`, r ~ N(0, I), and its diagnostics.
+    """Belief after the observation `y = y_hat + H (x - mean) + root_R r`, r ~ N(0, I), and its diagnostics.
 
-    `y_hat` is `H mean` unless given: for a nonlinear observation it is the predicted one, and H its Jacobian. `lost` is
-    a root of more noise. Components where `mask` is False are as if they were not there, whatever `y`, `y_hat` and the
-    rows of `H`, `root_R` and `lost` hold, NaN included; so are those that the diagnostics call invalid or deficient.
+    `y_hat` is `H mean` unless given; for a nonlinear observation it is the predicted one, and H its Jacobian.
+    `added_root` is a root of more noise. Components where `mask` is False have no effect, whatever `y`, `y_hat` and the
+    rows of `H`, `root_R` and `added_root` hold, NaN included. Neither have those that the diagnostics count as invalid
+    or deficient.
+
     The array algorithm of T. Kailath, A. Sayed, B. Hassibi, "Linear Estimation", 2000, section 12.3. The root is not
     triangular; it is as wide as that of `belief`, or square if that is wider.
     """
-    noise = info.observed(mask, root_R if lost is None else jnp.hstack([root_R, lost]))
+    noise = info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root]))
     usable = info.rows(belief.mean, y, H, noise, y_hat, mask)
     noise = info.observed(usable.seen, noise)
     seen = linalg.matmul(info.observed(usable.seen, H), belief.root)
@@ -66,7 +68,7 @@ def rts(
     F: Float[Array, "k n"],
     root_Q: Float[Array, "k _"],
     b: Float[Array, " k"] | float = 0.0,
-    lost: Float[Array, "k _"] | None = None,
+    added_root: Float[Array, "k _"] | None = None,
 ) -> GaussianRoot:
     """Belief given the future too, from `following`, that of the next step given the same.
 
@@ -74,7 +76,7 @@ def rts(
     measured x'; what is not known of x' comes on top (H. Rauch, F. Tung, C. Striebel, "Maximum likelihood estimates of
     linear dynamic systems", AIAA J. 3(8), 1965).
     """
-    noise = root_Q if lost is None else jnp.hstack([root_Q, lost])
+    noise = root_Q if added_root is None else jnp.hstack([root_Q, added_root])
     root, cross, known = _conditioned(linalg.matmul(F, belief.root), noise, belief.root)
     gain = linalg.solve_triangular(root, cross.T, transpose=True).T
     mean = belief.mean + factor.apply(gain, following.mean - factor.apply(F, belief.mean) - b)
@@ -82,10 +84,10 @@ def rts(
 
 
 def noise_root(
-    root_R: Float[Array, "m _"], mask: Bool[Array, " m"] | None = None, lost: Float[Array, "m _"] | None = None
+    root_R: Float[Array, "m _"], mask: Bool[Array, " m"] | None = None, added_root: Float[Array, "m _"] | None = None
 ) -> Float[Array, "m m"]:
-    """Lower root of the noise and of what is lost beside it, zero where masked."""
-    return linalg.tria(info.observed(mask, root_R if lost is None else jnp.hstack([root_R, lost])))
+    """Lower root of the noise and of what is added to it by a root, zero where masked."""
+    return linalg.tria(info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root])))
 
 
 def _conditioned(seen, noise, state):

@@ -9,6 +9,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.constraints.linear import LinearConstraints
 from jaxfilters.gaussian.extended import ExtendedKalman
+from jaxfilters.gaussian.linear import Kalman
 
 
 def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) -> None:
@@ -27,7 +28,7 @@ def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) 
         ValueError: A row moves; the message names the row and the reason.
     """
     model = inner.params
-    if not isinstance(model, ExtendedKalman) or not model.manifold.flat:
+    if not isinstance(model, ExtendedKalman | Kalman) or not model.manifold.flat:
         return
     known = _on_host((constraints.normals, lasting))
     if known is None or not known[1].any():

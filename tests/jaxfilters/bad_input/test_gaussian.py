@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxfilters as jf
@@ -328,7 +329,29 @@ RUN = {
     ),
 }
 
-GAUSSIAN = [Case(name, *case) for name, case in (EXTENDED | WRAPPERS | RUN).items()]
+
+def linear(**changed):
+    given = {"F": np.eye(2), "Q": np.eye(2), "H": np.ones((1, 2)), "R": np.eye(1)}
+    return jf.kalman(PRIOR, **{**given, **changed})
+
+
+LINEAR = [
+    Case("kalman, narrow F", lambda: linear(F=np.ones((2, 1))), ("F", "(2, 2)", "(2, 1)")),
+    Case("kalman, wide H", lambda: linear(H=np.ones((1, 3))), ("H", "(1, 2)", "(1, 3)")),
+    Case("kalman, flat H", lambda: linear(H=np.ones(2)), ("H", "(2,)")),
+    Case("kalman, other Q", lambda: linear(Q=np.eye(3)), ("Q", "(2, 2)", "(3, 3)")),
+    Case("kalman, other R", lambda: linear(R=np.eye(2)), ("R", "(1, 1)", "(2, 2)")),
+    Case("kalman, negative R", lambda: linear(R=-np.eye(1)), ("R", "negative variance", "-1")),
+    Case("kalman, asymmetric Q", lambda: linear(Q=np.array([[1.0, 0.5], [0.0, 1.0]])), ("Q", "symmetric")),
+    Case("kalman, NaN in Q", lambda: linear(Q=np.full((2, 2), np.nan)), ("Q", "finite")),
+    Case("kalman, long b", lambda: linear(b=np.zeros(3)), ("b", "(2,)", "(3,)")),
+    Case("kalman, long d", lambda: linear(d=np.zeros(3)), ("d", "(1,)", "(3,)")),
+    Case("kalman, arithmetic", lambda: linear(arithmetic=jf.arithmetic.square_root), ("prior", "GaussianRoot")),
+    Case("kalman, wide y", lambda: jf.run(linear(), KEY, jnp.zeros((5, 3))), ("observation", "(3,)", "(1,)")),
+    Case("kalman, a control", lambda: jf.run(linear(), KEY, jnp.zeros((5, 1)), jnp.zeros(5)), ("control", "None")),
+]
+
+GAUSSIAN = [*LINEAR] + [Case(name, *case) for name, case in (EXTENDED | WRAPPERS | RUN).items()]
 
 
 @pytest.mark.parametrize("case", GAUSSIAN, ids=lambda case: case.name)

@@ -117,7 +117,7 @@ def test_other_filters_and_lengths_are_rejected():
     def unused(*_):
         return jnp.zeros(())
 
-    with pytest.raises(ValueError, match="made by extended"):
+    with pytest.raises(ValueError, match="made by kalman or extended_kalman"):
         rts(bootstrap(unused, unused, unused, num_particles=2), Gaussian(jnp.zeros((T, 1)), jnp.zeros((T, 1, 1))))
     with pytest.raises(ValueError, match="as long as beliefs, 6"):
         rts(build(arithmetics.joseph), Gaussian(jnp.zeros((T, N)), jnp.zeros((T, N, N))), jnp.zeros(T - 1))

@@ -173,7 +173,7 @@ def test_what_does_not_fit_is_rejected():
     averaged = bootstrap(sample_prior, move, log_likelihood, num_particles=3, scheme=transport(0.5))
     with pytest.raises(ValueError, match="inner must choose ancestors"):
         fixed_lag(averaged, 2)
-    with pytest.raises(ValueError, match="inner must be made by extended"):
+    with pytest.raises(ValueError, match="inner must be made by kalman or extended_kalman"):
         fixed_lag_rts(pf, 2)
     with pytest.raises(ValueError, match="inner must have particles"):
         run(fixed_lag(gaussian, 2), KEY, jnp.asarray(YS))
