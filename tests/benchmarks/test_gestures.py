@@ -20,6 +20,7 @@ def two_shapes(monkeypatch):
     monkeypatch.setattr(gestures, "QUICK", Scale(1, 5, 2, 3))
 
 
+@pytest.mark.system
 def test_without_recordings_only_what_is_drawn_is_measured(two_shapes, monkeypatch, capsys):
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     metrics = gestures.run(quick=True, seed=0, out=None)

@@ -57,6 +57,7 @@ def test_users_are_who_the_training_faces_say():
     assert 45 < eyes_apart_of(made.identity) < 80
 
 
+@pytest.mark.system
 def test_wider_turns_make_better_starts():
     face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0).face
     metrics = start_metrics(face, 0, 6)

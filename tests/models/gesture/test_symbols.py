@@ -95,6 +95,7 @@ def test_features_that_are_not_finite_are_rejected_without_nan(symbols):
     assert not any(np.any(np.isnan(leaf)) for leaf in found)
 
 
+@pytest.mark.system
 def test_a_symbol_is_added_of_five_strokes():
     few = learn(*collection(5, 8, ("caret", "square", "v")), num_states=6)
     more = extended(few, learn(*collection(6, 5, ("z",)), num_states=6))

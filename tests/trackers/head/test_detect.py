@@ -166,6 +166,7 @@ def first_frames(path, count, every):
     return frames[::every]
 
 
+@pytest.mark.system
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "least"), [("franck", 55), ("cap12_edit", 50)])
 def test_a_real_face_is_found_and_has_a_faces_proportions(data_dir, name, least):

@@ -51,6 +51,7 @@ def npz(tmp_path, features):
     return write
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_articulated")
 def test_track_writes_all_results(npz, tmp_path, features, capsys):
     out = tmp_path / "out"
