@@ -41,6 +41,7 @@ def test_a_symbol_is_right_if_shape_and_fingers_are_and_wrong_if_rejected():
     assert scored(("V 1", "V 2"), judged, drawings) == [50, 50]
 
 
+@pytest.mark.system
 def test_recorded_people_are_recognised_from_the_others(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     lines = np.linspace(0, 1, 20)[:, None] * np.array([[100.0, 0, 0]])

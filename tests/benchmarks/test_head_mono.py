@@ -47,6 +47,7 @@ def test_rotation_errors_go_by_yaw():
     assert "m_mae_yaw_30_40" not in metrics
 
 
+@pytest.mark.system
 def test_users_are_who_the_training_faces_say():
     """The eleven without one are ten others; the first user is the person in the video."""
     made = talking_head(head_mono.FIRST_USER, 2)

@@ -16,6 +16,7 @@ def problem(monkeypatch):
     return model, codes, codes[: hmm.NUM_TRAINING_SEQUENCES], hmm.NUM_ITERATIONS
 
 
+@pytest.mark.system
 def test_without_peers_only_this_library_is_timed(problem, monkeypatch, capsys):
     monkeypatch.setattr(_hmm_peers, "installed", list)
     monkeypatch.setattr(hmm, "QUICK_ROUNDS", 1)

@@ -117,6 +117,7 @@ def test_white_acceleration_moves_the_position_too(x64):
     )
 
 
+@pytest.mark.system
 def test_a_hint_at_the_velocity_is_a_measurement_of_it(moves):
     belief = motion.new_belief(jnp.zeros(2))
     found = motion.correct_velocity(belief, jnp.asarray([8.0, -4.0]), 10.0, jnp.asarray(True))

@@ -43,6 +43,7 @@ def symbols():
     return learn(*collection(0, 8), num_states=6)
 
 
+@pytest.mark.system
 def test_symbols_of_other_writers_are_recognised_with_confidence(symbols):
     strokes, labels = collection(1, 12)
     found = recognise(symbols, strokes_last(strokes))
@@ -51,6 +52,7 @@ def test_symbols_of_other_writers_are_recognised_with_confidence(symbols):
     assert np.median(found.confidence.max(0)) > 0.9
 
 
+@pytest.mark.system
 def test_what_is_no_symbol_is_rejected_and_symbols_are_not(symbols):
     bar = hmm.threshold(network(symbols))
     strokes, _ = collection(2, 12)

@@ -48,6 +48,7 @@ def run_with(cache, **more):
     return hit == "True", folder
 
 
+@pytest.mark.system
 def test_the_second_run_finds_what_the_first_has_compiled(tmp_path):
     hit, folder = run_with(tmp_path)
     assert not hit
