@@ -8,6 +8,7 @@ from jaxfilters.benchmarks.scenarios import adaptive
 from jaxfilters.benchmarks.scenarios.adaptive import NOISE, SETTLED, Belief, Sequence
 
 
+@pytest.mark.system
 def test_targets_rest_and_jerk_without_a_jump_of_their_velocity():
     sequence = adaptive.simulate(0, 3, 11)
     truth = np.asarray(sequence.truth)

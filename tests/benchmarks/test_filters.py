@@ -39,6 +39,7 @@ def interpreter(folder, name, script):
     return str(path)
 
 
+@pytest.mark.system
 def test_a_process_of_its_own_answers_with_metrics():
     found = filters.ask(sys.executable, TINY)
     assert found["resampler_n1e6_mismatch_ours"].value < 1e-3
@@ -114,6 +115,7 @@ def test_a_peer_that_is_installed_agrees(name):
     assert found[f"ratio_pf_n1000_to_{name}"][0] > 0
 
 
+@pytest.mark.system
 def test_tasks_compute_in_the_precision_that_is_asked_for():
     double = measure(TINY._replace(tasks=["resampler"], float64=True))
     assert double["resampler_n1e6_mismatch_searchsorted"][0] < 1e-6

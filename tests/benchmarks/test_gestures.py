@@ -20,6 +20,7 @@ def two_shapes(monkeypatch):
     monkeypatch.setattr(gestures, "QUICK", Scale(1, 5, 2, 3))
 
 
+@pytest.mark.system
 def test_without_recordings_only_what_is_drawn_is_measured(two_shapes, monkeypatch, capsys):
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     metrics = gestures.run(quick=True, seed=0, out=None)
@@ -40,6 +41,7 @@ def test_a_symbol_is_right_if_shape_and_fingers_are_and_wrong_if_rejected():
     assert scored(("V 1", "V 2"), judged, drawings) == [50, 50]
 
 
+@pytest.mark.system
 def test_recorded_people_are_recognised_from_the_others(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     lines = np.linspace(0, 1, 20)[:, None] * np.array([[100.0, 0, 0]])

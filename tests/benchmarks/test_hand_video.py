@@ -73,6 +73,7 @@ def test_a_folder_without_the_recording_is_named(tmp_path):
         hand_video.hand_video_metrics(tmp_path)
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_tips_of_the_real_hand_are_near_its_key_points(data_dir, tmp_path):
     """The first 300 frames: open hand, pinches with every finger, a fist."""

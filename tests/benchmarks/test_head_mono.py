@@ -47,6 +47,7 @@ def test_rotation_errors_go_by_yaw():
     assert "m_mae_yaw_30_40" not in metrics
 
 
+@pytest.mark.system
 def test_users_are_who_the_training_faces_say():
     """The eleven without one are ten others; the first user is the person in the video."""
     made = talking_head(head_mono.FIRST_USER, 2)
@@ -57,6 +58,7 @@ def test_users_are_who_the_training_faces_say():
     assert 45 < eyes_apart_of(made.identity) < 80
 
 
+@pytest.mark.system
 def test_wider_turns_make_better_starts():
     face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0).face
     metrics = start_metrics(face, 0, 6)

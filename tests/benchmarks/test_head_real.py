@@ -54,6 +54,7 @@ def test_without_recordings_the_command_says_what_is_missing(monkeypatch, tmp_pa
         head_real.read_video(tmp_path / "none.mp4", None)
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_a_real_face_is_found_and_followed(monkeypatch, data_dir):
     monkeypatch.setenv("JAXFILTERS_DATA", str(data_dir))

@@ -16,6 +16,7 @@ def problem(monkeypatch):
     return model, codes, codes[: hmm.NUM_TRAINING_SEQUENCES], hmm.NUM_ITERATIONS
 
 
+@pytest.mark.system
 def test_without_peers_only_this_library_is_timed(problem, monkeypatch, capsys):
     monkeypatch.setattr(_hmm_peers, "installed", list)
     monkeypatch.setattr(hmm, "QUICK_ROUNDS", 1)
@@ -36,6 +37,7 @@ def test_a_library_that_computes_something_else_is_not_timed(problem):
         hmm.check(model, codes, {"ours": right, "other": untrained})
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", ["dynamax", "hmmlearn"])
 def test_a_peer_that_is_installed_agrees(problem, name):
     if name not in _hmm_peers.installed():

@@ -8,6 +8,7 @@ from jaxfilters.benchmarks.scenarios import _least_squares_peers as peers
 from jaxfilters.benchmarks.scenarios import least_squares
 
 
+@pytest.mark.system
 def test_few_problems_are_solved_and_compared(x64):
     problems = least_squares.random_problems(0, 12)
     metrics = least_squares.answer_metrics(problems)
@@ -20,6 +21,7 @@ def test_few_problems_are_solved_and_compared(x64):
     assert timed["ratio_batch_to_scipy"].value > 0
 
 
+@pytest.mark.system
 def test_shared_variables_are_solved_alike(x64):
     metrics = least_squares.shared_metrics(0, (4, 8), 1)
     assert metrics["shared_apart_from_dense"].value < 1e-7

@@ -34,6 +34,7 @@ def test_cameras_deliver_as_their_setup_says():
     assert all(SETUPS[""].delivers(camera, i, 12) for camera in range(4) for i in frames)
 
 
+@pytest.mark.system
 def test_somebody_is_seen_whole_from_the_feet_to_the_head(room):
     """In front of the first camera, too near to it, and beside its view."""
     camera = room.cameras[0]
@@ -44,6 +45,7 @@ def test_somebody_is_seen_whole_from_the_feet_to_the_head(room):
     assert sees_whole(camera, beside, 0.4).tolist() == [True, False]
 
 
+@pytest.mark.system
 def test_people_are_handed_over_and_nobody_counts_who_is_not_seen(room):
     """With narrow views, more of the time is spent in one of them alone; a camera that stops sees nobody."""
     assert handovers(room, people_cameras.NARROW) > 10
@@ -68,6 +70,7 @@ def test_recordings_are_kept_apart():
     np.testing.assert_array_equal(both.xy_m[2:], one.xy_m)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("half_size")
 def test_every_metric_of_a_setup_is_there(monkeypatch, capsys):
     """All cameras, as in the next test with one program for both; a few frames, no recordings."""

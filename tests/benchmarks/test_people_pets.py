@@ -126,6 +126,7 @@ def test_tracks_are_written_by_frame(tmp_path):
     assert [line[:4] for line in lines[2:]] == ["4,2,", "4,5,"]
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_the_recording_is_read_as_it_lies(data_dir):
     """Every annotated place projects into its annotated box, near the lower edge; the area is that of the column."""

@@ -36,6 +36,7 @@ def test_every_metric_is_there_and_everybody_is_followed(monkeypatch):
     assert metrics["candidates_per_second_8_people_160x120"].value == pytest.approx(rate)
 
 
+@pytest.mark.system
 def test_images_of_all_sizes_show_the_same():
     """The same people at the same places of the image, up to what a smaller image shows."""
     places, sizes = people_speed.crowd(0, 2)

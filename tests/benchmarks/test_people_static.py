@@ -39,6 +39,7 @@ def mean_error(runs, estimates):
     return np.linalg.norm(off, axis=-1).mean(), *off.mean(axis=0)
 
 
+@pytest.mark.system
 def test_the_cameras_show_what_the_paper_says(first, second):
     """Section 3: whole people fill 3.0 to 7.4 percent of camera 1 and 0.8 to 2.7 percent of camera 2."""
     for rooms, points, low, high in (
@@ -50,6 +51,7 @@ def test_the_cameras_show_what_the_paper_says(first, second):
         assert low < shares.min() < shares.max() < high
 
 
+@pytest.mark.system
 def test_lens_distortion_goes_into_the_images_and_out_again():
     calibration = static.camera_2()
     straight = calibration._replace(distortion=np.zeros(5))
@@ -60,6 +62,7 @@ def test_lens_distortion_goes_into_the_images_and_out_again():
     assert overlap(static.straightened(calibration, bent) > 127, expected) > 0.94
 
 
+@pytest.mark.system
 def test_a_desk_stands_in_front_of_the_person_and_hides_the_legs(first):
     open_view, behind_desk = (
         first.simulate(range(1), "desk", ((-1, 1),), LOOKS["body"], with_desk=with_desk) for with_desk in (False, True)
@@ -72,6 +75,7 @@ def test_a_desk_stands_in_front_of_the_person_and_hides_the_legs(first):
     np.testing.assert_allclose([*low[:2], high[2]], [-1.6, 0.15, 0.73], atol=1e-6)
 
 
+@pytest.mark.system
 def test_masks_depend_on_the_key_alone(first):
     runs = [first.simulate(range(seed, seed + 1), "key", ((-1, 1),), LOOKS["shadow"]) for seed in (3, 3, 4)]
     np.testing.assert_array_equal(runs[0].masks, runs[1].masks)
@@ -79,6 +83,7 @@ def test_masks_depend_on_the_key_alone(first):
     assert np.abs(runs[0].starts - runs[0].truth[:, 0]).max() <= 0.15
 
 
+@pytest.mark.system
 def test_the_papers_tracker_meets_the_acceptance_of_table_1(first, second):
     """Section 4, E1: body with holes within 0.06, 0.12, 0.07 and 0.06 m; depth worse than sideways in (a) and (b)."""
     for name, most in {"a": 0.06, "b": 0.12, "c": 0.07, "camera2": 0.06}.items():
@@ -90,6 +95,7 @@ def test_the_papers_tracker_meets_the_acceptance_of_table_1(first, second):
             assert y > x
 
 
+@pytest.mark.system
 def test_step_halving_meets_its_acceptance(first):
     """Section 4, E1: 0.04 m for bodies (prototype .034), .019 m for ellipsoids."""
     for look, size, most in (("holes", BODY_M, 0.04), ("ellipsoid", MODEL_M, 0.025)):
@@ -97,6 +103,7 @@ def test_step_halving_meets_its_acceptance(first):
         assert mean_error(runs, static.run_paper(first.halving, runs))[0] <= most
 
 
+@pytest.mark.system
 def test_depth_cannot_be_seen_where_head_and_feet_are_hidden(first):
     """Section 4, E2: flatness .21, .10, .37 in full view, of lower and upper bodies; .13 and .06 behind desks."""
     flatness = {}
@@ -117,6 +124,7 @@ def test_depth_cannot_be_seen_where_head_and_feet_are_hidden(first):
     assert flatness["desk_b"] < 0.07 < min(flatness["full"], flatness["desk_a"], flatness["upper"])
 
 
+@pytest.mark.system
 def test_a_crossing_pair_keeps_its_identities(first):
     """Section 4, E3: mean error within 0.10 m for both, no exchange (prototype .070, .056)."""
     truth = people_static._ways(people_static.CROSSING_M)[None]
@@ -127,6 +135,7 @@ def test_a_crossing_pair_keeps_its_identities(first):
     assert not people_static._confused(runs, estimates).any()
 
 
+@pytest.mark.system
 def test_people_who_are_taller_than_believed_are_placed_wrong_but_not_lost(first):
     """Section 4, E5: within 0.10 m for heights up to 5 percent off."""
     for factor in (0.95, 1.05):
@@ -134,6 +143,7 @@ def test_people_who_are_taller_than_believed_are_placed_wrong_but_not_lost(first
         assert mean_error(runs, static.run_paper(first.paper, runs))[0] <= 0.10
 
 
+@pytest.mark.system
 def test_binary_images_find_people_from_farther_away_than_ternary_ones(first):
     """Section 4, E8: from 0.5 m .83 and .50 are found, from 0.15 m all."""
     shares = {}

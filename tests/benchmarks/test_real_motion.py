@@ -57,6 +57,7 @@ def test_detections_lie_where_their_truth_is_seen(data_dir):
         assert 0.5 < found.noise < 12.0
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_one_frame_lifted_within_limits_is_nearer_than_its_back_projection(data_dir):
     """By more than four standard errors of the difference, over poses a third of a second apart."""

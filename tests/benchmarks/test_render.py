@@ -16,6 +16,7 @@ def test_known_disagreement_is_reported():
     assert agreement([(ours, theirs), (ours, ours)]) == (pytest.approx(0.5 * 5 / 15), pytest.approx(15 / 25))
 
 
+@pytest.mark.system
 def test_fine_capsules_have_the_volume_of_capsules():
     mesh = render.hand_mesh(render.GEOMETRY)
     capsules = render.cloud(0, 2, mesh).capsules
@@ -40,6 +41,7 @@ def test_every_metric_is_there(monkeypatch):
     assert metrics["silhouette_iou_mesh"].value > 0.995
 
 
+@pytest.mark.system
 def test_without_embree_only_our_own_times_remain(monkeypatch, capsys):
     monkeypatch.setattr(render, "NUM_POSES", 8)  # as above: the same programs
     monkeypatch.setattr(render, "QUICK_ROUNDS", 1)

@@ -5,6 +5,7 @@ import pytest
 from jaxfilters.benchmarks.scenarios import scale
 
 
+@pytest.mark.system
 def test_filters_in_parallel_and_one_frame_after_the_other_agree_and_are_compared():
     metrics = scale.in_time(0, 8, 1)
     assert set(metrics) == {f"in_time_{name}_{what}_t8" for name in ("filter", "smoother") for what in ("ratio", "ms")}

@@ -3,11 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfilters.benchmarks.scenarios import thumb
 from jaxfilters.models.fingertip.thumb import POSTURE
 
 
+@pytest.mark.system
 def test_accumulated_decisions_meet_the_acceptance_and_the_posterior_beats_them():
     metrics = {name: metric.value for name, metric in thumb.run(quick=True, seed=0, out=None).items()}
     for task in thumb.TASKS:

@@ -77,6 +77,7 @@ def test_vmap_over_keys_equals_single_runs():
     np.testing.assert_allclose(together, alone, rtol=1e-5)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("hidden", [0.0, jnp.nan, jnp.inf])
 def test_unseen_frames_change_nothing_whatever_they_hold(hidden):
     pf = make_filter()

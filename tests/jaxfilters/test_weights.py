@@ -56,6 +56,7 @@ def test_moments_agree_with_numpy_and_ignore_weightless_particles(x64):
     np.testing.assert_allclose(covariance, np.cov(x, aweights=w, bias=True), rtol=1e-12)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("probability", "expected"), [(0.0, 1), (0.2, 1), (0.201, 2), (0.5, 2), (0.9, 4), (1.0, 4)])
 def test_quantile_is_the_smallest_value_with_enough_weight_below(probability, expected):
     # Values 1, 2, 3, 4 weigh 0.2, 0.3, 0.3, 0.2 parts; 0 and 9 weigh nothing.

@@ -24,6 +24,7 @@ def simulated(seed=0, sensor=0.5, drive=40.0, frames=200):
     return times, places, seen
 
 
+@pytest.mark.system
 def test_noises_are_learnt_from_tracks_with_gaps():
     times, places, seen = simulated()
     tracks, means = tracks_of(seen, times)
@@ -35,6 +36,7 @@ def test_noises_are_learnt_from_tracks_with_gaps():
     assert np.sqrt(np.mean((smoothed - places) ** 2)) < 0.8 * np.sqrt(np.nanmean((seen - places) ** 2))
 
 
+@pytest.mark.system
 def test_the_likelihood_is_that_of_all_readings_at_once():
     times, _, seen = simulated(frames=5)
     tracks, _ = tracks_of(seen, times)

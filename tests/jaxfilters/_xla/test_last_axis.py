@@ -138,6 +138,7 @@ def test_second_derivatives_are_those_of_the_custom_rule() -> None:
     np.testing.assert_allclose(second, -0.5 * jnp.sin(x), 1e-5)
 
 
+@pytest.mark.system
 def test_maps_within_maps_and_other_axes() -> None:
     function = lambda x, y: jnp.outer(x, y) @ y
     x, y = jax.random.normal(jax.random.key(0), (4, 2)), jax.random.normal(jax.random.key(1), (4, 3))

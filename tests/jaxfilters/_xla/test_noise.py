@@ -10,6 +10,7 @@ from jaxfilters._xla.noise import standard_normal
 KEYS = {"typed": jax.random.key(5), "old": jax.random.PRNGKey(7), "other": jax.random.key(1, impl="rbg")}
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", KEYS)
 @pytest.mark.parametrize("shape", [(), (3,), (10, 101), (2, 3, 5), (0, 4)])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float16])

@@ -153,6 +153,7 @@ def test_a_particle_filter_draws_what_it_is_told(draws):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_the_gradient_of_the_log_evidence_agrees_with_differences():
     density = fit.over_sequences(KEY, filter_of, jnp.asarray(simulate(RNG, (9, 1, 3), 0.8, 0.5, 0.4), jnp.float32))
     assert fit.check_gradient(density, THETA, LIMITS).error < 1e-7

@@ -32,6 +32,7 @@ METHODS = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_finds_the_closed_form_and_its_errors(x64, name):
     found = fit.maximize(density(), START, LIMITS, method=METHODS[name])
@@ -118,6 +119,7 @@ def test_rotations_covariances_and_shares_have_their_closed_forms(x64):
 SLOW_STEPS = optax.adam(0.1)
 
 
+@pytest.mark.system
 def test_a_search_continues_where_it_ended():
     def at_most(steps):
         return fit.first_order(SLOW_STEPS, max_steps=steps, patience=1000)

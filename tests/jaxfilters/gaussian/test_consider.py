@@ -94,6 +94,7 @@ def test_where_every_view_is_new_it_is_the_inner_filter(x64):
     np.testing.assert_allclose(views.inner.covariance, alone.covariance, rtol=1e-12)
 
 
+@pytest.mark.system
 def test_memories_of_constraints_stay_with_the_constant_quantities(x64):
     inner, _ = stick()
     rows = linear_constraints(np.array([[0.0, 1.0]]), np.array([-np.inf]), np.array([58.0]))

@@ -384,6 +384,7 @@ def follow(scale):
     return run(filter, KEY, jnp.ones((3, 2)))
 
 
+@pytest.mark.system
 def test_filters_map_over_sequences_and_priors():
     filter = linear_filter_32()
     ys = jnp.asarray(RNG.normal(size=(T, M, 4)), jnp.float32)

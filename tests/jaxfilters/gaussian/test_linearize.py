@@ -30,6 +30,7 @@ def rng():
     return np.random.default_rng(3)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("strategy", STRATEGIES.values(), ids=STRATEGIES)
 @pytest.mark.parametrize("n", [3, 10])
 def test_a_linear_function_is_itself(x64, rng, form, strategy, n):

@@ -68,6 +68,7 @@ def test_it_comes_back_after_it_went_astray():
     np.testing.assert_allclose(final.mean, 8.0, atol=0.3)
 
 
+@pytest.mark.system
 def test_the_share_of_outliers_is_learnt_by_gradient():
     def evidence(share):
         prior = Gaussian(jnp.array([0.5]), jnp.array([[2.0]]))

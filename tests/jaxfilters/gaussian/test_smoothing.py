@@ -101,6 +101,7 @@ def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
     assert infos.log_evidence[3] == 0
 
 
+@pytest.mark.system
 def test_the_smoother_differentiates(x64):
     filter = build(arithmetics.joseph)
     ys, controls = jnp.asarray(YS), jnp.ones(T)

@@ -65,6 +65,7 @@ def test_draws_follow_the_chain_and_the_emission():
     assert hmm.sample(jax.random.key(0), hmm.from_probabilities(INITIAL, TRANSITION), 3)[1] is None
 
 
+@pytest.mark.system
 def test_the_online_filter_is_the_forward_pass(x64):
     ours = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), model())
     y = jnp.array([0, 0, 1, 2, 2, 0, 1])

@@ -63,6 +63,7 @@ def test_solutions_are_feasible_and_stationary(solved):
     assert np.all(after <= before)
 
 
+@pytest.mark.system
 def test_scipy_finds_nothing_better(solved):
     """From the same start, or, where the two end in different minima, from where this solver ended."""
     (A, b, c, lower, upper, start), (y, _, energy, _, _) = solved
@@ -84,6 +85,7 @@ def test_large_residuals_do_not_slow_it_down(solved):
     assert np.quantile(steps, 0.9) <= 20
 
 
+@pytest.mark.system
 def test_every_iterate_is_feasible_and_none_is_worse_than_the_last():
     with jax.enable_x64(True):
         A, b, c, lower, upper, start = map(jnp.asarray, problems(1))

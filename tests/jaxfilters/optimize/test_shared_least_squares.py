@@ -75,6 +75,7 @@ def narrow(start):
     return beside(-0.1), beside(0.15)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("box", [infinite, narrow])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_solution_is_the_dense_one(x64, seed, box):

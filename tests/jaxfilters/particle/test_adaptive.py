@@ -104,6 +104,7 @@ def test_a_large_ensemble_has_the_variance_and_the_evidence_of_the_kalman_filter
     np.testing.assert_allclose(log_evidence, exact_evidence, atol=0.05)
 
 
+@pytest.mark.system
 def test_the_fit_has_learnt_from_the_estimates_from_the_third_on():
     ys, taus = simulate(2)
     state, (states, _) = run(make_filter(partitions=Partitions(consecutive(2, 1))), jax.random.key(2), ys, taus)
@@ -204,6 +205,7 @@ def anything(particles, y):
     return jnp.zeros(particles.shape[1])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("partitions", [None, Partitions(consecutive(2, 1))])
 def test_filters_compile_once_and_run_together_as_they_do_alone(partitions):
     ys, taus = simulate(10)

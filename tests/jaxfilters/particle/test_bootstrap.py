@@ -81,6 +81,7 @@ def test_evidence_is_unbiased(ess_threshold, scheme):
     assert abs(z) < 4
 
 
+@pytest.mark.system
 def test_keys_and_normals_both_give_the_posterior_mean():
     ys = simulate(1)
     _, exact_mean = exact_log_evidence(ys, 0.4)

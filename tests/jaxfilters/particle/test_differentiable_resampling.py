@@ -64,6 +64,7 @@ def test_the_default_is_the_score_of_every_parameter():
     assert abs(z).max() < 4
 
 
+@pytest.mark.system
 def test_soft_resampling_leaves_the_evidence_unbiased():
     # The evidence itself is unbiased, its logarithm is not: a z-test at 4 sigma.
     pf = particle_filter(jnp.asarray(THETA, jnp.float32), num_particles=100, scheme=soft(0.5), ess_threshold=0.8)

@@ -70,6 +70,7 @@ def twice(key, particles, log_likelihood, stage_weights=uncorrected):
     return partitioned_update(key, particles, even, ancestors, log_likelihood, jitter, stage_weights=stage_weights)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("stage_weights", "counts"), [(uncorrected, "twice"), (corrected, "once")])
 def test_both_stages_give_the_moments_of_their_closed_form(stage_weights, counts):
     mean, variance, log_evidence = closed_form(counts)
@@ -120,6 +121,7 @@ def test_the_likelihood_of_one_particle_serves_all_and_is_traced_once():
     assert not TRACES
 
 
+@pytest.mark.system
 def test_where_nothing_explains_the_observation_weights_are_even_and_the_evidence_says_so():
     particles = moved(jax.random.key(2), 64)
     calls = []

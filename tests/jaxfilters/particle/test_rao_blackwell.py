@@ -285,6 +285,7 @@ def observe_both(x):
     return LinearObservation(x, jnp.full((1, 1), 0.1), jnp.full((1, 1), R))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("builder", [rao_blackwell, rao_blackwell_shared])
 def test_an_observed_linear_state_matches_the_joint_kalman_filter(builder):
     # y = x + 0.1 v + e; the evidence is unbiased: z-test over 400 runs at 4 sigma.

@@ -77,6 +77,7 @@ def test_draws_that_should_be_independent_have_the_multinomial_variance():
     assert (abs(np.cov(counts.T) - covariance) < 5 * sigma).all()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("n", [1, 1000])
 def test_even_dead_and_undefined_ensembles(scheme, n):
     for log_weights in (jnp.full(n, -math.log(n)), jnp.full(n, -30.0)):

@@ -180,6 +180,7 @@ def test_reversal_of_the_whole_hand_leaves_all_features_unchanged(seed, pivot_at
     np.testing.assert_allclose(reversed_R, J @ R @ M, atol=1e-12)
 
 
+@pytest.mark.system
 def test_reversal_is_a_signed_permutation_and_its_own_inverse_up_to_the_sign_of_the_quaternion(random_state):
     hand = articulated_hand(Layout(2))
     x = jnp.asarray(random_state(np.random.default_rng(0), hand.layout))

@@ -93,6 +93,7 @@ def test_links_keep_their_lengths(random_state):
         np.testing.assert_allclose(np.linalg.norm(links, axis=2).ravel(), x[layout.lengths], rtol=1e-12)
 
 
+@pytest.mark.system
 def test_vmap_over_the_last_axis_equals_a_loop(random_state):
     layout = five_fingers()
     states = jnp.asarray(np.stack([random_state(np.random.default_rng(seed), layout) for seed in range(4)], axis=-1))

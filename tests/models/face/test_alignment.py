@@ -59,6 +59,7 @@ def test_shifts_by_fractions_of_a_pixel_are_found(face):
         assert found.score.min() > 0.998
 
 
+@pytest.mark.system
 def test_landmarks_are_found_on_turned_planes(face, head_poses):
     """Also where the pose that is expected is 3 mm and 3 degrees off."""
     rng = np.random.default_rng(1)
@@ -210,6 +211,7 @@ def test_flat_images_score_nothing(face):
     assert np.all(np.asarray(found.score) < 0.1)
 
 
+@pytest.mark.system
 def test_landmarks_that_moved_far_are_found_again(face):
     """One landmark, 14 px from where it is expected; the others stay as they were."""
     pose = face.scene.registered

@@ -81,6 +81,7 @@ def test_exact_landmarks_give_back_the_face_and_where_it_is(x64, seed):
     np.testing.assert_allclose(of(found), of(true), atol=1e-3)
 
 
+@pytest.mark.system
 def test_the_least_energy_within_the_box_is_that_of_scipy(x64):
     """Noise of 1 px and a narrow box, of which several bounds are met."""
     rng = np.random.default_rng(7)

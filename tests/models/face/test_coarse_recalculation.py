@@ -70,6 +70,7 @@ def test_blur_widens_the_range_from_which_landmarks_are_found(scenes, px, plain,
     assert found[1] >= coarse
 
 
+@pytest.mark.system
 def test_the_last_level_is_as_exact_as_without_blur(scenes):
     for scene in scenes:
         np.testing.assert_allclose(scene.coarse(2.0), scene.plain(2.0), atol=0.05)

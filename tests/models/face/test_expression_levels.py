@@ -29,6 +29,7 @@ def test_rates_run_from_shortest_to_longest(x64):
         deformation_rate(jnp.array([1, np.nan]))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("length", "strengths"), [(mouth_width, (0.9, 0.0)), (face_length, (0.0, 0.9))])
 def test_levels_lie_where_the_length_says(x64, length, strengths):
     draw = np.random.default_rng(0)

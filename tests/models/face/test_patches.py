@@ -167,6 +167,7 @@ def test_curved_skin_bends_its_picture(plane_scene, head_poses, x64, camera):
             assert np.abs(bent[camera, k]).max() > 3 * np.abs(plane + bent[camera, k] - expected).mean()
 
 
+@pytest.mark.system
 def test_turned_templates_are_what_the_images_show(plane_scene, head_poses, x64):
     found = registered(plane_scene)
     compare = jax.vmap(jax.vmap(ncc))

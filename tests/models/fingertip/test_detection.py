@@ -52,6 +52,7 @@ def check_accuracy(num_fingers, shape, blur, num_frames):
         assert np.percentile(tips, 95) <= 1.7
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("num_fingers", range(6))
 @pytest.mark.parametrize(("shape", "blur"), [(SMALL, 1.0), (SMALL, 2.2), (LARGE, 2.2)])
 def test_counts_and_places_are_right(num_fingers, shape, blur):

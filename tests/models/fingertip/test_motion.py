@@ -72,6 +72,7 @@ def test_it_converges_to_the_riccati_equation(moves):
     np.testing.assert_allclose(U[-50:], 7.352, atol=1e-3)
 
 
+@pytest.mark.system
 def test_predictions_ahead_are_predictions_one_after_the_other(moves):
     """Oracle 3: [P10, P11] within 1e-12, for both drives."""
     L = np.random.default_rng(1).normal(size=(4, 4))
@@ -116,6 +117,7 @@ def test_white_acceleration_moves_the_position_too(x64):
     )
 
 
+@pytest.mark.system
 def test_a_hint_at_the_velocity_is_a_measurement_of_it(moves):
     belief = motion.new_belief(jnp.zeros(2))
     found = motion.correct_velocity(belief, jnp.asarray([8.0, -4.0]), 10.0, jnp.asarray(True))

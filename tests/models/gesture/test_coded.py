@@ -47,12 +47,14 @@ def shapes(training):
     return coded.learn_paths(paths, labels, num_states=8)
 
 
+@pytest.mark.system
 def test_symbols_of_another_writer_are_recognised_from_codes(published, shapes, others):
     strokes, _, labels = others
     assert right(published, coded.recognise_each(published, strokes, margin=-10.0), labels) >= 0.93
     assert right(shapes, coded.recognise_each(shapes, strokes), labels) >= 0.97
 
 
+@pytest.mark.system
 def test_symbols_of_another_writer_are_recognised_from_paths(shapes, others):
     _, paths, labels = others
     found = coded.recognise_paths(shapes, paths)
@@ -60,6 +62,7 @@ def test_symbols_of_another_writer_are_recognised_from_paths(shapes, others):
     np.testing.assert_allclose(found.confidence.sum(axis=0), 1, rtol=1e-5)
 
 
+@pytest.mark.system
 def test_one_stroke_is_judged_as_among_many(published, shapes, others):
     strokes, paths, _ = others
     for symbols in (published, shapes):
@@ -78,6 +81,7 @@ def test_published_models_are_blurred_probabilities_that_fit_what_was_counted(pu
     assert [int(published.names[i][-1]) for i in published.owner] == most.tolist()
 
 
+@pytest.mark.system
 def test_strokes_that_are_none_are_rejected(published, shapes):
     none = [((), ()), ([1], [1]), ([STILL] * 40, [1] * 40), ([1, 2, STILL, 3], [1, 1, 1, 1])]
     strokes = [(np.array(codes, int), np.array(counts, int)) for codes, counts in none]
@@ -91,6 +95,7 @@ def test_strokes_that_are_none_are_rejected(published, shapes):
         assert coded.recognise_path(shapes, points, np.ones(len(points), int), margin=-1e9).label == -1
 
 
+@pytest.mark.system
 def test_scribbles_are_rejected(shapes):
     rng = np.random.default_rng(0)
     heading = np.cumsum(rng.normal(0, 1.5, (40, 80)), axis=1)
@@ -99,6 +104,7 @@ def test_scribbles_are_rejected(shapes):
     assert np.mean(found.label < 0) >= 0.85
 
 
+@pytest.mark.system
 def test_codes_outside_their_range_are_refused(shapes):
     five = np.ones(5, int)
     for codes, counts, word in (
@@ -138,6 +144,7 @@ def test_the_number_of_tips_is_the_one_most_often_seen():
     assert coded.voted(np.zeros(0, int)) == 0
 
 
+@pytest.mark.system
 def test_a_symbol_is_added_of_five_strokes(shapes, others):
     _, paths, labels = collection(2, 5, ("Z",))
     few = [label == "Z 1" for label in labels]

@@ -3,11 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfilters import hmm
 from jaxfilters.models.gesture.rejection import LEAVING, threshold_log_likelihood
 
 
+@pytest.mark.system
 def test_it_is_the_threshold_model_of_the_symbols_side_by_side():
     rng = np.random.default_rng(0)
     chain = hmm.from_topology(hmm.left_right(4), initial=hmm.left_right_initial(4))

@@ -43,6 +43,7 @@ def symbols():
     return learn(*collection(0, 8), num_states=6)
 
 
+@pytest.mark.system
 def test_symbols_of_other_writers_are_recognised_with_confidence(symbols):
     strokes, labels = collection(1, 12)
     found = recognise(symbols, strokes_last(strokes))
@@ -51,6 +52,7 @@ def test_symbols_of_other_writers_are_recognised_with_confidence(symbols):
     assert np.median(found.confidence.max(0)) > 0.9
 
 
+@pytest.mark.system
 def test_what_is_no_symbol_is_rejected_and_symbols_are_not(symbols):
     bar = hmm.threshold_model(network(symbols))
     strokes, _ = collection(2, 12)
@@ -95,6 +97,7 @@ def test_features_that_are_not_finite_are_rejected_without_nan(symbols):
     assert not any(np.any(np.isnan(leaf)) for leaf in found)
 
 
+@pytest.mark.system
 def test_a_symbol_is_added_of_five_strokes():
     few = learn(*collection(5, 8, ("caret", "square", "v")), num_states=6)
     more = extended(few, learn(*collection(6, 5, ("z",)), num_states=6))

@@ -66,6 +66,7 @@ def random_camera(rng):
     return K @ np.column_stack([R, -R @ rng.uniform([-3, -3, 0.5], [3, 3, 4])]) * rng.uniform(-2, 2)
 
 
+@pytest.mark.system
 def test_the_outline_holds_a_million_projected_points_tightly(camera, person):
     uv, _ = camera.project(jnp.asarray(surface(person)))
     seen = outline(camera.P, person)

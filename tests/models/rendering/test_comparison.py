@@ -145,6 +145,7 @@ def test_an_image_is_no_variable(camera, random_capsules):
         jax.grad(lambda y: compare_capsules(camera, capsules, y, MAX_ERROR)[0])(observed_image(camera.shape))
 
 
+@pytest.mark.system
 def test_a_pose_that_is_no_number_has_no_cost(camera, random_capsules):
     capsules = random_capsules(0)
     broken = jax.tree.map(lambda leaf: leaf.at[0].set(jnp.nan), capsules)

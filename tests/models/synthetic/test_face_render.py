@@ -98,6 +98,7 @@ def test_noise_has_a_standard_deviation_of_two_grey_levels(scene):
     assert abs((a - b).mean()) < 0.02
 
 
+@pytest.mark.system
 def test_head_is_a_brighter_ellipse_before_the_background(scene):
     image = averaged(plain(scene))[0]
     center = np.asarray(Rotation.from_euler("ZYX", POSE[3:]).as_matrix() @ [0, 5, 70] + np.asarray(POSE[:3]))

@@ -68,6 +68,7 @@ def test_the_occluder_covers_mouth_and_nostrils_in_both_cameras_and_nothing_else
                 np.testing.assert_array_equal(hidden[window], seen[window])
 
 
+@pytest.mark.system
 def test_one_camera_will_do():
     rig = monocular(Pinhole.from_intrinsics(400.0, (159.5, 119.5), (240, 320)))
     one = face_sequence(jax.random.key(2), motion("slow", 3, 1, place_mm=(0.0, 0.0, 650.0)), rig=rig)

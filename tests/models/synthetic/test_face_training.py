@@ -30,6 +30,7 @@ def small_ict(x64):
     return IctModel(40 * normal(), normal(100), normal(len(NAMES)), jnp.arange(2, 70), jnp.zeros((1, 3), int), NAMES)
 
 
+@pytest.mark.system
 def test_the_generator_gives_the_levels_of_the_specification(x64):
     people = people_of(jax.random.key(0), 3)
     shapes = generator_shapes(jax.random.key(1), people, 0.0)

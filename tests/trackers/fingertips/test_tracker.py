@@ -175,6 +175,7 @@ def test_a_finger_is_given_up_when_its_prediction_is_too_uncertain():
     assert sorted(again[-1].identity[again[-1].is_tip]) == [int(max(reports[-1].identity)), 2]
 
 
+@pytest.mark.system
 def test_the_papers_finger_is_given_up_after_four_misses(published):
     """Section 2.4: theta = 300 allows four; confirmation takes three detections."""
     is_early = np.arange(FRAMES) < 20

@@ -166,6 +166,7 @@ def first_frames(path, count, every):
     return frames[::every]
 
 
+@pytest.mark.system
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "least"), [("franck", 55), ("cap12_edit", 50)])
 def test_a_real_face_is_found_and_has_a_faces_proportions(data_dir, name, least):
@@ -186,6 +187,7 @@ def test_a_real_face_is_found_and_has_a_faces_proportions(data_dir, name, least)
     assert np.mean((down[:, 4:] < -0.1) & (down[:, 4:] > -0.6)) > 0.95  # brows
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_real_video_starts_by_itself(data_dir):
     frames = first_frames(data_dir / "talking_face_video" / "franck.mp4", 60, 1)

@@ -48,6 +48,7 @@ def face():
     return Face()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("off", [(0, 0, 0, 0, 0, 0), (1.5, -1, 4, 0.7, -1.5, 1)])
 def test_the_fit_finds_the_pose_from_nearby(face, off):
     found = face.refined(1, off)
@@ -60,11 +61,13 @@ def test_the_fit_finds_the_pose_from_nearby(face, off):
     np.testing.assert_allclose(found.belief.mean[POSE:], 0, atol=1e-3)
 
 
+@pytest.mark.system
 def test_a_face_at_rest_keeps_its_registered_shape(face):
     found = face.refined(1)
     np.testing.assert_allclose(found.shape, face.state.registered.shape, atol=0.02)
 
 
+@pytest.mark.system
 def test_a_face_that_deforms_is_measured(face):
     """The mouth and the brows have moved by some 6 mm; what is measured is where they are, but for depth."""
     found = face.refined(2)
@@ -78,6 +81,7 @@ def test_a_face_that_deforms_is_measured(face):
     assert np.all(np.abs(error) < [0.6, 0.8, 2.5, 0.6, 1.5, 2.0])
 
 
+@pytest.mark.system
 def test_landmarks_that_moved_become_loose(face):
     found = face.refined(2)
     change = np.sqrt(np.asarray(found.looseness)) - np.sqrt(np.asarray(face.state.looseness))
@@ -86,6 +90,7 @@ def test_landmarks_that_moved_become_loose(face):
         assert np.all((np.asarray(values) >= low * (1 - 1e-5)) & (np.asarray(values) <= high))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["noise", "flat"])
 def test_no_face_is_not_found(face, kind):
     noise = np.random.default_rng(0).integers(0, 256, face.images[0].shape)
@@ -96,6 +101,7 @@ def test_no_face_is_not_found(face, kind):
     np.testing.assert_allclose(found.slopes.mean, face.state.slopes.mean, atol=1e-6)
 
 
+@pytest.mark.system
 def test_the_slopes_of_the_skin_become_better_known(face):
     found = face.refined(1)
     before, after = (np.diagonal(s.covariance, axis1=1, axis2=2) for s in (face.state.slopes, found.slopes))
@@ -103,6 +109,7 @@ def test_the_slopes_of_the_skin_become_better_known(face):
     assert np.median(after / before) < 0.8
 
 
+@pytest.mark.system
 def test_the_papers_estimate_is_the_mean_that_the_search_has_made(face):
     rng = np.random.default_rng(1)
     particles = rng.normal(size=(POSE + NUM_MODES, 50))

@@ -187,6 +187,7 @@ class Frames:
         self.windows = recalculation.patches(self.images[0], self.shapes[0], self.pose, self.video.rig)
 
 
+@pytest.mark.system
 def test_shapes_recalculated_on_rendered_frames_are_right():
     """Oracle 9: a neutral model, the true pose, an expression that it has never seen; six faces."""
     before, after = [], []
@@ -208,6 +209,7 @@ def test_shapes_recalculated_on_rendered_frames_are_right():
     assert int(info.iterations) <= 5
 
 
+@pytest.mark.system
 def test_recalculation_goes_on_from_the_frame_before():
     """From windows of the frame before where there are such, else from the registered ones."""
     frames = Frames(1)

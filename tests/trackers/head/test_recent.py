@@ -32,6 +32,7 @@ def scene():
     return made.rig, registered, shape, pose, jnp.asarray(made.uv[0], jnp.float32), changed
 
 
+@pytest.mark.system
 def test_a_changed_landmark_is_followed_and_the_others_stay_registered(scene):
     rig, registered, shape, pose, uv, (before, after) = scene
     slopes = unknown_slopes(len(shape))
@@ -54,6 +55,7 @@ def test_a_changed_landmark_is_followed_and_the_others_stay_registered(scene):
     np.testing.assert_allclose(seen.apart[:, CHANGED], np.tile(MOVED, (2, 1)), atol=0.1)
 
 
+@pytest.mark.system
 def test_templates_are_renewed_only_where_the_looks_have_changed(scene):
     rig, registered, shape, pose, _, (before, _) = scene
     slopes = unknown_slopes(len(shape))
@@ -69,6 +71,7 @@ def test_templates_are_renewed_only_where_the_looks_have_changed(scene):
     np.testing.assert_allclose(new[:, CHANGED], window, atol=1.0)
 
 
+@pytest.mark.system
 def test_a_landmark_drifts_with_every_frame_until_it_is_anchored_again(scene):
     rig, registered, shape, pose, uv, (before, after) = scene
     slopes = unknown_slopes(len(shape))

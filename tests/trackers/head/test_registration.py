@@ -55,6 +55,7 @@ def truth(face):
     return np.asarray(place(jnp.asarray(face.shapes[0]), jnp.asarray(face.poses[0])), float)
 
 
+@pytest.mark.system
 def test_matches_are_right_to_a_part_of_a_pixel_and_depths_follow():
     """Noise of 2 grey levels; 0.15 px in each coordinate is asked for. Depth errs by z^2 / (f B) per pixel (4.4 mm)."""
     pixels, depths = [], []
@@ -79,6 +80,7 @@ def test_matches_are_right_both_ways(scene):
     assert np.sqrt(np.mean((uv - face.uv[0, 0]) ** 2)) < 0.15
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("num_cameras", [2, 3])
 def test_rigs_need_not_be_rectified(num_cameras):
     face = first(5, toed_in(num_cameras=num_cameras), (55.0, 5, 620, 0.05, -0.1, 0.08))
@@ -194,6 +196,7 @@ def test_what_does_not_belong_together_is_an_error(scene, function):
         function(images[:1], points, monocular(CAMERA))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("pose", [(0.0, 0, 650, 0, 0, 0), (30.0, -20, 500, 0.1, 0.25, -0.15)])
 def test_one_camera_gives_an_average_face_on_the_given_points(pose):
     face = first(1, monocular(CAMERA), pose)

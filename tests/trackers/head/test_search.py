@@ -91,6 +91,7 @@ def particles_about(face, deformed=1.0, n=N):
     return face.x[:, None] + jnp.asarray(spread[:, None] * rng.normal(size=(POSE + NUM_MODES, n)), float)
 
 
+@pytest.mark.system
 def test_weights_are_those_of_the_paper(face):
     """Oracle 4, from projections one by one, and windows cut one by one."""
     particles = particles_about(face, n=20).at[:, 0].set(face.x)
@@ -130,6 +131,7 @@ def permuted(model, rig, images, landmarks, cameras):
     return model, jax.tree.map(lambda leaf: leaf[cameras], rig), images[cameras]
 
 
+@pytest.mark.system
 def test_the_order_of_landmarks_and_cameras_does_not_matter(face, x64):
     """Oracle 13: one frame with the same random keys; the world stays the frame of the left camera."""
     wide = lambda tree: jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), float), tree)

@@ -51,6 +51,7 @@ def said(session):
     return [what for _, what in session.events]
 
 
+@pytest.mark.system
 def test_a_face_that_holds_still_is_detected_registered_and_followed(drawn):
     images, _ = drawn(STABLE_FRAMES + 8)
     session = HeadSession(nominal())
@@ -81,6 +82,7 @@ def whole(moving):
     return HeadSession(video.rig, points=video.uv[0, 0].astype(float)).process(images, video.times)
 
 
+@pytest.mark.system
 def test_given_points_register_the_first_frame(moving, whole):
     video, _ = moving
     np.testing.assert_array_equal(whole.status, [INITIALISING] + [RIGID] * 20)
@@ -93,6 +95,7 @@ def test_given_points_register_the_first_frame(moving, whole):
     np.testing.assert_allclose(whole.image_points[1:], video.uv[1:], atol=0.5)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("sizes", [(1, 3, 9, 8), (0, 21), (10, 0, 11)])
 def test_pieces_of_any_size_give_the_same_rows(moving, whole, sizes):
     """But for the rounding of intervals, which the fit to the images forgets."""
@@ -108,6 +111,7 @@ def test_pieces_of_any_size_give_the_same_rows(moving, whole, sizes):
     np.testing.assert_allclose(pieces.image_points, whole.image_points, atol=0.01)
 
 
+@pytest.mark.system
 def test_a_clock_that_counts_from_long_ago_does_not_matter(moving, whole):
     """Single precision has steps of 128 s at this time."""
     video, images = moving
@@ -115,6 +119,7 @@ def test_a_clock_that_counts_from_long_ago_does_not_matter(moving, whole):
     np.testing.assert_allclose(late.pose, whole.pose, atol=2e-3)
 
 
+@pytest.mark.system
 def test_a_lost_face_is_reported_and_found_again(drawn):
     """Where it was lost it is found by the search; elsewhere it is registered anew, and known or not by its shape."""
     start, points = drawn(6)
@@ -144,6 +149,7 @@ def test_a_lost_face_is_reported_and_found_again(drawn):
     assert events[4][0] == ends[3] + STABLE_FRAMES - 1
 
 
+@pytest.mark.system
 def test_what_was_learnt_is_kept_for_a_known_face(drawn):
     images, points = drawn(2)
     session = HeadSession(nominal(), points=points)
@@ -187,6 +193,7 @@ def test_a_rig_that_contradicts_the_images_is_an_event(drawn):
     assert "epipolar" in session.events[0][1]
 
 
+@pytest.mark.system
 def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
     """Looks once a second: elsewhere twice, once where the track is, then elsewhere three times in a row."""
     images, points = drawn(9)
@@ -216,6 +223,7 @@ def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
     assert said(session)[-1].startswith("registered")
 
 
+@pytest.mark.system
 def test_a_live_session_follows_and_registers_anew_beside_the_frames(drawn):
     """Frame by frame: lost behind noise, found elsewhere by a search whose answer comes some frames later."""
     start, points = drawn(4)

@@ -61,6 +61,7 @@ def depth(errors):
     return np.sqrt(np.mean(np.square(errors)[..., 2]))
 
 
+@pytest.mark.system
 def test_depths_become_right_to_a_fraction_of_a_millimetre(starts):
     """From 0.45 mm to 0.15 mm once the skin's slopes are known; an average head's are already worth something."""
     slopes = slopes_of_the_planes()
@@ -73,6 +74,7 @@ def test_depths_become_right_to_a_fraction_of_a_millimetre(starts):
     assert depth(known) < 0.45 * depth(before)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("known", [True, False])
 def test_depths_are_known_as_well_as_claimed(starts, known):
     """Squared errors over variances of 80 landmarks, whose mean is 1; 4 sqrt(2 / 80) = 0.63. Unknown slopes are
@@ -86,6 +88,7 @@ def test_depths_are_known_as_well_as_claimed(starts, known):
     assert np.all(np.linalg.eigvalsh(np.stack([r.covariance for r in results])) > 0)
 
 
+@pytest.mark.system
 def test_landmarks_stay_where_they_are_in_the_first_image(starts):
     for one in starts[:3]:
         found = one.sharpened(slopes_of_the_planes())
@@ -100,6 +103,7 @@ def test_landmarks_stay_where_they_are_in_the_first_image(starts):
         assert np.abs(np.sum(largest * sight, axis=1)).min() > 0.9
 
 
+@pytest.mark.system
 def test_a_second_time_changes_little(starts):
     slopes = slopes_of_the_planes()
     once = starts[0].sharpened(slopes)
@@ -108,6 +112,7 @@ def test_a_second_time_changes_little(starts):
     assert second < 0.25 * first
 
 
+@pytest.mark.system
 def test_what_is_not_found_stays_where_it_was(starts):
     """Another picture in the second image: no landmark moves farther than a match may, and depths say so."""
     one = starts[1]
@@ -121,6 +126,7 @@ def test_what_is_not_found_stays_where_it_was(starts):
     assert depths[0] > 2 * depths[1]
 
 
+@pytest.mark.system
 def test_pictures_that_differ_make_depths_less_certain(starts):
     """Something else behind the edge of a face, say: noise in one window of the second image."""
     one, slopes = starts[2], slopes_of_the_planes()
@@ -134,6 +140,7 @@ def test_pictures_that_differ_make_depths_less_certain(starts):
     np.testing.assert_allclose(np.delete(ratio, 4), 1, atol=0.05)
 
 
+@pytest.mark.system
 def test_pictures_of_one_moment_tell_the_slopes(starts):
     """Closer to those of the planes than an average head's, and no curvature; depths become better by as much."""
     true = np.asarray(slopes_of_the_planes().mean)
@@ -150,6 +157,7 @@ def test_pictures_of_one_moment_tell_the_slopes(starts):
     assert depths[0] < 0.8 * depths[1]
 
 
+@pytest.mark.system
 def test_one_camera_knows_nothing_of_depth(starts):
     rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
     image, points = starts[0].images[0], starts[0].points

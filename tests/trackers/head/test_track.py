@@ -70,6 +70,7 @@ def rms(errors):
     return np.sqrt(np.mean(errors**2, axis=0))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["slow", "fast"])
 def test_the_fit_is_far_within_half_of_the_published_errors(videos, kind):
     state, track = videos[kind].track(MODERN)
@@ -82,6 +83,7 @@ def test_the_fit_is_far_within_half_of_the_published_errors(videos, kind):
     assert int(state.misses) == 0
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["slow", "fast"])
 def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
     """80 frames of one face, whose registration errs in its own way: twice as much is allowed.
@@ -99,6 +101,7 @@ def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
     assert np.all(rms(kept) < 2.0 * np.array(PAPER_ADAPTIVE[kind]))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["slow", "fast"])
 def test_standard_deviations_are_true(videos, kind):
     """Two of them hold most errors; over 80 frames errors are alike, and one face is but one."""
@@ -108,6 +111,7 @@ def test_standard_deviations_are_true(videos, kind):
     assert np.all(deviation.mean(axis=0) < [0.3, 0.3, 1.0, 0.2, 0.5, 0.5])
 
 
+@pytest.mark.system
 def test_rows_are_of_one_piece(videos):
     """Image points are the projected shape, deformations are none in the first frames, weights are sound."""
     video, (_, track) = videos["fast"].video, videos["fast"].track(MODERN)
@@ -120,6 +124,7 @@ def test_rows_are_of_one_piece(videos):
     assert np.all((track.effective_sample_size >= 1) & (track.effective_sample_size <= MODERN.num_particles))
 
 
+@pytest.mark.system
 def test_the_registered_shape_gets_sharper(videos):
     """From matches to what slopes of the skin and a second look make of them."""
     video = videos["fast"]
@@ -132,6 +137,7 @@ def test_the_registered_shape_gets_sharper(videos):
     assert np.all(np.abs(after[:, 2]) < 4 * claimed)
 
 
+@pytest.mark.system
 def test_rows_that_are_no_frames_leave_the_state_alone(videos):
     video = videos["slow"]
     state = video.begin(MODERN)
@@ -148,6 +154,7 @@ def test_rows_that_are_no_frames_leave_the_state_alone(videos):
     assert int(one.age) == int(both.age) == 6
 
 
+@pytest.mark.system
 def test_dropped_frames_are_bridged(videos):
     """Every third frame of the fast motion, at its own time; and two frames of one time."""
     video, state = videos["fast"], videos["fast"].begin(MODERN)
@@ -158,6 +165,7 @@ def test_dropped_frames_are_bridged(videos):
         assert np.all(error < [0.5, 0.5, 2.5, 0.5, 1.5, 1.5])
 
 
+@pytest.mark.system
 def test_a_head_at_rest_does_not_jitter():
     """Oracle 12, in the paper's mode, with 70 of its 200 frames."""
     poses = np.tile([*STEREO_PLACE_MM, 0.0, 0, 0], (73, 1))
@@ -168,6 +176,7 @@ def test_a_head_at_rest_does_not_jitter():
     assert np.all(modern < 0.25 * np.array([0.1, 0.1, 1.5, 0.15, 1.0, 0.9]))
 
 
+@pytest.mark.system
 def test_a_face_behind_noise_is_missed_and_then_lost(videos):
     video = videos["slow"]
     state, _ = video.advance(video.begin(MODERN), 1, 6, MODERN)

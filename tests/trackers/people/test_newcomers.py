@@ -60,6 +60,7 @@ def test_small_things_are_nobody(found, camera):
     assert not found(mask).found
 
 
+@pytest.mark.system
 def test_cells_are_those_of_the_floor_that_a_camera_sees(camera):
     """A triangle of which the camera sees a part; furniture hides half of the image."""
     triangle = np.array([(-9.0, -2.0), (9.0, -2.0), (0.0, 7.0)])

@@ -102,6 +102,7 @@ def literal_frame(places, mode, mask, steps=(0.05,) * 3):
     return places
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("mode", [ACQUIRE, TRACK])
 def test_a_frame_is_that_of_the_literal_loops(scene, mode):
     rng = np.random.default_rng(mode)
@@ -218,6 +219,7 @@ def test_who_leaves_the_image_is_outside_until_seen_again(scene):
     assert int(found.mode[0]) == TRACK
 
 
+@pytest.mark.system
 def test_a_close_person_of_whom_only_the_middle_shows_is_seen_by_the_box_alone():
     camera = camera_1()
     near, far = (standing(jnp.array([-1.0, y]), jnp.array(2.6), jnp.array(0.4)) for y in (-0.95, 1.0))

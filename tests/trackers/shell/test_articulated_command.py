@@ -51,6 +51,7 @@ def npz(tmp_path, features):
     return write
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_articulated")
 def test_track_writes_all_results(npz, tmp_path, features, capsys):
     out = tmp_path / "out"
@@ -93,6 +94,7 @@ def test_without_a_recording_the_synthetic_one_is_followed(tmp_path):
     assert all(report[name] > 0 for name in ERRORS[:2])
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_articulated")
 def test_keypoints_of_any_detector_are_followed(tmp_path, capsys):
     points = np.random.default_rng(0).uniform(50, 300, (20, 21, 2))
@@ -124,6 +126,7 @@ def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monk
     assert configs == [ArticulatedConfig("literal", 2, "left", 0.0, 7), ArticulatedConfig()]
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_articulated")
 def test_interrupted_and_resumed_equals_uninterrupted(npz, tmp_path, monkeypatch, capsys):
     whole, parts, file = tmp_path / "whole", tmp_path / "parts", npz()

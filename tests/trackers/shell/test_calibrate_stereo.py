@@ -60,6 +60,7 @@ def calibrate(*arguments):
     return main(["calibrate", "stereo", *map(str, arguments)])
 
 
+@pytest.mark.system
 def test_the_rig_comes_back(pictures, tmp_path, capsys):
     """Seven pictures of 24 corners that are good to 0.1 px or so: 0.3 % in focal length, 2 mm, half a degree."""
     out = tmp_path / "rig.json"

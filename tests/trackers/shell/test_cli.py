@@ -102,6 +102,7 @@ def interrupt_at(monkeypatch, frames):
     monkeypatch.setattr(ProgressLine, "show", show_and_interrupt)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_interrupted_and_resumed_equals_uninterrupted(png_folder, tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"

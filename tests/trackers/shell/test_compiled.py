@@ -48,6 +48,7 @@ def run_with(cache, **more):
     return hit == "True", folder
 
 
+@pytest.mark.system
 def test_the_second_run_finds_what_the_first_has_compiled(tmp_path):
     hit, folder = run_with(tmp_path)
     assert not hit
@@ -55,6 +56,7 @@ def test_the_second_run_finds_what_the_first_has_compiled(tmp_path):
     assert run_with(tmp_path) == (True, folder)
 
 
+@pytest.mark.system
 def test_a_folder_that_the_user_chose_is_left_alone(tmp_path):
     assert run_with(tmp_path / "cache", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "mine"))[1] == str(tmp_path / "mine")
     assert run_with(tmp_path / "cache", JAX_ENABLE_COMPILATION_CACHE="0") == (False, "None")

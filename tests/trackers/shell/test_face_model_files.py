@@ -37,6 +37,7 @@ def arrays_of(file):
         return {name: content[name] for name in content.files}
 
 
+@pytest.mark.system
 def test_what_is_written_is_read(saved, model):
     read = load_face_model(saved)
     jax.tree.map(np.testing.assert_array_equal, read.model, model)

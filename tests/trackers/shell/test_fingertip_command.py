@@ -49,6 +49,7 @@ def results(recording, tmp_path_factory):
     return out
 
 
+@pytest.mark.system
 def test_fingertips_are_where_they_are(recording, results):
     _, frames = recording
     with (results / "tips.csv").open() as file:
@@ -73,6 +74,7 @@ def test_fingertips_are_where_they_are(recording, results):
     assert {row["status"] for row in rows} == {"observed", "coasted"}
 
 
+@pytest.mark.system
 def test_every_output_can_be_read(results):
     report = json.loads((results / "report.json").read_text())
     assert report["frames"] == OPEN + REST
@@ -102,6 +104,7 @@ def test_hands_in_depth_images_lie_above_the_desk(recording, tmp_path):
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 8
 
 
+@pytest.mark.system
 def test_tips_of_another_run_are_not_overwritten(recording, results, capsys):
     before = (results / "tips.csv").read_bytes()
     assert main(["track", "fingertips", str(recording[0]), "--out", str(results)]) == 2

@@ -47,6 +47,7 @@ def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     assert made.parameters == pytest.approx(shipped.parameters, abs=1e-6)
 
 
+@pytest.mark.system
 def test_a_file_of_landmarks_with_holes(tmp_path, capsys, shapes):
     holes = shapes.copy()
     holes[1, 3] = holes[4, 9] = np.nan
@@ -64,6 +65,7 @@ def test_a_file_of_landmarks_with_holes(tmp_path, capsys, shapes):
     np.testing.assert_allclose(read.model.mean, whole.mean, atol=0.5)
 
 
+@pytest.mark.system
 def test_people_are_remembered_for_the_tracker(tmp_path, capsys, shapes):
     np.savez(tmp_path / "faces.npz", shapes=shapes)
     asked = ("--out", tmp_path / "model.npz", "--remember", tmp_path / "people.npz", *FEW)
@@ -189,6 +191,7 @@ def test_other_wrong_paths_are_refused(tmp_path):
         read_landmark_sets(tmp_path / "a.npy")
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_the_ict_face_model_is_recognised(tmp_path, capsys, data_dir):
     out = tmp_path / "model.npz"

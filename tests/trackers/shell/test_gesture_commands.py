@@ -41,6 +41,7 @@ def written(path, names, people=("Ann", "Bob"), trials=3, axes=("x", "y")):
     return path
 
 
+@pytest.mark.system
 def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     data, model, more = written(tmp_path / "vl.csv", "VL"), tmp_path / "vl.npz", tmp_path / "vlz.npz"
     assert run("fit", "gestures", data, "--out", model, "--states", 6, "--held-out", "person") == 0
@@ -85,6 +86,7 @@ def test_without_data_it_makes_the_model_of_the_package(tmp_path, capsys):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), made.symbols.models, shipped.symbols.models)
 
 
+@pytest.mark.system
 def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, capsys):
     flat, model = written(tmp_path / "flat.csv", "V"), tmp_path / "flat.npz"
     deep = written(tmp_path / "deep.csv", "VL", axes=("x", "y", "z"))

@@ -25,6 +25,7 @@ def of_codes():
     return learn_codes([(np.full(9, 1), np.ones(9, int)), (np.full(9, 5), np.full(9, 2))], ["a", "b"], num_states=2)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("learnt", [of_shape, of_codes])
 def test_models_are_read_as_they_were_written(learnt, tmp_path):
     symbols = learnt()

@@ -19,6 +19,7 @@ def count(picture, color, distance=40):
     return int((np.abs(picture.astype(int) - color).sum(axis=-1) < distance).sum())
 
 
+@pytest.mark.system
 def test_both_cameras_show_axes_and_landmarks_where_they_are(face_track):
     track, _ = face_track
     picture = draw_frame([PAPER, PAPER], RIG, track, 10)

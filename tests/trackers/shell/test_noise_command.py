@@ -8,6 +8,7 @@ from jaxfilters.trackers.shell.cli import main
 from jaxfilters.trackers.shell.track_points import read_points
 
 
+@pytest.mark.system
 def test_noises_of_synthetic_tracks_are_found_and_written(tmp_path, capsys):
     assert main(["fit", "noise", "--out", str(tmp_path / "noise.json")]) == 0
     found = json.loads((tmp_path / "noise.json").read_text())

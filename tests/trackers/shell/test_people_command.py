@@ -39,6 +39,7 @@ def results(recording, tmp_path_factory):
     return out
 
 
+@pytest.mark.system
 def test_tracks_are_where_people_walked(recording, results):
     """Two people are on the floor for long enough; a decimetre or two is what silhouettes of 70 px can tell."""
     _, room = recording
@@ -55,6 +56,7 @@ def test_tracks_are_where_people_walked(recording, results):
     assert np.median(errors) < 0.35
 
 
+@pytest.mark.system
 def test_every_output_can_be_read(results):
     report = json.loads((results / "report.json").read_text())
     assert report["frames"] == FRAMES
@@ -69,6 +71,7 @@ def test_every_output_can_be_read(results):
     assert min(int(line.split(",")[0]) for line in lines) >= 1
 
 
+@pytest.mark.system
 def test_tracks_of_another_run_are_not_overwritten(recording, results, capsys):
     folder, _ = recording
     places = ["--camera", str(folder / "camera.json"), "--scene", str(folder / "scene.json")]
@@ -78,6 +81,7 @@ def test_tracks_of_another_run_are_not_overwritten(recording, results, capsys):
     assert (results / "tracks.csv").read_bytes() == before
 
 
+@pytest.mark.system
 def test_wrong_input_is_named(recording, tmp_path, capsys):
     folder, _ = recording
     video, out = str(folder / "room.mp4"), ["--out", str(tmp_path / "out")]

@@ -29,6 +29,7 @@ def saved(tmp_path, taught):
     return tmp_path / "new" / "two.npz"
 
 
+@pytest.mark.system
 def test_what_is_written_is_read_from_several_files(saved, taught, tmp_path):
     face, known = taught
     one = jax.tree.map(lambda leaf: leaf[1:], known)

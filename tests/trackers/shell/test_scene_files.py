@@ -26,6 +26,7 @@ def _write(tmp_path, **settings):
     return path
 
 
+@pytest.mark.system
 def test_a_patch_and_a_mesh_stand_where_they_are_said_to(tmp_path):
     trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix((3, 2, 0.5))).export(tmp_path / "b.stl")
     patch = [[0.5, 1.5, 2.0], [1, 0, 0], [0, 1, 0]]

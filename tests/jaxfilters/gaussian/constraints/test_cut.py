@@ -106,6 +106,7 @@ def test_half_spaces_in_a_row_depend_on_their_order_and_intervals_do_not(x64, fo
         np.testing.assert_allclose(info.log_mass, np.log(norm.cdf(0.2) - norm.cdf(-0.8)), rtol=1e-12)
 
 
+@pytest.mark.system
 def test_intervals_in_a_row_in_two_dimensions(x64, form):
     belief = form(np.zeros(2), np.linalg.cholesky([[1, 0.8], [0.8, 1]]))
     normals, lower, upper = np.eye(2), np.array([-np.inf, 0.6]), np.array([0.2, np.inf])

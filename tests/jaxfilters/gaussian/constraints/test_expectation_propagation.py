@@ -217,6 +217,7 @@ def contradictory(form, dtype):
     return jax.tree.map(lambda leaf: leaf.astype(dtype), (belief, constraints))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_rows_that_cannot_be_met_are_named_and_nothing_is_nan(x64, form, dtype):
     belief, constraints = contradictory(form, dtype)
