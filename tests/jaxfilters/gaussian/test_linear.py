@@ -59,7 +59,7 @@ def covariance_of(belief):
     return belief.covariance if isinstance(belief, jf.Gaussian) else belief.root @ jnp.swapaxes(belief.root, -1, -2)
 
 
-@pytest.mark.parametrize("n, m", SIZES)
+@pytest.mark.parametrize(("n", "m"), SIZES)
 @pytest.mark.parametrize("name", ["joseph", "square_root", "fast"])
 @pytest.mark.parametrize("wide", [False, True])
 def test_filter_and_smoother_agree_with_textbook(n, m, name, wide):
@@ -79,7 +79,7 @@ def test_filter_and_smoother_agree_with_textbook(n, m, name, wide):
         np.testing.assert_array_equal(infos.num_invalid, np.sum(~seen, axis=1))
 
 
-@pytest.mark.parametrize("n, m", SIZES)
+@pytest.mark.parametrize(("n", "m"), SIZES)
 def test_masked_and_missing_components_are_the_same(n, m):
     ys = jnp.asarray(problem(n, m)[-1], float)
     seen = jnp.asarray(np.random.default_rng(1).random((T, m)) > 0.3)
@@ -107,7 +107,7 @@ def test_vmap_over_sequences_is_one_by_one():
     np.testing.assert_allclose(together, [jf.log_evidence(filter, KEY, y) for y in ys], rtol=1e-5)
 
 
-@pytest.mark.parametrize("n, m", [(3, 2), (12, 10)])
+@pytest.mark.parametrize(("n", "m"), [(3, 2), (12, 10)])
 def test_gradient_agrees_with_finite_differences(x64, n, m):
     filter, ys = build(n, m), jnp.asarray(problem(n, m)[-1])
 

@@ -130,7 +130,7 @@ def test_joint_kalman_filter_has_the_papers_spread():
 
 
 @pytest.mark.parametrize(
-    ("name", "pose", "velocity", "evidence"), [("exact", 0.005, 0.05, 0.4), ("paper_corrected", 0.007, 0.07, 0.5)]
+    ("name", "pose", "velocity", "evidence"), [("exact", 0.005, 0.05, 0.4), ("plug_in_corrected", 0.007, 0.07, 0.5)]
 )
 def test_consistent_proposals_match_the_joint_kalman_filter(table, name, pose, velocity, evidence):
     # Bounds: about twice the Monte Carlo error that the specification measured at N = 5000.
@@ -149,7 +149,7 @@ def test_consistent_proposals_match_the_joint_kalman_filter(table, name, pose, v
 
 def test_the_papers_proposal_is_overconfident_and_filters_a_one_noise_model(table):
     ys, results = table
-    means, covariances, _ = results["paper"]
+    means, covariances, _ = results["plug_in"]
     _, oracle_covariances, _ = joint_kalman(ys)
     ratio = (covariances[..., 0, 0] / oracle_covariances[..., 0, 0]).mean()
     assert 0.90 < ratio < 0.95
@@ -249,7 +249,7 @@ def test_without_information_exact_keeps_the_open_loop_spread_and_paper_loses_it
         spread[proposal.__name__] = float(weights.covariance(state.particles, state.log_weights)[0, 0])
     # The sample variance of 20000 draws is within 4 sqrt(2 / 20000) = 4 % of the true one.
     assert spread["exact"] == pytest.approx(P[0, 0], rel=0.05)
-    assert spread["paper"] < 0.8 * P[0, 0]
+    assert spread["plug_in"] < 0.8 * P[0, 0]
 
 
 def test_own_and_shared_covariance_give_the_same_filter():
