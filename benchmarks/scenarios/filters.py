@@ -6,7 +6,8 @@ of 1e3, 1e5 and 1e6 particles; Rao-Blackwellized filters, with a covariance for 
 hidden Markov models. All libraries find the same log evidence of the same readings, particle filters within 4 standard
 errors, or nothing is timed. They take turns in every round, in one process that is bound to one core; a ratio is the
 median over the rounds of processor times, which other work on the machine hardly changes. Suffixes: `_float64`; and
-`_two_cores`, where ratios are of wall times. `first_call_s_*` is a first call in a fresh process with its compilation,
+`_two_cores`, where ratios are of wall times. `first_call_s_*` is a first call in a fresh process with its compilation
+(`ratio_first_call_*` to that of a peer, in turns),
 `repeat_call_ratio` a call as it is used, without a `jit` around it, to a compiled one.
 
 Peers that the running Python lacks can be in others: `JAXFILTERS_PEERS` lists their interpreters, separated as in
@@ -15,6 +16,7 @@ Peers that the running Python lacks can be in others: `JAXFILTERS_PEERS` lists t
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -26,6 +28,7 @@ from jaxfilters.benchmarks.scenarios._filter_worker import Request
 from jaxfilters.trackers.shell.devices import available_cores
 
 ROUNDS, QUICK_ROUNDS = 15, 3
+FIRST_CALL_ROUNDS = 5
 SCALE = 1.0
 """Of the sizes of all problems; below 1 to see that they run."""
 GAUSSIAN = ["gaussian", "batched"]
@@ -56,10 +59,27 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
                 two = request._replace(tasks=["gaussian", *PARTICLES, MANY, "resampler"], clock="wall")
                 measured |= _suffixed("two_cores", ask(python, two, cores=2))
             for what, peer in FIRST_CALLS.items():
-                for library in ["ours"] + [peer] * (peer in peers):
-                    measured |= ask(python, request._replace(tasks=[f"first_call {what} {library}"]))
+                measured |= first_calls(python, request, what, ["ours"] + [peer] * (peer in peers))
         # Of several interpreters the first says how this library does alone.
         found |= {name: value for name, value in measured.items() if name not in found}
+    return found
+
+
+def first_calls(python: str, request: Request, what: str, libraries: list[str]) -> dict[str, Metric]:
+    """Seconds of a first call by each library in turn, medians over fresh processes; and their ratio."""
+    rounds = []
+    for i in range(FIRST_CALL_ROUNDS):
+        measured: dict[str, Metric] = {}
+        for library in libraries[:: 1 if i % 2 == 0 else -1]:
+            measured |= ask(python, request._replace(tasks=[f"first_call {what} {library}"]))
+        rounds.append([measured[f"first_call_s_{what}_{library}"].value for library in libraries])
+    found = {
+        f"first_call_s_{what}_{library}": Metric(statistics.median(seconds), "s", "lower")
+        for library, seconds in zip(libraries, zip(*rounds, strict=True), strict=True)
+    }
+    if len(libraries) > 1:
+        ratio = statistics.median(ours / peer for ours, peer in rounds)
+        found[f"ratio_first_call_{what}_to_{libraries[1]}"] = Metric(ratio, "", "lower")
     return found
 
 

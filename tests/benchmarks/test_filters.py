@@ -71,6 +71,9 @@ def test_peers_that_nobody_has_are_named_and_every_setting_is_asked_for(monkeypa
 
     def ask(python, request, cores=1):
         asked.append((python, request.float64, request.clock, cores, tuple(request.tasks)))
+        if request.tasks[0].startswith("first_call"):
+            what, library = request.tasks[0].split()[1:]
+            return {f"first_call_s_{what}_{library}": Metric(2.0 if library == "ours" else 4.0, "s", "lower")}
         return {f"ratio_{len(asked)}": Metric(1.0, "", "lower")}
 
     monkeypatch.setattr(filters, "peers_of_interpreters", lambda: {"python": ["dynamax", "cuthbert", "particles"]})
@@ -84,6 +87,8 @@ def test_peers_that_nobody_has_are_named_and_every_setting_is_asked_for(monkeypa
     assert ("first_call ekf dynamax",) in first_calls
     assert ("first_call pf ours",) in first_calls
     assert ("first_call pf smcx",) not in first_calls
+    assert found["ratio_first_call_ekf_to_dynamax"].value == 0.5
+    assert "ratio_first_call_pf_to_smcx" not in found
 
 
 def test_particle_filters_that_compute_something_else_are_not_timed():
