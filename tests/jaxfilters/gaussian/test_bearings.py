@@ -82,7 +82,7 @@ def rmse_and_nees(states, means, covariances):
 PROBLEMS = {"moving_observer": (moving_observer(), 0.035), "two_sensors": (two_sensors(), 0.02)}
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("observers", "noise"), PROBLEMS.values(), ids=PROBLEMS)
 def test_iterations_do_not_lose_to_the_plain_update(x64, observers, noise, seed):

@@ -168,7 +168,7 @@ def ensemble_mean(state, info):
     return weights.mean(state.ensemble.particles, state.ensemble.log_weights)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_more_particles_do_not_make_a_tempered_guided_filter_worse():
     """Errors 0.69 and 0.32, with standard errors of 0.04 and 0.01 over 12 sequences.
 

@@ -96,7 +96,7 @@ NORMALS = {
 CASES = [(name, root, 6) for name in NORMALS for root in (False, True)] + [("3-D", False, 1), ("2-D", True, 1)]
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("name", "root", "frames"), CASES)
 def test_evidence_and_gradients_of_narrow_intervals_in_single_precision(x64, name, root, frames):
     normals = jnp.asarray(NORMALS[name], jnp.float32)
@@ -127,7 +127,7 @@ def test_evidence_and_gradients_of_narrow_intervals_in_single_precision(x64, nam
                 )
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
 def test_wide_intervals_in_single_and_in_double_precision_agree(x64, root):
     normals = jnp.eye(3)
