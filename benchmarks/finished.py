@@ -15,8 +15,8 @@ from jaxfilters import benchmarks, models, trackers
 from jaxfilters.benchmarks.environment import environment
 from jaxfilters.benchmarks.metrics import Direction, Metric
 from jaxfilters.benchmarks.recordings import VARIABLE
+from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.shell.checkpoint import write_npz
-from jaxfilters.trackers.shell.npz_files import read_arrays
 
 _PACKAGES = (jaxfilters, models, trackers, benchmarks)
 """In a checkout they lie side by side."""
@@ -46,7 +46,7 @@ class Finished:
             return measure()
         path = self._folder / f"{name}.npz"
         if path.exists():
-            return read_arrays(path, _WANTED)
+            return read_npz(path, _WANTED)
         measured = measure()
         self._folder.mkdir(parents=True, exist_ok=True)
         write_npz(path, measured)

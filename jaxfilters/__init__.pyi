@@ -50,6 +50,7 @@ from .particle.guided import guided as guided
 from .particle.mixed_model import LinearObservation as LinearObservation
 from .particle.mixed_model import MixedDynamics as MixedDynamics
 from .particle.partitioned import Partitions as Partitions
+from .particle.partitioned import batch_log_likelihood as batch_log_likelihood
 from .particle.rao_blackwell import rao_blackwell as rao_blackwell
 from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
 from .particle.tempering import AdaptiveTempering as AdaptiveTempering

@@ -9,8 +9,6 @@ _CURRENT = {
     "ensemble": "jf.ensemble_kalman (a function)",
     "extended": "jf.extended_kalman (a function)",
     "fixed_lag": "jf.smoothing.fixed_lag",
-    "last_axis": "private (jf._xla.last_axis)",
-    "materialize": "private (jf._xla.materialize)",
     "layered": "jf.Partitions",
     "least_squares": "jf.optimize",
     "lie": "jf.math.lie",

@@ -83,7 +83,7 @@ def particles(problem: DriftProblem, num_particles: int) -> OfKey:
             ahead = np.concatenate([xp[:, :POSE] + DT * xp[:, POSE:], xp[:, POSE:]], axis=1)
             return ahead + spread * self.rng.normal(size=xp.shape)
 
-        def logG(self, t: int, xp: np.ndarray, x: np.ndarray) -> np.ndarray:
+        def logG(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
             del xp
             distances = np.sqrt(((x[:, None, :3] - beacons) ** 2).sum(2))
             error = (readings[t] - distances) / std

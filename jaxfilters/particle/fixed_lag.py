@@ -158,7 +158,7 @@ def _ensemble(state: Any) -> Any:
 
 def _schemes(params: Any) -> list:
     """Resampling schemes of a filter and of the one inside it."""
-    return [getattr(part, "scheme", None) for part in (params, getattr(params, "marginal", None))]
+    return [getattr(part, "scheme", None) for part in (params, getattr(params, "inner", None))]
 
 
 def _followed(window: PyTree, ancestors: Int[Array, " n"]) -> PyTree:

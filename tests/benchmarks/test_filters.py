@@ -49,6 +49,7 @@ def test_a_process_of_its_own_answers_with_metrics():
     assert not any("smcx" in name for name in found)
 
 
+@pytest.mark.system
 def test_a_process_that_fails_is_an_error():
     with pytest.raises(RuntimeError, match="failed to measure"):
         filters.ask(sys.executable, TINY._replace(tasks=["no_such_task"]))

@@ -32,6 +32,7 @@ def test_errors_are_from_the_nearest_finger_that_is_out():
     assert (total, rows) == (9.0 + 16.0 + 100.0, 3)
 
 
+@pytest.mark.system
 def test_observations_are_stacked_and_hands_rendered():
     key = jax.random.key(0)
     parameters = fingertips.open_hand(key)

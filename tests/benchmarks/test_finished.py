@@ -26,6 +26,7 @@ class Measuring:
         return METRICS
 
 
+@pytest.mark.system
 def test_what_is_finished_is_measured_once(tmp_path):
     measure = Measuring()
     for _ in range(2):

@@ -50,6 +50,7 @@ def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
     return HeadRun(track, truth, np.asarray(contributions))
 
 
+@pytest.mark.system
 def test_errors_are_in_millimetres_and_degrees_and_only_of_frames_with_the_face():
     errors = np.tile([1.0, 2.0, 3.0, 0.1, 0.2, 0.3], (6, 1))
     errors[4:] = ASTRAY
@@ -59,6 +60,7 @@ def test_errors_are_in_millimetres_and_degrees_and_only_of_frames_with_the_face(
     assert np.all(np.isinf(runs.rmse(run, slice(4, 6))))
 
 
+@pytest.mark.system
 def test_a_pose_that_is_not_known_is_a_loss_and_covers_nothing():
     errors = np.zeros((4, 6))
     errors[3] = np.nan
@@ -68,6 +70,7 @@ def test_a_pose_that_is_not_known_is_a_loss_and_covers_nothing():
     np.testing.assert_allclose(runs.rmse(run), 0.0, atol=1e-9)
 
 
+@pytest.mark.system
 def test_coverage_is_that_of_a_gaussian():
     errors = np.random.default_rng(1).normal(0, 0.7, (4000, 6))
     # Four standard errors of a share of 0.954 in 4000.
@@ -91,12 +94,14 @@ def test_shapes_are_compared_after_the_best_rotation():
     assert np.isnan(runs.apart_after_alignment(noisy, shapes)).tolist() == [False, False, True, False, False]
 
 
+@pytest.mark.system
 def test_landmarks_are_compared_in_the_world():
     errors = np.zeros((3, 6))
     errors[:, 2] = [0.0, 1.0, 2.0]
     np.testing.assert_allclose(fake_run(errors).landmark_errors, [0.0, 1.0, 2.0], atol=1e-4)
 
 
+@pytest.mark.system
 def test_tables_compare_with_the_rows_of_the_paper():
     paper = np.array(head_stereo.PAPER_ADAPTIVE["slow"])
     astray = np.tile(paper, (5, 1))
@@ -117,6 +122,7 @@ def test_tables_compare_with_the_rows_of_the_paper():
     assert metrics["lost_runs_slow"] == 0
 
 
+@pytest.mark.system
 def test_recovery_is_when_the_errors_of_the_next_frames_are_the_usual_ones():
     errors = np.full((599, 6), 0.1)
     errors[200:229] = 2.0  # frames 201 to 229: covered until 230
@@ -135,6 +141,7 @@ def test_recovery_is_when_the_errors_of_the_next_frames_are_the_usual_ones():
     assert never["occlusion_lost_share"] == pytest.approx(359 / 599)
 
 
+@pytest.mark.system
 def test_deformation_is_judged_in_the_frames_in_which_it_is():
     schedule = Schedule(40, 120, 200)
     far, near = np.full((199, 6), 0.2), np.full((199, 6), 0.2)

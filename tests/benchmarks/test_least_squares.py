@@ -44,6 +44,7 @@ def test_peers_that_are_not_of_python_solve_the_same_problems(name):
     assert np.abs(far.jacobian(y).T @ far.value(y)).max() < 1e-3
 
 
+@pytest.mark.system
 def test_the_peers_own_derivatives_are_right():
     """SciPy is given a Jacobian that is written out."""
     A, b, c, lower, upper, start = (a[5] for a in least_squares.random_problems(1, 12))

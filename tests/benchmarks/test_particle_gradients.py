@@ -18,6 +18,7 @@ def test_bias_and_spread_are_relative_to_the_true_gradient():
     assert measured.milliseconds == 7.0
 
 
+@pytest.mark.system
 def test_the_exact_log_evidence_is_that_of_the_joint_gaussian(x64):
     ys = simulate(1)[:6]
     rate, power, noise = AT[0], np.exp(AT[1]), np.exp(AT[2])

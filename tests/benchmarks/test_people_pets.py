@@ -79,6 +79,7 @@ def test_truth_is_refused_where_nothing_is_compared_with_it(monkeypatch, capsys,
     assert "--truth: people-speed compares with no file" in capsys.readouterr().err
 
 
+@pytest.mark.system
 def test_furniture_is_as_far_as_where_it_stands():
     """A post that is seen at the image of its foot has the depth of the foot there, along its line and its sign."""
     R = np.array([[1, 0, 0], [0, -0.5, -np.sqrt(0.75)], [0, np.sqrt(0.75), -0.5]])

@@ -46,6 +46,7 @@ def test_images_of_all_sizes_show_the_same():
     assert np.mean(np.abs(reduced - small).max(axis=-1) < 25) > 0.95
 
 
+@pytest.mark.system
 def test_people_start_where_they_are():
     places, sizes = people_speed.crowd(1, 3)
     people = people_speed._followed(people_speed.PeopleConfig(capacity=5), places, sizes)

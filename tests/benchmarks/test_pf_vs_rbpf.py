@@ -81,6 +81,7 @@ def test_time_metrics_take_the_median_of_the_ratios():
     assert metrics["predict_share_rbpf_n512"].value == pytest.approx(0.1)
 
 
+@pytest.mark.system
 def test_errors_are_those_of_a_known_shift():
     poses = jnp.tile(open_palm(jnp.array([0.0, 0.09, 0.7])), (30, 1))
     joints = jax.jit(jax.vmap(lambda pose: forward_kinematics(pose, hand_geometry()).joints))(poses)
@@ -105,6 +106,7 @@ def test_finished_runs_are_on_disk_at_once(tmp_path):
     assert second.startswith("A,rbpf,0,2.5,")
 
 
+@pytest.mark.system
 def test_both_filters_start_from_the_same_particles_and_share_their_noise():
     setting = hand.improved()
     pf, rbpf = (build(setting, 16) for build in (hand.particle_filter, hand.rao_blackwellized))

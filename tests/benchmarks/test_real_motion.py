@@ -22,6 +22,7 @@ def test_errors_are_those_of_a_shape_from_its_root():
     assert scaled == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.system
 def test_markers_lie_between_joints_and_on_the_palm():
     layout = five_fingers()
     markers = (Marker("a", palm=(0.5, 0.1, -0.2)), Marker("b", finger=1, along=1.5), Marker("c", finger=4, along=3.0))

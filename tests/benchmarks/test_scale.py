@@ -13,12 +13,13 @@ def test_filters_in_parallel_and_one_frame_after_the_other_agree_and_are_compare
 
 
 def test_ways_that_disagree_are_not_timed(monkeypatch):
-    wrong = lambda *arguments: scale.filter_in_parallel(*arguments)[1] + 1.0
+    wrong = lambda *arguments: scale.parallel_kalman(*arguments)[1] + 1.0
     monkeypatch.setattr(scale, "_log_evidences", wrong)
     with pytest.raises(RuntimeError, match="differ"):
         scale.in_time(0, 8, 1)
 
 
+@pytest.mark.system
 def test_transport_has_its_time_with_and_without_a_derivative():
     assert set(scale.transported(0, 12, 1)) == {"transport_ms_n12", "transport_gradient_ms_n12"}
 

@@ -20,6 +20,7 @@ def test_accumulated_decisions_meet_the_acceptance_and_the_posterior_beats_them(
         assert modern > published
 
 
+@pytest.mark.system
 def test_people_differ_and_calibration_finds_how():
     people = thumb.everybody(jax.random.key(1), 200)
     offset, found = np.asarray(people.offset), np.asarray(people.measured.offset)
@@ -29,6 +30,7 @@ def test_people_differ_and_calibration_finds_how():
     assert abs(np.mean(np.square(found - offset)) / left.mean() - 1) < 4 * np.sqrt(2 / 200)
 
 
+@pytest.mark.system
 def test_tracks_are_of_the_fingers_of_a_task():
     people = thumb.everybody(jax.random.key(2), 3)
     angles = thumb.task_angles(jax.random.key(3), people, jnp.radians(jnp.asarray([51.0, 21.0])))

@@ -112,6 +112,7 @@ EXPECTED = evidence_of_textbook(NOISE)
 SLOPE = (evidence_of_textbook(NOISE + 1e-5) - evidence_of_textbook(NOISE - 1e-5)) / 2e-5
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", EXACT)
 def test_filters_that_are_exact_have_the_evidence_and_the_gradient_of_the_textbook(name):
     value, slope = value_and_slope(EXACT[name], KEY)
@@ -132,6 +133,7 @@ def test_filters_that_sample_agree_with_the_textbook_within_their_error(name):
     assert abs(slopes.mean() - SLOPE) < 4 * slopes.std(ddof=1) / 4 + 0.05 * abs(SLOPE)
 
 
+@pytest.mark.system
 def test_adaptive_diffusion_follows_and_has_gradients():
     def build(noise):
         likelihood = lambda particles, y: jax.scipy.stats.norm.logpdf(y - particles, 0.0, noise).sum(0)
@@ -161,6 +163,7 @@ def test_a_hidden_markov_model_is_a_filter_too():
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.system
 def test_smoothing_and_fitting_take_any_of_them():
     beliefs, infos = jf.smoothing.filter_and_smooth(extended(jnp.float32(NOISE)), KEY, YS)
     assert beliefs.mean.shape == (len(YS), 2)

@@ -23,6 +23,7 @@ def test_project_is_the_matrix_product(camera):
     np.testing.assert_allclose(camera.project(jnp.asarray(points)), expected, rtol=1e-12)
 
 
+@pytest.mark.system
 def test_unproject_inverts_project(camera):
     points = np.random.default_rng(1).normal(size=(20, 3)) * 0.2 + [0, 0, 1]
     back = camera.unproject(camera.project(jnp.asarray(points)), jnp.asarray(points[:, 2]))

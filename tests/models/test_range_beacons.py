@@ -33,6 +33,7 @@ def test_steps_lead_along_the_path_over_any_gap():
     np.testing.assert_allclose(np.sum(steps.seconds), 30.0, rtol=1e-5)
 
 
+@pytest.mark.system
 def test_a_robot_is_found_where_it_is_among_wild_ranges():
     rng = np.random.default_rng(0)
     times, distances, turns, poses = circle(400)
@@ -54,6 +55,7 @@ def test_a_robot_is_found_where_it_is_among_wild_ranges():
     assert heard_wild.sum() >= 3
 
 
+@pytest.mark.system
 def test_a_robot_at_a_beacon_has_finite_numbers():
     prior = Gaussian(jnp.zeros(3), jnp.eye(3))
     step = Step(jnp.zeros((1, 2)), jnp.zeros(1), jnp.zeros(1), jnp.ones(1))

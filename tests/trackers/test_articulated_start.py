@@ -63,6 +63,7 @@ def test_the_true_pose_is_among_the_starts(scene, turned):
     assert float(jnp.sqrt(jnp.mean(image**2))) < 3.0
 
 
+@pytest.mark.system
 def test_what_was_not_measured_does_not_matter(scene):
     """Middle joints, tips and the wrist alone, with anything in the other rows."""
     hand, starts = scene

@@ -52,6 +52,7 @@ def test_somebody_who_stands_still_is_found_after_priming(name):
     assert wrong.mean() < 0.02
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_camera_that_was_not_primed_is_unsure_and_then_finds_people(name):
     model = made(name)
@@ -63,6 +64,7 @@ def test_a_camera_that_was_not_primed_is_unsure_and_then_finds_people(name):
     assert wrong.mean() < 0.03
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", LEARNING)
 def test_somebody_who_is_kept_is_not_learnt_in_a_minute(name):
     model = made(name, **({"learn_every": 1} if name == "median" else {}))
@@ -74,6 +76,7 @@ def test_somebody_who_is_kept_is_not_learnt_in_a_minute(name):
     assert (model.apply(seen(700))[person(60)] > 0.5).mean() < 0.05
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", LEARNING)
 def test_slow_changes_of_light_are_followed(name):
     model = made(name)
@@ -83,6 +86,7 @@ def test_slow_changes_of_light_are_followed(name):
     assert (probability > 0.5).mean() < 0.02
 
 
+@pytest.mark.system
 def test_a_chair_that_is_left_behind_is_learnt_in_the_end():
     model = MedianBackground(learn_every=1)
     model.prime([seen(i) for i in range(10)])

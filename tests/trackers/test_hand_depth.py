@@ -85,6 +85,7 @@ def test_a_hand_that_leaves_and_returns_is_said_lost_and_found_again(tracker, se
     assert joint_errors_mm(track, joints)[14:].mean() < 20
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("value", [np.nan, 3.0])
 def test_without_any_hand_the_tracker_searches(tracker, value):
     track = follow(tracker, np.full((CHUNK, 424, 512), value, np.float32))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxfilters.trackers.shell.argument_types import positive_integer, positive_number
+from jaxfilters.trackers.shell.argument_types import positive_number
 
 
 def add_head(what: Any, seed: Callable[[str], int]) -> None:
@@ -48,7 +48,7 @@ def add_head(what: Any, seed: Callable[[str], int]) -> None:
         choices=("cascades", "mediapipe"),
         help="what finds the landmarks at the start: OpenCV's cascades (default) or MediaPipe's face mesh",
     )
-    head.add_argument("--num-particles", type=positive_integer, metavar="N", help="number of particles (default: 1000)")
+    head.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 1000)")
     head.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
     head.add_argument("--fps", type=positive_number, metavar="FPS", help="of the recordings, in place of what they say")
     head.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")

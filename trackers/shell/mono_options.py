@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxfilters.trackers.shell.argument_types import positive_integer, positive_number
+from jaxfilters.trackers.shell.argument_types import positive_number
 
 
 def add_mono(what: Any, seed: Callable[[str], int]) -> None:
@@ -69,7 +69,7 @@ def add_mono(what: Any, seed: Callable[[str], int]) -> None:
 
 def _add_run(mono: argparse.ArgumentParser, seed: Callable[[str], int]) -> None:
     """What is not about the face."""
-    mono.add_argument("--num-particles", type=positive_integer, metavar="N", help="number of particles (default: 750)")
+    mono.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 750)")
     mono.add_argument("--seed", type=seed, metavar="SEED", help="random seed, also of the synthetic face")
     mono.add_argument("--fps", type=positive_number, metavar="FPS", help="of the recording, in place of what it says")
     mono.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")

@@ -30,6 +30,7 @@ OUTSIDE = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", CASES)
 def test_charts_lead_there_and_back_and_every_coordinate_is_allowed(x64, name):
     constraint, value, count = CASES[name]

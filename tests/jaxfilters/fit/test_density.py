@@ -75,6 +75,7 @@ def test_nan_is_a_missing_component_to_a_gaussian_filter_as_in_run(x64):
     assert np.isfinite(found.log_density)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("together", [False, True])
 def test_a_search_says_which_observation_makes_the_start_impossible(together):
     ys = simulate(RNG, (6, 1), 0.8, 0.5, 0.4)
@@ -101,6 +102,7 @@ def ruled_out(key, theta):
     return jnp.where(theta["rate"] > 0.5, 0.0, -jnp.inf)
 
 
+@pytest.mark.system
 def test_a_start_that_the_prior_or_a_frame_rules_out_is_named():
     ys = jnp.asarray(simulate(RNG, (6, 1), 0.8, 0.5, 0.4), jnp.float32)
     density = fit.with_prior(fit.log_evidence(KEY, filter_of, ys), lambda theta: ruled_out(None, theta))

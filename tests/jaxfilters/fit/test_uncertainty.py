@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfilters import fit
 from jaxfilters.fit.uncertainty import ErrorStatus, no_errors, observed_information
@@ -31,6 +32,7 @@ def steep(x):
     return -(jnp.abs(x) ** 1.5)
 
 
+@pytest.mark.system
 def test_the_report_says_why_a_standard_error_is_missing():
     def log_density(theta):
         saddle = theta["saddle"][0] ** 2 - theta["saddle"][1] ** 2

@@ -121,6 +121,7 @@ def test_masked_components_are_as_if_they_were_not_there(x64, rng, name):
     assert info.nis == 0
 
 
+@pytest.mark.system
 def test_what_is_certain_stays_so_without_nan(x64, rng, name):
     arithmetic = ARITHMETICS[name]
     root = np.tril(rng.normal(size=(3, 3)))
@@ -195,6 +196,7 @@ def constant_velocity(name, dtype, ys):
     return np.asarray(means), np.asarray(log_evidence)
 
 
+@pytest.mark.system
 def test_float32_survives_a_condition_number_of_1e12(x64, rng, name):
     velocity = 0.3 + np.cumsum(1e-5 * rng.normal(size=2000))
     ys = np.float32(0.01 * np.cumsum(velocity) + 1e-3 * rng.normal(size=2000))[:, None]
@@ -210,6 +212,7 @@ def test_float32_survives_a_condition_number_of_1e12(x64, rng, name):
         np.testing.assert_allclose(means[10:], exact_means[10:], atol=2e-4)
 
 
+@pytest.mark.system
 def test_beliefs_map_over_the_last_axis(rng, name):
     arithmetic = ARITHMETICS[name]
     means, roots = rng.normal(size=(3, 5)).astype(np.float32), rng.normal(size=(3, 3, 5)).astype(np.float32)

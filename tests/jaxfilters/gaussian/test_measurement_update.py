@@ -41,6 +41,7 @@ def updated(y, form=Gaussian, **options):
     return jax.jit(lambda y: condition(belief, y, bearing, R, residual=wrap, arithmetic=arithmetic, **options))(y)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("degrees", [55, 70, 105])
 def test_the_mean_is_that_of_the_posterior_to_a_higher_order(x64, degrees):
     y = np.deg2rad([degrees])
@@ -85,6 +86,7 @@ def test_the_covariance_and_the_evidence_are_those_at_the_end(x64):
     np.testing.assert_allclose(info.log_evidence, info_again.log_evidence, rtol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("n", [3, 12])
 def test_an_iterated_linear_update_with_masks_is_the_plain_one(x64, n):
     rng = np.random.default_rng(n)

@@ -84,7 +84,7 @@ def test_the_share_of_outliers_is_learnt_by_gradient():
 def test_what_does_not_fit_is_refused():
     root = GaussianRoot(PRIOR.mean, jnp.ones((1, 1)))
     rooted = extended_kalman(root, still, jnp.ones((1, 1)), itself, jnp.ones((1, 1)), arithmetic=arithmetic.square_root)
-    with pytest.raises(ValueError, match="inner must have a Gaussian prior; got a GaussianRoot"):
+    with pytest.raises(ValueError, match="prior; its prior is a GaussianRoot"):
         robust(rooted, 0.1, jnp.eye(1))
     with pytest.raises(ValueError, match="outlier_noise"):
         robust(filter_of().params.inner, 0.1, jnp.eye(2))

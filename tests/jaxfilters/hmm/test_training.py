@@ -69,6 +69,7 @@ def test_padding_of_any_content_and_empty_sequences_change_nothing(x64):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), found, expected)
 
 
+@pytest.mark.system
 def test_one_iteration_moves_to_the_expected_counts(x64):
     model = code_model(3, pseudo_count=0.0)
     (codes, counts), _ = hmm.pad(code_sequences(4, (9,)))

@@ -20,6 +20,7 @@ def numeric_tangent(f, x, dx, step=1e-6):
     return (f(x + step * dx) - f(x - step * dx)) / (2 * step)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("n", SIZES)
 def test_cholesky_and_solves_agree_with_numpy(x64, rng, n):
     A = rng.normal(size=(n, n + 2))

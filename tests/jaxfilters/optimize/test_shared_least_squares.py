@@ -123,6 +123,7 @@ def test_it_runs_in_single_precision_and_under_vmap():
     np.testing.assert_allclose(found.energy[1], one.energy, rtol=1e-4)
 
 
+@pytest.mark.system
 def test_what_is_not_finite_is_said_and_the_start_stays():
     start, data = problem()
     found = solve_shared(residuals, start, data.at[2, 0, 0].set(jnp.nan), steps=5)

@@ -55,6 +55,7 @@ def many_gradients(keys, theta):
     return jax.vmap(jax.grad(of_theta), in_axes=(None, 0))(theta, keys)
 
 
+@pytest.mark.system
 def test_the_default_is_the_score_of_every_parameter():
     # 400 independent estimates; their bias, O(1/N), is below four standard errors of the mean.
     found = many_gradients(jax.random.split(KEY, 400), jnp.asarray(THETA, jnp.float32))
@@ -119,6 +120,7 @@ def test_the_plan_is_that_of_sinkhorn(x64, regularization):
     np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-6)
 
 
+@pytest.mark.system
 def test_transport_keeps_the_mean_and_its_derivative_is_that_of_the_plan(x64):
     direction = jnp.asarray(RNG.normal(size=(2, 15)))
     scheme = transport(0.2)

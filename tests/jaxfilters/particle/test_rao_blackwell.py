@@ -148,6 +148,7 @@ def test_consistent_proposals_match_the_joint_kalman_filter(table, name, pose, v
     assert abs(log_evidence.sum(-1).mean() - oracle_evidence) < evidence
 
 
+@pytest.mark.system
 def test_the_papers_proposal_is_overconfident_and_filters_a_one_noise_model(table):
     ys, results = table
     means, covariances, _ = results["plug_in"]
@@ -214,6 +215,7 @@ def test_steady_state_variance():
         assert abs(float(P) - 0.5 * (DT * Q_L + np.sqrt((DT * Q_L) ** 2 + 4 * Q_L * Q_N))) < 1e-10
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("x64", [False, True])
 def test_variance_stays_positive_over_eight_decades(x64):
     with jax.enable_x64(x64):

@@ -54,6 +54,7 @@ def test_ancestors_are_sorted_weighted_indices_with_the_counts_of_their_scheme(n
     assert (deviation < high + 1e-3).all()
 
 
+@pytest.mark.system
 def test_counts_are_unbiased(scheme):
     n, runs = 40, 3000
     log_weights = uneven(n, seed=2, scale=1.5)
@@ -89,6 +90,7 @@ def test_even_dead_and_undefined_ensembles(scheme, n):
         np.testing.assert_array_equal(dead, scheme(jax.random.key(0), jnp.zeros(n)))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("most", [3, 5, 7, 11, 13])
 def test_whole_expected_counts_are_met_exactly_by_certain_copies(most):
     expected = np.tile([most, 1] + [0] * (most - 1), 9)
@@ -104,6 +106,7 @@ def test_one_particle_with_all_the_weight_is_the_only_ancestor(scheme, heir):
         np.testing.assert_array_equal(scheme(jax.random.key(seed), log_weights), heir)
 
 
+@pytest.mark.system
 def test_weightless_particles_are_never_drawn_at_any_offset(scheme):
     # Sums of these weights round differently in every order, and half of the particles lie between equal sums.
     log_weights = jnp.where(jnp.arange(3000) % 64 >= 30, -jnp.inf, uneven(3000, seed=5, scale=1.0))

@@ -72,6 +72,7 @@ def test_evidence_and_posterior_are_unbiased_however_often_islands_exchange(foun
     check_unbiased(found[which])
 
 
+@pytest.mark.system
 def test_placement_gives_the_numbers_of_one_device(found):
     placed = found["placement"]
     assert placed["ancestors"]

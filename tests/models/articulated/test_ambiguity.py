@@ -75,6 +75,7 @@ def test_amplitude_is_the_cosine_of_sight_and_finger_plane(random_state):
     np.testing.assert_allclose(amplitude, np.broadcast_to(np.sqrt(1 - sines**2)[:, None], (5, 3)), atol=1e-12)
 
 
+@pytest.mark.system
 def test_palm_to_the_camera_without_abduction_has_the_same_image():
     hand = articulated_hand(Layout(2))
     x = hand_state([0, 30, 0, 0, 0, 20, 30, 10])
@@ -84,6 +85,7 @@ def test_palm_to_the_camera_without_abduction_has_the_same_image():
     np.testing.assert_allclose(hand.observe(mirrored.x), hand.observe(x), atol=1e-10)
 
 
+@pytest.mark.system
 def test_links_beyond_keep_their_direction_if_asked():
     hand = articulated_hand(Layout(2))
     x = hand_state([0, 30, 25, 15, 0, 20, 30, 10])
@@ -100,6 +102,7 @@ def test_links_beyond_keep_their_direction_if_asked():
         assert changed == ([f"theta_2{link + 2}"] if link < 2 else [])
 
 
+@pytest.mark.system
 def test_indices_may_be_traced(random_state):
     hand = articulated_hand(Layout(2))
     x = jnp.asarray(random_state(np.random.default_rng(1), hand.layout))
@@ -121,6 +124,7 @@ def test_a_finger_plane_across_the_line_of_sight_has_finite_derivatives():
     assert np.all(np.isfinite(jax.jit(jax.jacfwd(lambda x: depth_mirrors(x, hand).change))(x)))
 
 
+@pytest.mark.system
 def test_trigger_needs_a_small_change_within_the_uncertainty_and_the_line_of_sight_in_the_plane():
     hand = articulated_hand(Layout(2))
     # Links at 20 (first), 45 and 10 degrees to the image plane: changes of 40, 90 and 20 degrees.
@@ -162,6 +166,7 @@ def test_linearisation_points_are_apart_at_the_critical_angle_itself():
     np.testing.assert_allclose(np.sort(points[:, 7]), [-0.2, 0.2], atol=1e-12)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("pivot_at_wrist", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_reversal_of_the_whole_hand_leaves_all_features_unchanged(seed, pivot_at_wrist, random_state):

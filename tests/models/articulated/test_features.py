@@ -82,6 +82,7 @@ def test_links_below_two_pixels_are_degenerate():
     np.testing.assert_array_equal(degenerate_links(points, 1.0), [[False, False, True]])
 
 
+@pytest.mark.system
 def test_wrap_keeps_the_angle_and_is_exact_inside():
     angles = np.random.default_rng(0).uniform(-20, 20, 1000)
     wrapped = np.asarray(wrap(jnp.asarray(angles)))
@@ -118,6 +119,7 @@ def in_other_notation(y, names, links):
     return other
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(5))
 def test_undirected_residual_does_not_depend_on_the_notation(seed):
     (y, names), (y_hat, _) = random_rows(seed), random_rows(100 + seed)
@@ -157,12 +159,14 @@ def test_directed_lines_are_not_turned_round():
     assert change[names == "rho_11"].item() == pytest.approx(-2 * y[names == "rho_11"].item())
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("residual", [directed_residual, undirected_residual])
 def test_residuals_are_exact_differences_in_sets_without_lines(residual):
     y, y_hat = (jnp.asarray(v) for v in np.random.default_rng(0).normal(size=(2, 42)) * 100)
     np.testing.assert_array_equal(residual(y, y_hat, KEYPOINTS, 5), y - y_hat)
 
 
+@pytest.mark.system
 def test_residual_moves_with_the_observation():
     (y, _), (y_hat, _) = random_rows(0), random_rows(100)
     slope = jax.jacfwd(lambda z: undirected_residual(jnp.asarray(y), z, FULL, 2))(jnp.asarray(y_hat))

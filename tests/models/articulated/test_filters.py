@@ -165,6 +165,7 @@ def test_a_turn_of_the_quaternion_leaves_the_scale_alone(x64, hand):
     np.testing.assert_allclose(longer.mean, before.at[LAYOUT.quaternion].multiply(1.2), rtol=1e-12)
 
 
+@pytest.mark.system
 def test_both_poses_of_one_link_are_found_from_separated_points(x64):
     # Specification 2.11: exact modes of the posterior at +19.7 and -19.6 degrees.
     link = synthetic.one_link_near_image_plane()

@@ -35,6 +35,7 @@ def straight_at_the_camera():
     )
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("pivot", PIVOTS)
 @pytest.mark.parametrize("seed", range(3))
 def test_features_match_a_computation_from_the_definitions(seed, pivot, random_state, finger_chains_oracle, x64):
@@ -131,6 +132,7 @@ def test_float32_observes_what_float64_does(random_state):
     np.testing.assert_allclose(change, 0, atol=2e-3)
 
 
+@pytest.mark.system
 def test_transition_is_the_matrix_of_constant_velocity(random_state, x64):
     hand = two_fingers()
     x = jnp.asarray(random_state(np.random.default_rng(0), hand.layout))
@@ -170,6 +172,7 @@ def test_five_fingers_have_consistent_shapes(features, position_size, random_sta
     assert len(hand.feature_names) == rows
 
 
+@pytest.mark.system
 def test_a_hand_is_a_pytree_argument(random_state, x64):
     hand = two_fingers()
     x = jnp.asarray(random_state(np.random.default_rng(0), hand.layout))
@@ -190,6 +193,7 @@ def test_a_hand_is_a_pytree_argument(random_state, x64):
     np.testing.assert_allclose(noise[1], 4 * noise[0], rtol=1e-12)
 
 
+@pytest.mark.system
 def test_the_comparison_is_the_one_that_was_chosen():
     hand = articulated_hand(Layout(2), compare=directed_residual)
     y = jnp.zeros(29).at[14].set(3.0)

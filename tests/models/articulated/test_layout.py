@@ -67,6 +67,7 @@ def test_a_left_hand_is_a_right_hand_in_a_mirror():
     np.testing.assert_allclose(left.frame_matrices, mirror @ right.frame_matrices @ mirror, atol=1e-14)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("layout", [Layout(2), Layout(3, 3)])
 def test_transition_moves_by_rates_and_noise_is_that_of_steps_of_acceleration(layout, x64):
     rng = np.random.default_rng(0)

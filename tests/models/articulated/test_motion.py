@@ -31,6 +31,7 @@ def exact(speed_std, time, dt, *, is_angle):
     return F, F @ solved[:2, 2:]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("dt", [0.3, 1.0, 6.0, 60.0])
 def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
     layout = Layout(2)
@@ -69,6 +70,7 @@ def test_angles_that_nobody_sees_come_to_the_spread_of_hands():
     np.testing.assert_allclose(np.sqrt(np.diagonal(P)[layout.rates]), motion.speed_std, rtol=1e-3)
 
 
+@pytest.mark.system
 def test_no_time_changes_nothing():
     layout = Layout(2)
     motion, _ = uneven(layout)

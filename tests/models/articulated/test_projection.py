@@ -37,6 +37,7 @@ def in_space(x, weak, space, distance):
     return y, distance * scale
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("layouts", [(Layout(2), Layout(2, 3)), (five_fingers(), five_fingers(3))])
 def test_perspective_is_weak_perspective_for_a_far_camera(layouts, random_state):
     weak, space = layouts

@@ -111,6 +111,7 @@ def test_covariances_are_honest_about_white_noise(face, std):
     assert (square > 9.21).mean() < 0.04
 
 
+@pytest.mark.system
 def test_the_bias_of_a_turned_plane_is_within_what_is_claimed(face, head_poses):
     """Noise of the sensor, 2 grey levels: true places lie within what the covariance says, 12 landmarks in 8 poses."""
     rng, squares = np.random.default_rng(4), []
@@ -174,6 +175,7 @@ def test_slopes_that_are_learnt_are_those_of_the_planes(plane_scene, head_poses,
     assert np.all(variance < (0.5 * np.array([SLOPE_STD] * 2 + [CURVATURE_STD] * 3)) ** 2)
 
 
+@pytest.mark.system
 def test_a_patch_faces_a_camera_up_to_a_given_angle(face, head_poses):
     pose = head_poses.near[2]
     sight = np.stack([-place[None] - face.scene.world(pose) for place in (np.zeros(3), np.array([-120.0, 0, 0]))])
@@ -187,6 +189,7 @@ def test_a_patch_faces_a_camera_up_to_a_given_angle(face, head_poses):
         np.testing.assert_array_equal(np.asarray(found)[clear], (cosine > LEAST_FACING)[clear])
 
 
+@pytest.mark.system
 def test_what_cannot_be_seen_is_not_seen(face):
     pose = face.scene.registered.copy()
     images = jnp.asarray(face.scene.images(pose))

@@ -104,6 +104,7 @@ def test_the_least_energy_within_the_box_is_that_of_scipy(x64):
     assert np.sum((x <= bounds[0] + 1e-9) | (x >= bounds[1] - 1e-9)) >= 3
 
 
+@pytest.mark.system
 def test_scaling_identity_against_expression_changes_no_pixel(x64):
     """Oracle 6: the null direction of the Jacobian, with the expressions' own parts of it."""
     at = truth(4)
@@ -112,6 +113,7 @@ def test_scaling_identity_against_expression_changes_no_pixel(x64):
     assert np.abs(change).max() < 1e-9
 
 
+@pytest.mark.system
 def test_derivatives_are_those_of_finite_differences(x64):
     """Oracle 7: of the residuals that the solver sees, the robust ones and the prior's included."""
     at = truth(5)
@@ -143,6 +145,7 @@ def test_the_box_is_never_empty_and_holds_the_clipped_start(x64, far):
     assert np.all((low.person.identity <= inside + 1e-12) & (inside <= high.person.identity + 1e-12))
 
 
+@pytest.mark.system
 def test_landmarks_that_are_not_seen_say_nothing(x64):
     true = truth(6)
     views = views_of(true)

@@ -76,6 +76,7 @@ def test_the_last_level_is_as_exact_as_without_blur(scenes):
         np.testing.assert_allclose(scene.coarse(2.0), scene.plain(2.0), atol=0.05)
 
 
+@pytest.mark.system
 def test_blur_is_that_of_a_gaussian():
     image = np.random.default_rng(0).uniform(0, 255, (2, 60, 80)).astype(np.float32)
     found = blurred(jnp.asarray(image))

@@ -150,6 +150,7 @@ def test_flat_places_of_a_map_score_zero():
     assert not score_map(jnp.asarray(picture()), jnp.full((16, 16), 9), jnp.zeros(2), (20, 20)).any()
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("precise", [False, True])
 def test_scores_from_sums_are_those_of_cut_windows(precise):
     """The sums of interpolated windows are exact; 1e-4 bounds the rounding of sums in single precision."""

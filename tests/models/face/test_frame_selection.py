@@ -48,6 +48,7 @@ def random_information(rng, n, d=4, rank=2):
     return roots @ roots.transpose(0, 2, 1)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(5))
 def test_information_chooses_as_exhaustive_search_does(x64, seed):
     rng = np.random.default_rng(seed)
@@ -124,6 +125,7 @@ def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, sc
     np.testing.assert_allclose(found.response, expected, atol=2e-5 * np.abs(expected).max())
 
 
+@pytest.mark.system
 def test_hidden_landmarks_tell_less(x64, scene):
     face, rig, view, frame = scene
     some = view._replace(seen=view.seen.at[0, :4].set(False))

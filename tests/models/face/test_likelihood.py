@@ -36,6 +36,7 @@ def one_by_one(images, templates, uv):
     return jax.vmap(each)(images, templates, jnp.swapaxes(uv, -1, -2))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("spread", [10.0, 22.0, 30.0, 50.0, 70.0, 90.0])
 def test_scores_do_not_depend_on_how_far_the_candidates_spread(spread):
     """In boxes of either size and without one: 1e-4 bounds the rounding of sums in single precision."""
@@ -77,6 +78,7 @@ def test_boxes_end_at_the_border(corner):
     assert np.any(expected == -1)
 
 
+@pytest.mark.system
 def test_images_smaller_than_a_box_are_one_box():
     images, templates, uv = scene(12.0)
     small, offset = images[:, 90:140, 110:200], jnp.array([[110.0], [90.0]])
@@ -110,6 +112,7 @@ def normalised(score_sum, deformation, **options):
     return np.exp(log - jax.scipy.special.logsumexp(log))
 
 
+@pytest.mark.system
 def test_weights_are_the_formula_of_the_paper(x64):
     rng = np.random.default_rng(0)
     c, a = rng.uniform(-20, 20, 100), rng.normal(0, 3, (5, 100))
@@ -133,6 +136,7 @@ def test_a_deformation_of_one_deviation_costs_half_a_nat(x64):
     np.testing.assert_allclose(w[1:] / w[0], np.exp(-0.5), rtol=1e-12)
 
 
+@pytest.mark.system
 def test_modes_that_are_not_learnt_do_not_count(x64):
     deviation = jnp.array([2.0, 0.0])
     deformation = jnp.array([[1.0, 3.0], [0.0, 5.0]])

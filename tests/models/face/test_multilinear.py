@@ -46,6 +46,7 @@ def test_pairs_of_68_landmarks_contain_those_of_ten():
     assert [k for k in range(68) if mirror[k] == k] == [8, 27, 28, 29, 30, 33, 51, 57, 62, 66]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("pairs", "size"), [(PAIRS, 10), (PAIRS_68, 68), (((1, 0),), 3)])
 def test_both_halves_are_symmetric_and_hold_half_of_the_shape(x64, pairs, size):
     shape = jnp.asarray(np.random.default_rng(0).normal(size=(size, 3)))
@@ -57,6 +58,7 @@ def test_both_halves_are_symmetric_and_hold_half_of_the_shape(x64, pairs, size):
         np.testing.assert_array_equal(from_left[left], shape[left])
 
 
+@pytest.mark.system
 def test_the_data_tensor_holds_symmetric_halves_of_everybody(x64, shapes, tensor):
     assert tensor.shape == (10, 3, 22, 10)
     for person, expression in ((0, 0), (7, 4), (10, 9)):
@@ -68,6 +70,7 @@ def test_the_data_tensor_holds_symmetric_halves_of_everybody(x64, shapes, tensor
 
 # The specification's 0.88, 0.67 and 0.96 mm are of a point, the root of the sum over its three coordinates; other
 # people are drawn here, whence the tolerance.
+@pytest.mark.system
 @pytest.mark.parametrize(("ranks", "expected_mm"), [((10, 5), 0.88), ((15, 5), 0.67), ((10, 3), 0.96)])
 def test_the_error_of_the_model_is_that_of_the_specification(x64, tensor, ranks, expected_mm):
     model = of_tensor(tensor, {PEOPLE_MODE: ranks[0], EXPRESSION_MODE: ranks[1]})
@@ -132,6 +135,7 @@ def test_a_face_is_bilinear_in_identity_and_expression(x64, model):
     np.testing.assert_array_equal(multilinear.identity_basis(model, 0 * a), 0)
 
 
+@pytest.mark.system
 def test_missing_faces_are_completed(x64, shapes, model):
     draw = np.random.default_rng(2)
     observed = np.ones((11, 10), bool)
@@ -168,6 +172,7 @@ def test_a_person_is_fitted_and_an_unknown_one_less_well(x64, tensor, model):
     assert np.all(left_out.rms_mm < 3)
 
 
+@pytest.mark.system
 def test_size_is_told_from_shape_where_the_training_faces_allow(x64, tensor, model):
     faces = jnp.moveaxis((tensor[:, :, 1] + tensor[:, :, 12]) / 2, -1, 0)
     fit = fitted_up_to_size(model, faces)
@@ -177,6 +182,7 @@ def test_size_is_told_from_shape_where_the_training_faces_allow(x64, tensor, mod
     np.testing.assert_allclose(smaller.log_size - fit.log_size, -np.log(0.9), atol=0.01)
 
 
+@pytest.mark.system
 def test_wrong_input_is_refused(x64, shapes):
     with pytest.raises(ValueError, match="shapes must be finite; 3 of"):
         learn(shapes.at[2, 3, 4].set(jnp.nan))

@@ -22,6 +22,7 @@ def told_of_few(rng, rank=5):
     return J.T @ J, J.T @ rng.normal(size=rank), STD * rng.normal(size=SIZE)
 
 
+@pytest.mark.system
 def test_an_energy_is_kept_but_for_a_constant(x64):
     rng = np.random.default_rng(0)
     information, gradient, at = told_of_few(rng)
@@ -40,6 +41,7 @@ def test_information_and_mean_are_those_of_the_energy(x64):
     np.testing.assert_allclose(past.root.T @ past.towards, raw @ at - gradient / STD, rtol=1e-8)
 
 
+@pytest.mark.system
 def test_joined_energies_add_up(x64):
     rng = np.random.default_rng(2)
     one, other = (of_energy(*map(jnp.asarray, (*told_of_few(rng), STD))) for _ in range(2))
@@ -75,6 +77,7 @@ def test_a_parameter_without_a_unit_is_not_told_of(x64):
     assert np.isfinite(past.towards).all()
 
 
+@pytest.mark.system
 def test_single_precision_holds_what_hundreds_of_frames_tell():
     """Each tells of eight of twelve directions, with rounding errors that make it indefinite; so is their sum, of ten.
 

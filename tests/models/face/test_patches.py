@@ -88,6 +88,7 @@ def test_the_length_of_a_normal_does_not_matter(plane_scene, x64):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, registered(plane_scene))
 
 
+@pytest.mark.system
 def test_templates_are_windows_and_gradients_are_free_of_gain_and_offset(plane_scene, x64):
     images = plane_scene.images(plane_scene.registered)
     found = registered(plane_scene, images=images)
@@ -141,6 +142,7 @@ def _share(found):
     return 1 - raw
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("camera", [0, 1])
 def test_curved_skin_bends_its_picture(plane_scene, head_poses, x64, camera):
     """Points that rise along the registered line of sight, as slopes and curvatures say, projected by hand.
@@ -197,6 +199,7 @@ def test_a_template_is_mapped_by_the_affine_map(plane_scene, x64):
     np.testing.assert_allclose(result[1, 3].ravel(), 2 * back[0] - 3 * back[1], atol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("affine", [np.zeros((2, 2)), [[1.0, 2], [2, 4]], np.diag([0.3, 0.3]), np.diag([-1.0, 1])])
 def test_maps_that_squash_a_patch_leave_numbers(plane_scene, affine):
     result = turned(registered(plane_scene), jnp.broadcast_to(jnp.asarray(affine), (2, 6, 2, 2)))
@@ -230,6 +233,7 @@ def test_slopes_are_never_quite_known_nor_steep(x64):
     np.testing.assert_allclose(slopes.mean, np.tile([1.0, -1.0, MOST_CURVED, -MOST_CURVED, 0.01], (2, 1)), rtol=1e-6)
 
 
+@pytest.mark.system
 def test_a_view_can_be_taken_with_other_slopes_than_were_known(x64):
     """Linear equations about what was assumed: the posterior is the same, whatever that was."""
     before = unknown_slopes(2)
@@ -244,6 +248,7 @@ def test_a_view_can_be_taken_with_other_slopes_than_were_known(x64):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12), *results)
 
 
+@pytest.mark.system
 def test_views_that_say_nothing_change_nothing():
     slopes = Slopes(jnp.full((2, 2), 0.1), jnp.tile(0.04 * jnp.eye(2), (2, 1, 1)))
     again = learn_slopes(slopes, jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)))

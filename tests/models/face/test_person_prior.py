@@ -80,6 +80,7 @@ def test_near_the_mean_person_the_identity_is_as_likely_as_its_covariance_says(x
     assert found == pytest.approx(apart @ np.linalg.solve(np.asarray(face().identity_covariance), apart), rel=1e-3)
 
 
+@pytest.mark.system
 def test_the_size_is_as_likely_as_sizes_vary_and_the_rest_counts_in_proportion(x64):
     """Along what the size varies with the rest stays at its mean; at right angles to that the size hardly changes."""
     covariance = np.asarray(face().identity_covariance)

@@ -51,6 +51,7 @@ def scene(x64):
     return Scene()
 
 
+@pytest.mark.system
 def test_the_equations_are_the_derivatives_of_the_energy(scene):
     """A quadratic form: central differences are exact but for rounding."""
     found = point_equations(*scene.arguments)

@@ -21,6 +21,7 @@ def test_rotations_are_those_of_scipy(x64):
     np.testing.assert_allclose(jax.vmap(head.rotation)(jnp.asarray(angles)), expected, atol=1e-14)
 
 
+@pytest.mark.system
 def test_an_ensemble_along_the_last_axis_is_the_same(x64):
     angles = jnp.asarray(some_angles(20)).T
     along_last = jax.vmap(head.rotation, -1, -1)(angles)
@@ -32,6 +33,7 @@ def test_angles_invert_rotations(x64):
     np.testing.assert_allclose(jax.vmap(lambda a: head.angles(head.rotation(a)))(angles), angles, atol=1e-12)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("yaw", [np.pi / 2, -np.pi / 2])
 def test_at_a_quarter_turn_the_angles_still_give_the_rotation(x64, yaw):
     R = jnp.round(head.rotation(jnp.array([0.0, yaw, 0.0])), 15)
@@ -59,6 +61,7 @@ def test_placed_points_are_rotated_then_moved(x64):
     np.testing.assert_allclose(head.place(jnp.asarray(shape), jnp.asarray(pose)), expected, atol=1e-12)
 
 
+@pytest.mark.system
 def test_turning_axes_are_the_derivatives_of_the_rotation(x64):
     point = jnp.array([10.0, -30.0, 20.0])
     for angles in jnp.asarray(some_angles(10, seed=2)):

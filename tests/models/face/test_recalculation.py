@@ -74,6 +74,7 @@ def the_scene():
     return Scene()
 
 
+@pytest.mark.system
 def test_the_vector_is_the_gradient_of_the_quadratic_energy(scene):
     """Oracle 8: central differences of a quadratic form are exact but for rounding."""
     found = np.asarray(normal_equations(scene.start, scene.estimated, *scene.arguments).vector)
@@ -156,6 +157,7 @@ def test_a_landmark_that_no_camera_sees_moves_to_its_estimate(scene):
     assert np.all(np.isfinite(shape))
 
 
+@pytest.mark.system
 def test_a_landmark_in_one_image_alone_is_judged_by_that_one(scene):
     """Half of the first image is away: the equations of its landmarks are those of the second camera."""
     aside = scene.pose.at[0].set(-230.0)
@@ -183,6 +185,7 @@ def one_camera_each(rig):
     return [type(rig)(*(getattr(rig, a)[c : c + 1] for a in arrays), shape=rig.shape) for c in range(2)]
 
 
+@pytest.mark.system
 def test_a_moved_image_is_followed(scene):
     """Both images moved by a known vector: landmarks move to where the moved pixels triangulate."""
     shift = np.array([3.0, -2.0])
@@ -196,6 +199,7 @@ def test_a_moved_image_is_followed(scene):
     np.testing.assert_allclose(head.place(shape, scene.pose), expected, atol=0.05)
 
 
+@pytest.mark.system
 def test_single_precision_and_8_bit_images_give_the_same(scene):
     exact, _ = recalculate(scene.start, scene.estimated, *scene.arguments)
     images = jnp.asarray(np.clip(np.round(np.asarray(scene.images)), 0, 255).astype(np.uint8))
@@ -206,6 +210,7 @@ def test_single_precision_and_8_bit_images_give_the_same(scene):
     np.testing.assert_allclose(shape, exact, atol=0.05)
 
 
+@pytest.mark.system
 def test_results_follow_the_estimate_smoothly(scene):
     """Forward derivatives through the iterations, against central differences."""
     solve = lambda estimated: recalculate(scene.start, estimated, *scene.arguments, tolerance_mm=1e-10)[0]

@@ -157,6 +157,7 @@ def information_at(face, found, uv, seen, fisher=False):
     return information, off, S
 
 
+@pytest.mark.system
 def test_the_evidence_is_that_of_student_and_laplace(face):
     _, uv = face.draw(jax.random.key(2))
     seen = some_seen()
@@ -280,6 +281,7 @@ def test_a_mistaken_landmark_does_not_pull_the_head_along(face):
     assert np.abs((wrong.belief.mean - x) / deviation).max() < 4
 
 
+@pytest.mark.system
 def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
     """Oracle 13; the world stays the frame of the left camera."""
     _, uv = face.draw(jax.random.key(7))
@@ -300,6 +302,7 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
         np.testing.assert_allclose(again.log_evidence, expected.log_evidence, rtol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("garbage", [1e3, np.nan, np.inf])
 def test_landmarks_that_are_not_seen_or_score_low_do_not_count(face, garbage):
     _, uv = face.draw(jax.random.key(6))

@@ -41,6 +41,7 @@ def intrinsics(rig, camera):
     return K
 
 
+@pytest.mark.system
 def test_projection_is_that_of_opencv(rig):
     points = head_points()
     uv, in_front = rig.project(jnp.asarray(points))
@@ -56,6 +57,7 @@ def test_a_posed_shape_is_the_projection_of_its_points(rig):
     np.testing.assert_allclose(project_shape(rig, shape, pose)[0], expected, rtol=1e-13)
 
 
+@pytest.mark.system
 def test_points_behind_a_camera_have_no_image_and_a_derivative_of_zero(rig):
     points = jnp.array([[5.0, 3.0, 600.0], [5.0, 3.0, -600.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
     uv, in_front = rig.project(points)
@@ -119,6 +121,7 @@ def test_triangulation_of_noisy_pixels_is_opencv_s(x64):
     np.testing.assert_allclose(found, expected, atol=0.01 * noise)
 
 
+@pytest.mark.system
 def test_the_spread_of_depths_is_that_of_the_disparity(x64):
     """Oracle 2, second part: z^2 / (f B) sqrt(2) sigma, within 10 %; 4000 draws determine it to 1.1 %."""
     rig, rng, sigma = nominal(), np.random.default_rng(2), 0.2
@@ -128,6 +131,7 @@ def test_the_spread_of_depths_is_that_of_the_disparity(x64):
     assert depth.std() == pytest.approx(650**2 / (800 * 120) * np.sqrt(2) * sigma, rel=0.1)
 
 
+@pytest.mark.system
 def test_single_precision_is_enough():
     points = head_points().astype(np.float32)
     rig = nominal()
@@ -137,6 +141,7 @@ def test_single_precision_is_enough():
     np.testing.assert_allclose(triangulate(rig, uv), points, atol=0.02)
 
 
+@pytest.mark.system
 def test_a_rig_of_one_camera_is_that_camera(x64):
     camera = Pinhole.from_intrinsics(700.0, (320, 240), SHAPE)
     points = jnp.asarray(head_points())

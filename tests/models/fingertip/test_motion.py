@@ -49,6 +49,7 @@ def textbook(start, measured):
     return out
 
 
+@pytest.mark.system
 def test_it_is_the_textbooks_filter_in_other_units(moves):
     """Oracle 1: within 1e-10 over 200 steps."""
     measured = np.cumsum(np.random.default_rng(0).normal(size=(200, 2)), axis=0)
@@ -88,6 +89,7 @@ def test_predictions_ahead_are_predictions_one_after_the_other(moves):
         motion.ahead(moves, belief, Q, 0)
 
 
+@pytest.mark.system
 def test_uncertainty_grows_and_shrinks_as_the_specification_has_it(moves):
     """Oracle 4: after misses within 0.1, of a new track within 0.02."""
     start = motion.predict(moves, motion.new_belief(jnp.zeros(2)), Q)
@@ -98,6 +100,7 @@ def test_uncertainty_grows_and_shrinks_as_the_specification_has_it(moves):
     np.testing.assert_allclose(fresh, [534.33, 8.98, 7.40, 7.36], atol=0.02)
 
 
+@pytest.mark.system
 def test_a_finger_at_constant_speed_is_followed_exactly(moves):
     """Oracle 9: innovations of 5.83 and 0.033 pixels at first, below 1e-5 at the tenth and 1e-9 at the twentieth."""
     measured = jnp.arange(21.0)[:, None] * jnp.asarray([5.0, 3.0])

@@ -12,6 +12,7 @@ from jaxfilters.models.synthetic.desk import colour_desk
 from jaxfilters.models.synthetic.desk_hand import random_frame
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(4))
 def test_fingers_are_counted_on_the_desk_where_skin_was_learnt(seed):
     desk = colour_desk(np.random.default_rng(seed))

@@ -33,6 +33,7 @@ def observed(angles, seen, person, posture=POSTURE):
     return jax.lax.scan(step, thumb.unknown(person, posture), (angles, seen))[1]
 
 
+@pytest.mark.system
 def test_the_papers_score(x64):
     angles = jnp.linspace(I - 1, T + 1, 50)
     values = thumb.increment(angles, T, I)
@@ -72,6 +73,7 @@ def test_frames_without_an_angle_change_no_odds_and_let_the_drift_go_on(x64):
     assert drift[-1] < POSTURE.drift_sd**2
 
 
+@pytest.mark.system
 def test_a_track_that_goes_on_as_another_finger_is_found_out(x64):
     """Evidence of 300 frames for a forefinger is forgotten within 10 frames as a thumb; the mean of all never does."""
     angles = jnp.where(jnp.arange(320) < 300, POSTURE.forefinger, POSTURE.thumb)

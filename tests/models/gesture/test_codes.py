@@ -14,6 +14,7 @@ def turned(degrees, length=5.0):
     return jnp.asarray(length * np.stack([np.cos(angle), -np.sin(angle)], axis=-1), dtype=float)
 
 
+@pytest.mark.system
 def test_the_centres_of_the_sectors_are_one_to_sixteen():
     np.testing.assert_array_equal(direction_code(turned(22.5 * np.arange(16))), np.arange(1, 17))
     np.testing.assert_array_equal(direction_code(turned(np.array([11.2, 11.3, -11.2, -11.3]))), [1, 2, 1, 16])
@@ -26,12 +27,14 @@ def test_a_turn_by_one_sector_is_the_next_code_and_a_right_angle_four():
     np.testing.assert_array_equal(direction_code(turned(angles + 90)), (codes + 3) % 16 + 1)
 
 
+@pytest.mark.system
 def test_what_hardly_moves_is_still():
     np.testing.assert_array_equal(direction_code(turned(np.arange(0, 360, 30), 1.49)), STILL)
     np.testing.assert_array_equal(direction_code(jnp.array([[0.0, 0.0], [jnp.nan, 1.0]])), STILL)
     assert direction_code(turned(90.0, 1.0), still=0.5) == 5
 
 
+@pytest.mark.system
 def test_blur_spreads_directions_around_the_circle_and_leaves_still_alone():
     probability = np.zeros((2, 17))
     probability[0, [0, 16]] = 0.6, 0.4
@@ -46,6 +49,7 @@ def test_blur_spreads_directions_around_the_circle_and_leaves_still_alone():
         blurred(hmm.Codes(jnp.zeros((2, 16))))
 
 
+@pytest.mark.system
 def test_a_hand_moves_as_the_mean_of_the_tips_that_were_seen_twice():
     tips = np.array([[(0, 0), (9, 9)], [(4, 0), (9, 1)], [(7, 7), (9, -9)], [(np.nan, 0), (9, -9)], [(5, 5), (0, 0)]])
     present = np.array([[1, 0], [1, 1], [1, 1], [0, 1], [1, 0]], bool)

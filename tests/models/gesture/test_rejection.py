@@ -28,6 +28,7 @@ def test_it_is_the_threshold_model_of_the_symbols_side_by_side():
     np.testing.assert_allclose(threshold_log_likelihood(models, seen, lengths), expected, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.system
 def test_what_no_state_can_produce_is_impossible_and_nan_is():
     chain = hmm.from_topology(hmm.left_right(2), initial=hmm.left_right_initial(2))
     models = jax.tree.map(lambda leaf: leaf[None], chain)

@@ -89,6 +89,7 @@ def test_a_symbol_that_hardly_beats_another_is_rejected(symbols):
     np.testing.assert_array_equal(rejected, apart < bar)
 
 
+@pytest.mark.system
 def test_features_that_are_not_finite_are_rejected_without_nan(symbols):
     strokes, _ = collection(4, 1)
     found = recognise(symbols, strokes_last(strokes).at[3, 0, 0].set(jnp.nan))
@@ -110,6 +111,7 @@ def test_a_symbol_is_added_of_five_strokes():
         extended(few, learn(*collection(6, 5, ("z",)), num_states=5))
 
 
+@pytest.mark.system
 def test_a_symbol_that_is_drawn_in_two_ways_has_two_models():
     rng = np.random.default_rng(8)
     both_ways = [drawn(rng, "square")[:: 1 if i % 2 else -1] for i in range(12)]

@@ -143,6 +143,7 @@ PRINTED_MM = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("error", PRINTED_MM)
 def test_costs_of_small_errors_are_those_the_specification_prints(error):
     # The printed digits belong to one grid: every second pixel of the 128 x 128 window at (192, 148). Silhouette pixels

@@ -10,6 +10,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 LOW, HIGH = ANGLE_LIMITS.T
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_inside_and_on_the_limits_nothing_is_lost(share):
     assert limit_log_likelihood(jnp.asarray(LOW + share * (HIGH - LOW))) == 0
@@ -33,6 +34,7 @@ def test_excesses_of_several_angles_add_up():
     assert softer == pytest.approx(expected / 4, rel=1e-12)
 
 
+@pytest.mark.system
 def test_gradient_leads_back_inside_and_is_finite_at_the_limit():
     slope = jax.grad(limit_log_likelihood)
     np.testing.assert_array_equal(slope(jnp.asarray(HIGH)), 0)

@@ -29,6 +29,7 @@ def test_part_frames_match_homogeneous_matrices(seed, random_pose, phalanx_frame
     np.testing.assert_allclose(palm @ np.array([0.003, -0.095, 0]) + pose[:3], expected[6, :3, 3], atol=EXACT)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_part_frames_carry_the_capsules(seed, side, random_pose):
@@ -41,6 +42,7 @@ def test_part_frames_carry_the_capsules(seed, side, random_pose):
     np.testing.assert_allclose(T_camera_part.translation[:15] + along, capsules.end[:15], atol=EXACT)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("triangles", TESSELLATIONS)
 def test_number_of_triangles_and_one_closed_convex_solid_for_every_part(triangles):
     mesh = hand_mesh(hand_geometry(), **TESSELLATIONS[triangles])
@@ -70,6 +72,7 @@ def test_a_fine_capsule_mesh_approaches_the_capsule():
     np.testing.assert_allclose(distance, radius, rtol=2e-3)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_posed_vertices_surround_their_capsules(seed, side, random_pose):

@@ -10,6 +10,7 @@ from jaxfilters.models.hand.skeleton import TANGENT_SIZE, open_palm
 POSE = open_palm(jnp.array([0.0, 0.09, 0.7]))
 
 
+@pytest.mark.system
 def test_without_damping_it_is_the_papers_model():
     dt = 1 / 30
     step = paper_motion(dt).dynamics(POSE, jnp.asarray(dt))

@@ -18,6 +18,7 @@ CAMERA = Pinhole.from_intrinsics((90.0, 95.0), (64.0, 52.0), (106, 128))
 render = jax.jit(lambda camera, pose: render_capsules(camera, forward_kinematics(pose, GEOMETRY).capsules))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize("center", [(0.0, 0.0, 0.7), (0.45, -0.3, 0.7)])
 def test_a_window_holds_the_pixels_its_camera_says(stride, center):

@@ -40,6 +40,7 @@ def joint_error(pose, truth):
     return 1000 * float(jnp.linalg.norm(difference, axis=-1).mean())
 
 
+@pytest.mark.system
 def test_nearest_hand_pixel_by_brute_force():
     rng = np.random.default_rng(0)
     observed = np.where(rng.random((32, 32)) < 0.03, 0.7, np.where(rng.random((32, 32)) < 0.5, np.inf, np.nan))
@@ -92,6 +93,7 @@ def test_a_displaced_hand_is_pulled_back(seed):
     assert joint_error(found.pose, POSE) < 5
 
 
+@pytest.mark.system
 def test_information_is_symmetric_positive_and_smaller_for_what_is_hidden():
     information = pull(render(CAMERA, POSE), POSE).information
     np.testing.assert_allclose(information, information.T, rtol=1e-4, atol=1e-2)
@@ -100,6 +102,7 @@ def test_information_is_symmetric_positive_and_smaller_for_what_is_hidden():
     assert information[2, 2] > 0
 
 
+@pytest.mark.system
 def test_nothing_seen_leaves_the_prior():
     found = pull(jnp.full((32, 32), jnp.nan, POSE.dtype), retract(POSE, jnp.full(21, 0.01)))
     np.testing.assert_allclose(local(POSE, found.pose), 0, atol=1e-5)

@@ -51,6 +51,7 @@ GOLDEN_MM = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", GOLDEN_MM)
 @pytest.mark.parametrize("x64_on", [True, False])
 def test_golden_joints_of_the_open_palm(name, x64_on):
@@ -78,6 +79,7 @@ def test_joints_match_homogeneous_matrices(seed, random_pose, phalanx_frames_ora
     np.testing.assert_array_equal(joints[0], pose[:3])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", SEEDS)
 def test_capsules_lie_on_the_bones_in_the_stated_order(seed, random_pose):
     geometry = hand_geometry()
@@ -103,6 +105,7 @@ def test_bone_lengths_do_not_depend_on_the_pose(seed, random_pose):
     np.testing.assert_allclose(lengths, hand_geometry().lengths, rtol=1e-9)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", SEEDS)
 def test_moving_the_wrist_rigidly_moves_all_joints(seed, random_pose):
     rng = np.random.default_rng(seed)

@@ -78,6 +78,7 @@ def test_the_outline_holds_a_million_projected_points_tightly(camera, person):
     np.testing.assert_allclose((np.asarray(uv) @ normals).max(axis=0), support, atol=1e-3)
 
 
+@pytest.mark.system
 def test_ray_form_and_dual_form_agree_for_500_cameras(x64):
     """K = -Ra^2 Rb^2 c1 (C*)^-1, section 2.4."""
     rng = np.random.default_rng(0)
@@ -95,6 +96,7 @@ def test_ray_form_and_dual_form_agree_for_500_cameras(x64):
         np.testing.assert_allclose(found / scale, expected / scale, atol=1e-10)
 
 
+@pytest.mark.system
 def test_golden_case(camera, person):
     K = np.asarray(outline_coefficients(camera.P, person))
     expected = [1.00650704e-4, 8.50688007e-6, 1.54149702e-5, -1.99895842e-2, -2.20481015e-3, 1]
@@ -129,6 +131,7 @@ def test_points_of_the_ellipse_satisfy_the_papers_equation(camera, person):
     assert K1 * 96 * 96 + K2 * 42.5**2 + K3 * 96 * 42.5 + K4 * 96 + K5 * 42.5 + K6 > 0
 
 
+@pytest.mark.system
 def test_ellipse_parameters_agree_with_opencv(camera, person):
     ellipse = conic_to_ellipse(camera.P @ dual_quadric(person) @ camera.P.T)
     (x, y), sizes, degrees = cv2.fitEllipse(ellipse_points(ellipse).astype(np.float32))
@@ -194,6 +197,7 @@ def test_a_camera_in_front_of_the_origin_sees_the_same(camera, person):
     )
 
 
+@pytest.mark.system
 def test_depth_is_that_of_the_nearer_intersection(camera, person):
     depth = np.asarray(ellipsoid_depth(camera.P, person, SHAPE))
     mask = np.asarray(ellipse_mask(outline(camera.P, person), SHAPE))
@@ -247,6 +251,7 @@ def test_c1_is_positive_exactly_outside(x64):
         assert (int(outline(jnp.asarray(P), body).code) == INSIDE) == (np.linalg.norm(center) <= 0.8)
 
 
+@pytest.mark.system
 def test_the_soft_mask_is_one_half_on_the_outline_and_differentiable(camera, person):
     seen = outline(camera.P, person)
     soft = np.asarray(soft_ellipse_mask(seen, SHAPE, 8.0))

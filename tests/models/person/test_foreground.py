@@ -56,6 +56,7 @@ def test_a_large_window_of_clear_evidence_stays_finite():
     np.testing.assert_allclose(value, 4096 * np.log(1 - 0.98 * float(b[0])), rtol=1e-4)
 
 
+@pytest.mark.system
 def test_somebody_who_is_not_there_changes_nothing():
     b = contrast(jnp.linspace(0, 1, 50), jnp.full(50, 0.9))
     assert log_likelihood_ratio(jnp.zeros(50), b) == 0
@@ -72,6 +73,7 @@ def test_presence_is_that_of_a_person_at_a_place():
     np.testing.assert_allclose(q[2], q[3], rtol=1e-3)
 
 
+@pytest.mark.system
 def test_the_truth_is_likelier_than_its_neighbours():
     camera, xy = camera_1(), jnp.array([-0.6, 1.2])
     grid = jnp.stack(jnp.meshgrid(jnp.arange(160.0), jnp.arange(120.0)), axis=-1).reshape(-1, 2)
@@ -82,6 +84,7 @@ def test_the_truth_is_likelier_than_its_neighbours():
         assert log_likelihood_ratio(at(xy + jnp.array(step), 1.7), b) < best
 
 
+@pytest.mark.system
 def test_a_window_is_an_even_grid_of_pixels():
     seen = window(jnp.array([-4.0, 10.0, 12.0, 50.0]), (40, 60), (10, 8))
     uv, index, inside = (np.asarray(leaf) for leaf in seen[:3])
@@ -103,6 +106,7 @@ def test_lattice_points_are_all_combinations_with_the_unmoved_one_in_the_middle(
     np.testing.assert_array_equal(found[len(found) // 2], np.zeros(dimensions))
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_quadratic_fit_is_numpys_least_squares(n):

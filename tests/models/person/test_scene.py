@@ -72,6 +72,7 @@ def test_patch_depth_is_that_of_a_ray_caster(camera):
     np.testing.assert_allclose(found[away_from_edges], expected[away_from_edges], atol=1e-9)
 
 
+@pytest.mark.system
 def test_mesh_depth_is_that_of_a_ray_caster(camera):
     mesh = mesh_of_boxes()
     expected, away_from_edges = traced(camera, mesh.vertices, mesh.faces)
@@ -113,6 +114,7 @@ def test_upright_things_stand_in_a_plane_that_faces_the_camera(camera):
     np.testing.assert_allclose((points[:, :2] - xy) @ away, 0, atol=1e-9)
 
 
+@pytest.mark.system
 def test_walkable_agrees_with_opencv():
     polygon = np.array([[0, 0], [4, 0.3], [3.5, 3], [2, 1.2], [0.5, 2.8], [1, 1]], np.float32)
     xy = np.random.default_rng(0).uniform(-1, 5, (500, 2)).astype(np.float32)

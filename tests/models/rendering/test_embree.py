@@ -57,6 +57,7 @@ def test_against_embree(kind, random_transform, embree, seed):
     check_agreement(ours, embree(camera).depth(triangles))
 
 
+@pytest.mark.system
 def test_a_scan_of_many_triangles(embree):
     """Open, not convex, near the camera and beyond the image's border."""
     camera = Pinhole.from_intrinsics((500.0, 500.0), (319.5, 239.5), (480, 640))

@@ -31,6 +31,7 @@ from jaxfilters.models.synthetic.articulated import (
 STATES = {"shape1": lambda: paper_states(1), "shape2": lambda: paper_states(2), "held": lambda: held_states(2, 3, 20)}
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", STATES)
 def test_truth_satisfies_table_1_at_every_frame(name):
     rows = limit_rows(LAYOUT, table_1())
@@ -108,6 +109,7 @@ def test_a_held_pose_is_that_of_its_frame_at_scale_one():
     np.testing.assert_allclose(states[0, 2:6], moving[2:6] / np.linalg.norm(moving[2:6]), rtol=1e-5)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("simulate", "shape"),
     [
@@ -128,6 +130,7 @@ def test_a_key_decides_the_sequence(simulate, shape):
     assert all(np.all(np.isfinite(leaf)) for leaf in a)
 
 
+@pytest.mark.system
 def test_noise_of_the_features_has_the_stated_deviation():
     hand, states = paper_hand(), paper_states(1, 10)
     record_all = jax.jit(jax.vmap(lambda key: record(key, states, hand)))
@@ -139,6 +142,7 @@ def test_noise_of_the_features_has_the_stated_deviation():
     assert bool(np.all(masks))
 
 
+@pytest.mark.system
 def test_lines_without_length_are_masked():
     # Both fingers of a palm that faces the camera bent by a right angle.
     angles = jnp.deg2rad(jnp.array([0.0, 90, 0, 0, 0, 90, 0, 0]))
@@ -148,6 +152,7 @@ def test_lines_without_length_are_masked():
     np.testing.assert_array_equal(masks[0], ~lines)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("shape", [1, 2])
 def test_the_belief_at_the_start_is_that_of_table_2(shape):
     truth = paper_states(shape)[0]

@@ -25,6 +25,7 @@ def assert_fraction(count, total, fraction):
     assert abs(count - total * fraction) < 4 * np.sqrt(total * fraction * (1 - fraction))
 
 
+@pytest.mark.system
 def test_without_flaws_it_is_the_image_in_millimetres_before_a_wall(disc):
     np.testing.assert_array_equal(sense(disc, **QUIET), np.where(np.isfinite(disc), 700, 3000))
 
@@ -76,6 +77,7 @@ def test_dropouts_are_zero_and_as_many_as_stated(disc):
     np.testing.assert_array_equal(image[kept], sense(disc, **QUIET)[kept])
 
 
+@pytest.mark.system
 def test_depths_beyond_the_range_of_the_format_saturate():
     far = DepthSensor(noise_std=0.0).sense(jax.random.key(1), jnp.full((2, 2), 100.0))
     np.testing.assert_array_equal(far, 65535)

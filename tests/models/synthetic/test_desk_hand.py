@@ -70,6 +70,7 @@ def test_the_same_key_gives_the_same_frame_and_another_another():
     assert not np.array_equal(first.image, other.image)
 
 
+@pytest.mark.system
 def test_a_video_moves_smoothly_and_shows_the_fingers_of_its_schedule():
     fingers = np.repeat(np.array([[0, 1, 0, 0, 0], [0, 1, 1, 0, 0], [1, 1, 1, 1, 1]], bool), 30, axis=0)
     frames = list(desk_video(jax.random.key(0), fingers))

@@ -20,6 +20,7 @@ def people():
     return jax.vmap(make_identity)(jax.random.split(jax.random.key(0), MANY))
 
 
+@pytest.mark.system
 def test_people_are_centred_on_their_landmarks(people):
     np.testing.assert_allclose(people.neutral.mean(axis=1), 0, atol=1e-4)
 
@@ -57,6 +58,7 @@ def test_gains_are_log_normal_and_curvatures_standard_normal(people):
         assert np.abs(values.std(axis=0) / std - 1).max() < 4 / np.sqrt(2 * MANY)
 
 
+@pytest.mark.system
 def test_a_face_without_expression_is_neutral():
     person = make_identity(jax.random.key(3))
     np.testing.assert_array_equal(face_shape(person, 0.0, 0.0), person.neutral)

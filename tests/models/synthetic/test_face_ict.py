@@ -56,6 +56,7 @@ def test_the_model_is_read_in_millimetres_with_y_down_and_z_away(model_folder):
     assert model.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
+@pytest.mark.system
 def test_people_and_expressions_add_up_about_the_neutral_landmarks(model_folder):
     model = read_ict(model_folder)
     person = make_ict_person(jax.random.key(1), model)
@@ -161,6 +162,7 @@ def ict(data_dir):
     return read_ict(data_dir / "ict_face_model")
 
 
+@pytest.mark.system
 @pytest.mark.data
 def test_the_landmarks_of_the_mean_face_are_those_of_the_specification(ict):
     """Both are faces of adults: every landmark within 16 mm of the specification's, every eye 20 to 45 mm wide."""

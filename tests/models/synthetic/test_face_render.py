@@ -109,6 +109,7 @@ def test_head_is_a_brighter_ellipse_before_the_background(scene):
     np.testing.assert_allclose(image[:, :100], np.asarray(scene.background)[0][:, :100], atol=2.6)
 
 
+@pytest.mark.system
 def test_gain_and_offset_act_on_everything_and_pixels_stay_within_bytes(scene):
     key = jax.random.key(2)
     plain_image, dim, bright = (
@@ -120,6 +121,7 @@ def test_gain_and_offset_act_on_everything_and_pixels_stay_within_bytes(scene):
     assert bright.max() == 255
 
 
+@pytest.mark.system
 def test_an_occluder_hides_what_is_behind_it_in_every_camera(scene):
     occluder = Occluder(jnp.array([60.0, 40.0, 600.0]), jnp.array([40.0, 20.0]), jnp.asarray(120.0), jnp.asarray(1.0))
     key = jax.random.key(4)

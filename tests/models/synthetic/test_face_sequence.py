@@ -26,6 +26,7 @@ def test_images_are_the_same_however_they_are_asked_for(disturbed):
     assert np.any(together[0] != together[1])
 
 
+@pytest.mark.system
 def test_chunks_cover_every_frame_once():
     short = face_sequence(jax.random.key(1), motion("mix", 5, 0))
     pieces = list(short.chunks(2))
@@ -52,6 +53,7 @@ def test_shapes_deform_about_the_centroid_of_the_neutral_face(disturbed):
     assert moved[:, [1, 2]].max() == 0
 
 
+@pytest.mark.system
 def test_the_occluder_covers_mouth_and_nostrils_in_both_cameras_and_nothing_else(disturbed):
     covered = face_sequence(
         jax.random.key(0), disturbed.poses[:216], expressions=disturbed.expressions[:216], covered=np.ones(216, bool)
@@ -82,6 +84,7 @@ def test_frames_outside_the_sequence_are_refused(disturbed):
             disturbed.frames(start, stop)
 
 
+@pytest.mark.system
 def test_people_of_different_keys_differ():
     poses = motion("slow", 2, 0)
     a, b = (face_sequence(jax.random.key(i), poses) for i in (0, 1))

@@ -30,6 +30,7 @@ def test_texture_has_the_rms_and_the_wavelengths_of_the_specification(texture):
     assert length.max() <= 22 + 1e-4
 
 
+@pytest.mark.system
 def test_a_patch_is_the_waves_within_a_window(texture):
     x, y = np.random.default_rng(0).uniform(-15, 15, (2, 50))
     for k in (0, 5):

@@ -44,6 +44,7 @@ def test_the_generator_gives_the_levels_of_the_specification(x64):
     assert np.std(noise) == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(1800))
 
 
+@pytest.mark.system
 def test_an_additive_model_has_no_more_ranks_than_parts(x64):
     draw = np.random.default_rng(1)
     normal = lambda *shape: jnp.asarray(draw.normal(size=shape))

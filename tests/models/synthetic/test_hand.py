@@ -30,6 +30,7 @@ def displacements(poses):
     return jax.vmap(local)(poses[:-1], poses[1:])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", MOTIONS)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_quaternions_are_unit_and_bounds_are_kept(kind, seed):
@@ -42,6 +43,7 @@ def test_quaternions_are_unit_and_bounds_are_kept(kind, seed):
     assert np.all((wrist >= WRIST_BOUNDS[:, 0] - rounding) & (wrist <= WRIST_BOUNDS[:, 1] + rounding))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", RANDOM_WALKS)
 def test_a_key_decides_the_motion(kind):
     simulate = RANDOM_WALKS[kind]
@@ -87,6 +89,7 @@ def test_data_b_integrates_a_damped_random_walk_of_its_velocity():
     )
 
 
+@pytest.mark.system
 def test_data_b_turns_back_at_the_limits_of_the_angles():
     keys = jax.random.split(jax.random.key(5), 100)
     poses = np.asarray(jax.vmap(lambda key: simulate_poses_b(key, 100))(keys))

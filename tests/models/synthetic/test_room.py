@@ -58,6 +58,7 @@ def hulls(people, P):
     return masks
 
 
+@pytest.mark.system
 def test_the_matrix_of_a_camera_projects_as_its_pinhole_does(pinhole):
     transform = looking(POSITION, 70.0, 25.0)
     points = np.random.default_rng(0).uniform((-1, 0, 0), (2, 4, 2), (50, 3))
@@ -95,6 +96,7 @@ def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
         assert mine.sum() > 200
 
 
+@pytest.mark.system
 def test_clothes_and_heads_are_in_their_places(empty_room, people):
     image, who = image_of(empty_room, people)
     rows, cols = np.nonzero(who == 1)

@@ -75,6 +75,7 @@ def test_place_and_heading_move_the_whole_body():
     np.testing.assert_allclose(moved, plain @ turn.T + [2, -3, 0], atol=1e-5)
 
 
+@pytest.mark.system
 def test_bodies_can_be_had_in_batches():
     two = jax.tree.map(lambda a, b: jnp.stack([a, b]), walker(), walker(xy=(1.0, 2.0)))
     np.testing.assert_allclose(jax.vmap(body)(two).center[1], body(walker(xy=(1.0, 2.0))).center, atol=1e-6)

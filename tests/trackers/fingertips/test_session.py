@@ -81,6 +81,7 @@ def test_a_stroke_with_the_thumb_folded_is_a_symbol_in_its_place():
     np.testing.assert_array_equal(strokes[0].counts, 1)
 
 
+@pytest.mark.system
 def test_the_thumb_switches_from_symbols_to_manipulation():
     """Closing and opening is a pinch, with the move between; a turn and a stretch of the open hand are told."""
     palm = np.array([320.0, 300.0])

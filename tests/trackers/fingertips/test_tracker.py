@@ -241,6 +241,7 @@ def test_fingers_that_pass_each_other_keep_their_names():
     assert (left(first), right(first)) == (right(last), left(last))
 
 
+@pytest.mark.system
 def test_predictions_ahead_have_a_covariance_that_grows():
     frames = [shown([INDEX], palm=(6.0 * i, 0.0)) for i in range(20)]
     state, _ = play(frames)

@@ -144,6 +144,7 @@ def test_contribution_falls_with_what_the_modes_cannot_explain():
     assert float(learning.contribution(begin()[0])) == 0
 
 
+@pytest.mark.system
 def test_the_motion_of_the_skull_is_taken_out():
     """A turn of 1 degree and a shift of 2 mm, beside a mouth that opens."""
     turn = np.radians([0.6, -0.8, 0.2])
@@ -160,6 +161,7 @@ def test_the_motion_of_the_skull_is_taken_out():
     assert abs(np.asarray(still.basis)[:, 0] @ mouth.ravel()) > 0.97
 
 
+@pytest.mark.system
 def test_coefficients_are_carried_over_to_another_model():
     shapes, _ = deformed(5, 30)
     (_, before), _ = follow_all(shapes)

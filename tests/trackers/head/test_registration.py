@@ -91,6 +91,7 @@ def test_rigs_need_not_be_rectified(num_cameras):
     assert found.model.templates.shape == (num_cameras, 10, 16, 16)
 
 
+@pytest.mark.system
 def test_what_repeats_along_a_line_does_not_mislead(scene):
     """An exact copy of the left window at 900 mm: its score is 1, the true one's less."""
     images, points, face = scene
@@ -105,6 +106,7 @@ def test_what_repeats_along_a_line_does_not_mislead(scene):
     assert float(copied) > score[k]
 
 
+@pytest.mark.system
 def test_the_model_has_the_axes_of_the_camera_or_of_the_face():
     turn = (0.08, -0.2, 0.1)
     face = first(2, pose=(40.0, 10, 600, *turn))
@@ -159,6 +161,7 @@ def test_a_rig_turned_about_its_axes_is_refused(scene, axis, degrees):
     refused(images, points, rig, "epipolar error: the rig contradicts")
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("baseline", "words"), [(60.0, "326 mm away"), (180.0, "eyes are 4. and"), (240.0, "baseline")]
 )
@@ -167,6 +170,7 @@ def test_a_wrong_baseline_is_refused(scene, baseline, words):
     refused(images, points, nominal(baseline), words)
 
 
+@pytest.mark.system
 def test_images_of_two_moments_or_two_scenes_are_refused(scene):
     images, points, face = scene
     later = first(3, pose=(60.0, 12, 650, 0, 0, 0)).frames(0, 1)[0]
@@ -211,6 +215,7 @@ def test_one_camera_gives_an_average_face_on_the_given_points(pose):
     np.testing.assert_allclose(wider.pose[2] / found.pose[2], 68 / 62, rtol=0.01)
 
 
+@pytest.mark.system
 def test_an_average_face_is_posed_exactly():
     rig = monocular(CAMERA)
     points = np.asarray(project_shape(rig, jnp.asarray(MEAN_SHAPE, float), jnp.array([5.0, 8, 700, 0, 0, 0]))[0][0])
@@ -248,6 +253,7 @@ def test_a_registered_face_scores_highest_where_it_is(scene):
     assert score > 20 - 0.6
 
 
+@pytest.mark.system
 def test_float64_is_kept(scene, x64):
     images, points, _ = scene
     found = register(images, points.astype(float), nominal())

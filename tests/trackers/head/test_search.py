@@ -60,6 +60,7 @@ def face():
     return Face()
 
 
+@pytest.mark.system
 def test_the_registered_face_scores_nearly_all_there_is(face):
     """Oracle 3: c >= 2K - 0.6 in another frame, where noise has a standard deviation of 2 grey levels."""
     found = score_at(face.rigid, face.rigid.templates, face.rig, face.x, face.images)
@@ -147,6 +148,7 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face, x64):
     assert np.abs(estimates[0] - np.asarray(x)).max() > 0.01
 
 
+@pytest.mark.system
 def test_particles_spread_as_fast_as_the_head_goes(face):
     velocity = jnp.asarray(UNITS * [2.0, 0, -60, 0, 3, 0], float)
     state = start_search(face.x, OPTIONS)._replace(velocity=velocity)
@@ -197,6 +199,7 @@ def test_the_filter_is_fitted_to_the_model_of_the_day(face):
     assert filters.layered.params.partitions is not None
 
 
+@pytest.mark.system
 def test_one_frame_finds_a_head_that_has_moved_a_little(face):
     start = start_search(face.x.at[:POSE].add(jnp.asarray(UNITS * [0.8, -0.5, 1, 0.5, 0.7, -0.5], float)), OPTIONS)
     filter = at(searches(face.rig, OPTIONS).rigid, face.rigid, face.rigid.templates, jnp.zeros(NUM_MODES))

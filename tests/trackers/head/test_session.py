@@ -170,6 +170,7 @@ def test_what_was_learnt_is_kept_for_a_known_face(drawn):
     assert lost.status[-1] == DEFORMABLE
 
 
+@pytest.mark.system
 def test_two_faces_and_no_face_are_told_apart(draw_face):
     both = np.maximum(draw_face((180, 220), 62)[0], draw_face((440, 220), 75)[0])
     empty = np.full((480, 640), 40, np.uint8)
@@ -256,6 +257,7 @@ def test_a_detector_that_is_not_installed_is_refused(monkeypatch):
         HeadSession(nominal(), HeadOptions(detector="mediapipe"))
 
 
+@pytest.mark.system
 def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
     """It is registered in the images that were searched, of their time, though others have come meanwhile."""
     begun = []

@@ -137,12 +137,14 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     assert bool(does)
 
 
+@pytest.mark.system
 def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
     window = window_of(rig, face, seen, USUAL)
     _, does = choose(face, window, USUAL.prior, mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL)
     assert not bool(does)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
 def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landmarks):
     options = replace(USUAL, landmarks=landmarks, selection="angles")

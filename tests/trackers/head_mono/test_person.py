@@ -32,6 +32,7 @@ def somebody(face, seed=1):
     return Person(face.identity_mean + jnp.asarray(rng.normal(0, 0.3, 4)), jnp.asarray(rng.normal(0, 1, (10, 3))))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("num_expressions", [3, NUM_MODES])
 def test_every_expression_is_the_same_shape_in_both_models(x64, num_expressions):
     face = random_face(num_expressions)
@@ -55,6 +56,7 @@ def test_modes_are_orthonormal_and_vary_as_expressions_do(x64):
     assert np.all(np.diff(model.deviation) <= 0)
 
 
+@pytest.mark.system
 def test_of_many_expressions_the_strongest_modes_stay(x64):
     face = random_face(8)
     person = somebody(face)
@@ -66,6 +68,7 @@ def test_of_many_expressions_the_strongest_modes_stay(x64):
     np.testing.assert_allclose(modes.coefficients(face, modes.expression(face, c)), c, atol=1e-10)
 
 
+@pytest.mark.system
 def test_expressions_that_do_nothing_are_no_modes():
     face = random_face(NUM_MODES)
     still = MultilinearFace(**{**face.__dict__, "tensor": face.tensor.at[..., 2:].set(0.0)})

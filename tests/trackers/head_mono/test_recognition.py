@@ -117,6 +117,7 @@ def test_shares_of_the_prior(taught):
     np.testing.assert_allclose(np.exp(with_two.log_prior), [0.5, 0.25, 0.25], rtol=1e-6)
 
 
+@pytest.mark.system
 def test_people_of_another_model_are_refused(rig, face, taught):
     other, _ = taught
     fewer = Remembered(*(jnp.zeros(shape) for shape in ((1, 10), (1, 10, 10), (1, 10, 3))))

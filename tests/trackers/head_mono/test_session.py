@@ -163,6 +163,7 @@ def test_68_landmarks_are_a_start_of_which_ten_are_followed(rig, face, face68, s
     assert np.all(tracks[1].pose_std[1:, 2] < 1.01 * tracks[0].pose_std[1:, 2])
 
 
+@pytest.mark.system
 def test_what_is_no_face_is_refused_with_its_reason(rig, face):
     scattered = np.random.default_rng(0).uniform(100, 400, (10, 2))
     session = MonoSession(rig, face, points=scattered)

@@ -22,6 +22,7 @@ def test_images_are_those_of_the_seed(room):
     assert len(room) == len(room.routes.xy) == 240
 
 
+@pytest.mark.system
 def test_seeds_differ_in_speeds(room):
     other = demo_room(4, frames=240)
     assert np.abs(other.routes.xy - room.routes.xy).max() > 0.3

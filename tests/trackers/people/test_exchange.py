@@ -40,6 +40,7 @@ def met_and_parted(worn, *, frames=8, first=RED, second=BLUE, good=CLEARLY):
     return people
 
 
+@pytest.mark.system
 def test_whoever_wears_the_other_s_clothes_is_the_other():
     """Identity, clothes and height change hands; place, speed and width stay with the body."""
     people = met_and_parted([BLUE, RED, GREY], frames=1)

@@ -37,6 +37,7 @@ def parabolas(seed, n):
     return Fit(jnp.asarray(place), jnp.asarray(axes), steps, quadratic, none, none, none, none), mean, precision
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_readings_of_an_exact_parabola_are_its_gaussian():
     """Information H^T R^-1 H and information times mean, added up over the four readings."""
@@ -51,6 +52,7 @@ def test_readings_of_an_exact_parabola_are_its_gaussian():
     np.testing.assert_allclose(found, mean, atol=1e-10)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_shape_and_gait_add_to_every_reading():
     fit, *_ = parabolas(1, 5)
@@ -58,6 +60,7 @@ def test_shape_and_gait_add_to_every_reading():
     np.testing.assert_allclose(rough - plain, np.broadcast_to(0.05**2 * np.eye(4), plain.shape), atol=1e-15)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_moves_nobody_far():
     fit, *_ = parabolas(2, 1)
@@ -104,6 +107,7 @@ def test_everybody_is_found_where_drawn_though_two_overlap(found):
     assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
 
 
+@pytest.mark.system
 def test_slots_mean_nothing_to_the_search(found):
     run, *_ = found
     plain, moved = run({0: 0, 1: 1, 2: 2}), run({3: 0, 0: 1, 4: 2})

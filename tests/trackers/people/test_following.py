@@ -41,6 +41,7 @@ def given(monkeypatch):
     return steps
 
 
+@pytest.mark.system
 def test_frames_come_in_turn_with_the_seconds_between_them(scene, given):
     """Frame numbers are counted, steps are differences of times, and tracks go back to before the confirmation."""
     recorder, times = Recorder(), [0.0, 0.1, 0.4, 0.5]

@@ -55,6 +55,7 @@ def judged(scene, people, fit, *, dt=0.1, looked=True, frames=1):
     return people
 
 
+@pytest.mark.system
 def test_evidence_confirms_somebody(scene):
     """Four units of log odds, at most one a frame however good the score."""
     people = people_of(TENTATIVE)
@@ -146,6 +147,7 @@ def test_two_who_come_at_once_are_not_the_same_old_one():
     assert name(people).identity.tolist() == [2, -1, 9, -1]
 
 
+@pytest.mark.system
 def test_clothes_are_taken_at_first_and_then_followed_slowly():
     people, good = people_of(TRACKED, TRACKED), jnp.array([True, False, False, False])
     first = lifecycle.remembered(people, jnp.tile(RED, (SLOTS, 1)), good)

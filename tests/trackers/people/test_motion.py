@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.linalg import expm
 
 from jaxfilters.trackers.people.motion import HEIGHT_DRIFT, WIDTH_DRIFT, motion
 from jaxfilters.trackers.people.state import PeopleConfig
 
 
+@pytest.mark.system
 def test_motion_is_the_discretised_white_acceleration(x64):
     """Van Loan's block exponential (1978) gives F and Q of any linear stochastic differential equation."""
     A = np.zeros((6, 6))

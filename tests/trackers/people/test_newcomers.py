@@ -36,6 +36,7 @@ def check_near(new, place):
     assert abs(float(new.xy[1]) - place[1]) < 0.9
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("place", [SOMEBODY, (-1.6, 2.5, 1.6, 0.4), (0.0, -0.6, 1.85, 0.5)])
 def test_somebody_new_is_found(found, draw, camera, place):
     check_near(found(draw(camera, [place])[0]), place)
@@ -78,6 +79,7 @@ def test_cells_are_those_of_the_floor_that_a_camera_sees(camera):
     assert len(rest.xy) == pytest.approx(len(cells.xy) / 2, rel=0.15)
 
 
+@pytest.mark.system
 def test_cells_that_only_fill_up_change_nothing(camera, draw, floor):
     """A scene finds the same newcomers as with its own number of cells."""
     scene = people_scene([camera], floor, config=CONFIG)
@@ -104,6 +106,7 @@ def test_cells_are_filled_up_to_a_few_numbers(count, expected):
     assert not np.asarray(filled.share[0])[count:].any()
 
 
+@pytest.mark.system
 def test_a_floor_that_no_camera_sees_is_named(camera):
     behind = np.array([(-4.0, -20.0), (4.0, -20.0), (4.0, -10.0)])
     with pytest.raises(ValueError, match="floor: no camera sees half of a person"):

@@ -149,6 +149,7 @@ def test_people_who_are_ellipsoids_are_found(steps_m, most):
     assert np.mean(errors) <= most
 
 
+@pytest.mark.system
 def test_the_score_never_decreases_within_a_frame(scene):
     rng = np.random.default_rng(1)
     score = jax.jit(lambda sim, real: match_score(ternary_mask(sim), ternary_mask(real)))
@@ -181,6 +182,7 @@ def test_either_nesting_of_the_loops_follows_two_people():
         assert np.linalg.norm(np.asarray(state.xy[:2]) - truth, axis=1).max() <= 0.1
 
 
+@pytest.mark.system
 def test_somebody_is_acquired_tracked_and_lost(scene):
     state, mask = state_of(scene, (-1.5, 1.4)), silhouette((-1.1, 1.0))
     assert state.mode[0] == ACQUIRE
@@ -273,6 +275,7 @@ def test_nobody_at_all_is_no_trouble(scene):
     assert np.all(np.isneginf(report.score))
 
 
+@pytest.mark.system
 def test_any_number_of_people_is_one_compilation():
     scene = scene_of(capacity=4)
     before = paper_step._cache_size()
@@ -283,6 +286,7 @@ def test_any_number_of_people_is_one_compilation():
     assert paper_step._cache_size() - before == 1
 
 
+@pytest.mark.system
 def test_the_profile_says_in_which_direction_the_place_is_known(scene):
     whole, lower, upper = (-1.0, 1.0), (-1.0, 3.0), (-1.0, -0.5)
     profiles = {

@@ -64,6 +64,7 @@ def test_spreads_are_along_and_across_the_line_of_sight():
     assert spreads(np.array([[0.0, 0.0], [3.0, -1.0]]), seen) == pytest.approx((0.1, 0.2))
 
 
+@pytest.mark.system
 def test_smoothed_tracks_are_the_batch_solution(x64):
     """Filtered in NumPy, smoothed here, against the least-squares solution of all frames at once."""
     rng = np.random.default_rng(0)
@@ -99,6 +100,7 @@ def test_smoothed_tracks_are_the_batch_solution(x64):
         np.testing.assert_allclose(seen.covariance, spread[now, now], atol=2e-4)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("time", "slot"), [(20.0, 0), (0.1, 1)])
 def test_a_long_gap_and_another_slot_part_a_track(time, slot):
     here = [

@@ -32,6 +32,7 @@ def test_somebody_at_rest_looks_taller_than_on_the_way():
     np.testing.assert_allclose(factors, 1 + SINK * np.array([0.5, 0.5, 0, -0.5, -0.5]), rtol=1e-6)
 
 
+@pytest.mark.system
 def test_the_place_is_that_of_the_state_but_for_the_height():
     states = jnp.stack([moving(0.0), moving(2.0)])
     found = np.asarray(place_of(states))

@@ -143,6 +143,7 @@ def test_outlines_surround_the_silhouettes(scene, frames, followed):
 SQUARE = ((-1.0, 0.0), (1.0, 0.0), (1.0, 2.0), (-1.0, 2.0))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("floor", "message"),
     [

@@ -115,6 +115,7 @@ def test_keypoints_of_any_detector_are_followed(tmp_path, capsys):
     assert (video.get(cv2.CAP_PROP_FRAME_HEIGHT), video.get(cv2.CAP_PROP_FRAME_WIDTH)) == (480, 640)
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_articulated")
 def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monkeypatch):
     configs, build = [], articulated_hand.build
@@ -201,7 +202,7 @@ def test_wrong_options_are_one_clear_line(options, message, tmp_path, capfd):
         ("--out a --hand third", "--hand: invalid choice: 'third'"),
         ("--out a --image-size 640", "--image-size: expected WIDTHxHEIGHT in pixels, such as 640x480; got 640"),
         ("--out a --image-size 640x0", "--image-size: expected WIDTHxHEIGHT in pixels, such as 640x480; got 640x0"),
-        ("--out a --noise much", "--noise: invalid float value: 'much'"),
+        ("--out a --noise much", "--noise: expected a finite number above 0; got much"),
     ],
 )
 def test_wrong_arguments_exit_with_two(arguments, message, capsys):

@@ -130,6 +130,7 @@ def test_a_folder_needs_its_intrinsics(folder, track):
     assert "camera.json: intrinsics missing: ['cy']" in line
 
 
+@pytest.mark.system
 def test_a_truncated_image_in_the_first_frames_loses_nothing_before_it(folder, track, tmp_path):
     (folder / "camera.json").write_text('{"fx": 30, "fy": 30, "cx": 16, "cy": 12}')
     (folder / "3.png").write_bytes((folder / "3.png").read_bytes()[:40])
@@ -148,6 +149,7 @@ def test_a_disk_that_is_full_from_the_start_is_named(npz, track, tmp_path):
     assert line.endswith("out/track.csv: no space left on the device; nothing was kept.")
 
 
+@pytest.mark.system
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize("name", ["report.json", "summary.png", "overlay.mp4"])
 def test_a_disk_that_fills_at_the_end_keeps_the_run_for_a_second_try(npz, tmp_path, capsys, name):

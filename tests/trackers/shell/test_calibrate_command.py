@@ -120,6 +120,7 @@ def board_pictures(folder):
     return files, -rotation.T @ t * [1, -1, -1]
 
 
+@pytest.mark.system
 def test_pictures_of_a_board(tmp_path, capsys):
     files, position = board_pictures(tmp_path)
     size = ("--squares", "7x5", "--square-m", 0.04, "--marker-m", 0.03)

@@ -26,6 +26,7 @@ def run(*arguments):
     return main([str(argument) for argument in arguments])
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_track_writes_all_results(npz_file, tmp_path, depth_mm, capsys):
     out = tmp_path / "out"
@@ -60,6 +61,7 @@ def test_demo_follows_the_synthetic_recording_and_knows_its_error(tmp_path, reco
     assert f"mean joint error {report['mean_joint_error_mm']:.1f} mm" in capsys.readouterr().out
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_a_recording_without_a_hand_has_empty_results_and_no_crash(tmp_path, recording, capsys):
     empty = np.zeros((20, *recording.camera.shape), np.uint16)
@@ -75,6 +77,7 @@ def test_a_recording_without_a_hand_has_empty_results_and_no_crash(tmp_path, rec
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 20
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monkeypatch):
     configs = []
@@ -122,6 +125,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(png_folder, tmp_path, monk
         assert (parts / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_resume_starts_anew_where_there_is_nothing_and_redraws_what_is_finished(npz_file, tmp_path, capsys):
     out = tmp_path / "out"
@@ -131,6 +135,7 @@ def test_resume_starts_anew_where_there_is_nothing_and_redraws_what_is_finished(
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 40
 
 
+@pytest.mark.system
 @pytest.mark.usefixtures("fake_hand_depth")
 def test_a_truncated_image_says_what_is_kept_and_can_be_mended(png_folder, tmp_path, capfd):
     victim = sorted(png_folder.glob("*.png"))[20]

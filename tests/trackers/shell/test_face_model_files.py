@@ -48,6 +48,7 @@ def test_what_is_written_is_read(saved, model):
         save_face_model(saved / "below.npz", read)
 
 
+@pytest.mark.system
 def test_the_model_of_the_package_is_a_face():
     model, names, pairs, source, parameters = default_face_model()
     assert (names, pairs) == (NAMES, PAIRS)

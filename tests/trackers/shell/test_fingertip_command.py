@@ -87,6 +87,7 @@ def test_every_output_can_be_read(results):
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == OPEN + REST
 
 
+@pytest.mark.system
 def test_hands_in_depth_images_lie_above_the_desk(recording, tmp_path):
     """In millimetres, on a desk at 0.6 m, as a depth camera gives it."""
     _, frames = recording
@@ -195,6 +196,7 @@ def test_pictures_leave_the_image_as_it_is():
     assert shown(np.array([[0.5, np.nan], [0.6, 0.7]], np.float32)).shape == (2, 2, 3)
 
 
+@pytest.mark.system
 def test_strokes_are_named_by_the_model_of_a_file():
     strokes = tracked(drawn(5, 1))
     recognise = recogniser_of(default_symbols())

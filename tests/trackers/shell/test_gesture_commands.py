@@ -67,6 +67,7 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     assert rows[-1] == {"stroke": "hole", "symbol": "", "confidence": "", "lead_nats": "", "label": ""}
 
 
+@pytest.mark.system
 def test_without_data_symbols_are_drawn(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(gesture_command, "_SHOWN_TRIALS", 1)
     assert run("recognise", "default", "--margin", 0.3) == 0
@@ -108,6 +109,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, capsys):
         assert word in capsys.readouterr().err
 
 
+@pytest.mark.system
 def test_one_person_cannot_be_left_out(tmp_path, capsys):
     data = written(tmp_path / "one.csv", "VL", people=("Ann",))
     assert run("fit", "gestures", data, "--out", tmp_path / "model.npz", "--held-out", "person") == FAILURE

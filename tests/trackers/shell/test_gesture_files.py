@@ -200,6 +200,7 @@ def test_included_files_are_found_as_in_the_distribution(tmp_path):
         read_unipen(file)
 
 
+@pytest.mark.system
 @pytest.mark.data
 @pytest.mark.parametrize("donor", ["art", "gmd"])
 def test_files_of_the_distribution_give_the_strokes_that_others_read_from_them(data_dir, donor):

@@ -210,6 +210,7 @@ def test_images_and_points_lose_the_lens_distortion(stereo, fake_head, tmp_path,
     assert seen[0][0, 0, ROWS // 2, COLS // 2] == 100
 
 
+@pytest.mark.system
 def test_without_a_recording_the_synthetic_face_is_followed(fake_head, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(head_input, "_SYNTHETIC_FRAMES", 9)
     out = tmp_path / "out"
@@ -257,7 +258,7 @@ def test_live_cameras_are_followed_image_by_image(stereo, fake_head, tmp_path, m
         ("{left} {right} --rig {other}", "other.json: a: calibrated for images of 32x24; {left} has 64x48"),
         ("{left} --camera {camera}", "camera.json: calibrated for images of 32x24; {left} has 64x48"),
         ("{left} {left}x --rig {rig}", "leftx: no such file or folder"),
-        ("{left} {right} --rig {left}", "left: cannot be read"),
+        ("{left} {right} --rig {left}", "left: a folder"),
         ("{left} {right} --rig {rig} --points {left}x", "leftx: cannot be read"),
         ("{left} {right} --rig {rig} --num-particles 0", "num_particles must be"),
     ],

@@ -94,6 +94,7 @@ def pictures(tmp_path):
     return folder
 
 
+@pytest.mark.system
 def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(pictures, "--out", out, "--seed", 4, "--num-particles", 60, "--eyes-apart-mm", 64.5) == 0
@@ -162,6 +163,7 @@ def test_marked_landmarks_reach_the_session(pictures, fake, tmp_path):
     assert fake[0].options.landmarks == "aligned"
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("num_expressions", [3, 8])
 def test_models_of_any_number_of_expressions_make_tables(pictures, fake, tmp_path, num_expressions):
     file = default_face_model()

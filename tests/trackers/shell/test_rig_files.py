@@ -22,6 +22,7 @@ def opened(tmp_path, settings):
     return open_rig(file)
 
 
+@pytest.mark.system
 def test_a_file_becomes_a_rig_and_what_straightens_its_images(tmp_path):
     cameras, rig, undistortions = opened(tmp_path, {"cameras": [LEFT, RIGHT], "note": "by hand"})
     assert [camera.name for camera in cameras] == ["left", "camera 2"]

@@ -34,6 +34,7 @@ def track(recording, tracker, folder, *, resumed=False, stop_after=None, on_prog
     return writer
 
 
+@pytest.mark.system
 def test_rows_are_those_of_the_tracker_over_the_whole_recording(recording, fake_tracker, tmp_path):
     track(recording, fake_tracker, tmp_path)
     state = fake_tracker.start(jax.random.key(3), recording[0])
@@ -59,6 +60,7 @@ def test_the_table_has_a_row_a_frame_and_keeps_all_digits(recording, fake_tracke
     np.testing.assert_allclose([float(row[1]) for row in rows], recording.times_s, atol=5e-7)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("stop_after", [1, CHUNK + 1, 2 * CHUNK + 1])
 def test_interrupted_and_resumed_equals_uninterrupted(recording, fake_tracker, tmp_path, stop_after):
     track(recording, fake_tracker, tmp_path / "whole")
@@ -107,6 +109,7 @@ def unreadable_at(recording, bad):
     return replace(recording, read=read)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("bad", "saved"), [(5, 0), (CHUNK, CHUNK), (CHUNK + 5, CHUNK)])
 def test_frames_before_an_unreadable_one_are_kept(recording, fake_tracker, tmp_path, bad, saved):
     track(recording, fake_tracker, tmp_path / "whole")

@@ -123,6 +123,7 @@ def test_intervals_in_a_row_in_two_dimensions(x64, form):
             assert (info.sweeps, info.converged) == (1, True)
 
 
+@pytest.mark.system
 def test_a_known_direction_is_left_alone_or_reported(x64, rng, form):
     root = rng.normal(size=(3, 3))
     root[1] = root[0]
@@ -190,6 +191,7 @@ def test_hundreds_of_cuts_leave_a_covariance(x64, rng, form, dtype):
     assert np.trace(Q) < 0.1 * np.trace(before)
 
 
+@pytest.mark.system
 def test_gradients_agree_with_differences(x64, rng, form):
     root, phi = rng.normal(size=(3, 3)), jnp.asarray(rng.normal(size=3))
     mean = rng.normal(size=3)
