@@ -46,8 +46,8 @@ def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood
 
     Example:
         >>> import jax.numpy as jnp
-        >>> from jaxfilters.particle.partitioned import batch_log_likelihood
-        >>> batch_log_likelihood(lambda x, y: -jnp.sum((x - y) ** 2))(jnp.zeros((2, 5)), jnp.ones(2)).shape
+        >>> import jaxfilters as jf
+        >>> jf.batch_log_likelihood(lambda x, y: -jnp.sum((x - y) ** 2))(jnp.zeros((2, 5)), jnp.ones(2)).shape
         (5,)
     """
     checks.check_callables(log_likelihood=log_likelihood)

@@ -142,6 +142,7 @@ INDEFINITE = jnp.array([[1.0, 2.0], [2.0, 1.0]])
 ASYMMETRIC = jnp.array([[1.0, 0.5], [0.0, 1.0]])
 
 PARTICLE = [
+    Case("batch, no function", lambda: jf.batch_log_likelihood(3.0), ("log_likelihood", "callable", "3.0")),
     # The bootstrap filter, and what all particle filters have in common.
     Case("likelihood (1,)", lambda: run_bootstrap(log_likelihood=vector_log_likelihood), ("log_likelihood", "(1,)")),
     Case("likelihood pair", lambda: run_bootstrap(log_likelihood=lambda x, y: (0.0, 0.0)), ("log_likelihood", "(0.0")),
