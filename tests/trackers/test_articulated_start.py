@@ -16,6 +16,8 @@ from jaxfilters.models.articulated.projection import Perspective, WeakPerspectiv
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated_start import NUM_STARTS, starts_from_points
 
+pytestmark = pytest.mark.system
+
 CAMERA = Pinhole.from_intrinsics(600.0, (320.0, 240.0), (480, 640))
 
 
@@ -51,7 +53,6 @@ def rotation_error(hand, states, truth):
     return np.degrees(2 * np.arccos(np.clip(np.abs(q @ p), 0, 1)))
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("turned", [(0, 0, 0), (35, 0, 0), (0, 0, 120), (0, 170, 0), (20, 30, -60)])
 def test_the_true_pose_is_among_the_starts(scene, turned):
     hand, starts = scene
@@ -63,7 +64,6 @@ def test_the_true_pose_is_among_the_starts(scene, turned):
     assert float(jnp.sqrt(jnp.mean(image**2))) < 3.0
 
 
-@pytest.mark.system
 def test_what_was_not_measured_does_not_matter(scene):
     """Middle joints, tips and the wrist alone, with anything in the other rows."""
     hand, starts = scene

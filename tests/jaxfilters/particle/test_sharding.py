@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.system
+
 SCRIPT = Path(__file__).with_name("sharded_runs.py")
 QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 DT, Q_N, Q_L, STD = 0.1, 0.3, 4.0, 0.4
@@ -66,13 +68,11 @@ def check_unbiased(runs):
         assert abs(unbiased.mean()) < 4 * unbiased.std(ddof=1) / np.sqrt(ratio.size)
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("which", ["islands_0.0", "islands_0.5", "islands_1.0", "marginalised"])
 def test_evidence_and_posterior_are_unbiased_however_often_islands_exchange(found, which):
     check_unbiased(found[which])
 
 
-@pytest.mark.system
 def test_placement_gives_the_numbers_of_one_device(found):
     placed = found["placement"]
     assert placed["ancestors"]
@@ -141,7 +141,6 @@ def test_the_example_of_the_page_runs(root):
     assert abs(pose - 1) < 0.3
 
 
-@pytest.mark.system
 def test_two_processes_give_the_same_posterior():
     with socket.socket() as free:
         free.bind(("localhost", 0))

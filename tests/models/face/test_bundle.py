@@ -16,6 +16,8 @@ from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, par
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
+pytestmark = pytest.mark.system
+
 NUM = 5
 FREE, HELD = Prior(0.0, 0.0), Prior(1.0, 1.0)
 WIDE = Reach(np.array([300.0, 300, 400, 1, 1, 1]), 4.0, 4.0, 2.0)
@@ -68,7 +70,6 @@ def views_of(bundle, std=1.0, noise=None):
     return Views(uv, covariance, jnp.ones((NUM, 10), bool))
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_landmarks_give_back_the_face_and_where_it_is(x64, seed):
     """Oracle 12: without a prior, from the preset start."""
@@ -81,7 +82,6 @@ def test_exact_landmarks_give_back_the_face_and_where_it_is(x64, seed):
     np.testing.assert_allclose(of(found), of(true), atol=1e-3)
 
 
-@pytest.mark.system
 def test_the_least_energy_within_the_box_is_that_of_scipy(x64):
     """Noise of 1 px and a narrow box, of which several bounds are met."""
     rng = np.random.default_rng(7)
@@ -104,7 +104,6 @@ def test_the_least_energy_within_the_box_is_that_of_scipy(x64):
     assert np.sum((x <= bounds[0] + 1e-9) | (x >= bounds[1] - 1e-9)) >= 3
 
 
-@pytest.mark.system
 def test_scaling_identity_against_expression_changes_no_pixel(x64):
     """Oracle 6: the null direction of the Jacobian, with the expressions' own parts of it."""
     at = truth(4)
@@ -113,7 +112,6 @@ def test_scaling_identity_against_expression_changes_no_pixel(x64):
     assert np.abs(change).max() < 1e-9
 
 
-@pytest.mark.system
 def test_derivatives_are_those_of_finite_differences(x64):
     """Oracle 7: of the residuals that the solver sees, the robust ones and the prior's included."""
     at = truth(5)
@@ -145,7 +143,6 @@ def test_the_box_is_never_empty_and_holds_the_clipped_start(x64, far):
     assert np.all((low.person.identity <= inside + 1e-12) & (inside <= high.person.identity + 1e-12))
 
 
-@pytest.mark.system
 def test_landmarks_that_are_not_seen_say_nothing(x64):
     true = truth(6)
     views = views_of(true)
@@ -190,7 +187,6 @@ def test_a_point_behind_the_camera_is_a_large_residual_and_no_nan(x64):
     assert np.isfinite(_residuals(face(), rig(), views_of(preset()), behind, HELD)).all()
 
 
-@pytest.mark.system
 def test_a_past_is_the_gaussian_that_it_says(x64):
     """Energies of two people differ by what was measured, also where that tells nothing of a direction."""
     rng = np.random.default_rng(11)
@@ -213,7 +209,6 @@ def test_a_past_is_the_gaussian_that_it_says(x64):
     assert added[0] - added[1] == pytest.approx(told(true) - told(other), rel=1e-4)
 
 
-@pytest.mark.system
 def test_a_past_that_tells_nothing_changes_nothing(x64):
     views = views_of(truth(13), noise=np.random.default_rng(2).normal(0, 1, (NUM, 10, 2)))
     one, _ = _adjusted(views, preset(), HELD)

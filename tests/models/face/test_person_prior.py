@@ -14,6 +14,8 @@ from jaxfilters.models.face.person_prior import Person, Prior, expression_residu
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
+pytestmark = pytest.mark.system
+
 NUM_PEOPLE, NUM = 40, 5
 PRIOR = Prior(1.0, 0.7)
 REACH = Reach(np.array([300.0, 300, 400, 1, 1, 1]), 4.0, 4.0, 4.0)
@@ -48,7 +50,6 @@ def solved(views, start):
     return adjust(face(), rig(), views, start, *numbers, steps=(10, 40))[0]
 
 
-@pytest.mark.system
 def test_strangers_are_not_taken_for_smaller_than_they_are(x64):
     """Whatever counts in squared millimetres makes faces small, and the likeliest face is then some per cent too near.
 
@@ -71,7 +72,6 @@ def variance_of_sizes():
     return slope @ face().identity_covariance @ slope
 
 
-@pytest.mark.system
 def test_near_the_mean_person_the_identity_is_as_likely_as_its_covariance_says(x64):
     rng = np.random.default_rng(0)
     apart = 1e-4 * np.asarray(face().identity_std) * rng.normal(size=12)
@@ -80,7 +80,6 @@ def test_near_the_mean_person_the_identity_is_as_likely_as_its_covariance_says(x
     assert found == pytest.approx(apart @ np.linalg.solve(np.asarray(face().identity_covariance), apart), rel=1e-3)
 
 
-@pytest.mark.system
 def test_the_size_is_as_likely_as_sizes_vary_and_the_rest_counts_in_proportion(x64):
     """Along what the size varies with the rest stays at its mean; at right angles to that the size hardly changes."""
     covariance = np.asarray(face().identity_covariance)

@@ -20,6 +20,8 @@ from jaxfilters.models.face.refinement import COMMON_BIAS_PX, DEGREES_OF_FREEDOM
 from jaxfilters.models.face.rig import jacobian, nominal, project_shape, triangulate
 from jaxfilters.models.face.shape_model import FaceModel, shape
 
+pytestmark = pytest.mark.system
+
 NU = DEGREES_OF_FREEDOM
 POSE = np.array([60.0, 5, 640, 0.05, -0.2, 0.1])
 PRIOR_STD = np.array([2.0, 2, 4, 0.03, 0.05, 0.05, 3.0, 2.0])
@@ -118,7 +120,6 @@ def some_seen():
     return jnp.ones((2, 10), bool).at[0, 3].set(False).at[:, 7].set(False)
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("outlier", [0.0, 3.0])
 def test_the_fit_is_the_least_squares_of_scipy(face, outlier):
     """The same Student residuals, a number each landmark, with the covariances at the solution.
@@ -157,7 +158,6 @@ def information_at(face, found, uv, seen, fisher=False):
     return information, off, S
 
 
-@pytest.mark.system
 def test_the_evidence_is_that_of_student_and_laplace(face):
     _, uv = face.draw(jax.random.key(2))
     seen = some_seen()
@@ -188,7 +188,6 @@ def test_the_covariance_is_inverse_expected_information_and_a_bias_of_whole_imag
     )
 
 
-@pytest.mark.system
 def test_covariances_are_true_over_many_draws(face):
     """Errors over their covariance: 8 in the mean of 2000 Gaussian draws.
 
@@ -218,7 +217,6 @@ def test_covariances_are_true_over_many_draws(face):
     assert 0.7 * LOOSE_STD**2 < np.asarray(excess).mean() < 2 * LOOSE_STD**2
 
 
-@pytest.mark.system
 def test_covariances_are_true_under_the_noise_of_student(face):
     """Landmarks whose four rows together are as long as Student's t makes them; 2000 draws of eight numbers.
 
@@ -250,7 +248,6 @@ def test_covariances_are_true_under_the_noise_of_student(face):
     assert np.asarray(misfit).mean() == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.system
 def test_only_alignments_tell_their_misfit(face):
     """Errors of landmarks twice as large as claimed; a looseness hides them but across the epipolar lines."""
 
@@ -281,7 +278,6 @@ def test_a_mistaken_landmark_does_not_pull_the_head_along(face):
     assert np.abs((wrong.belief.mean - x) / deviation).max() < 4
 
 
-@pytest.mark.system
 def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
     """Oracle 13; the world stays the frame of the left camera."""
     _, uv = face.draw(jax.random.key(7))
@@ -302,7 +298,6 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
         np.testing.assert_allclose(again.log_evidence, expected.log_evidence, rtol=1e-9)
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("garbage", [1e3, np.nan, np.inf])
 def test_landmarks_that_are_not_seen_or_score_low_do_not_count(face, garbage):
     _, uv = face.draw(jax.random.key(6))

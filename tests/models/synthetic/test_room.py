@@ -12,6 +12,8 @@ from jaxfilters.models.synthetic import room
 from jaxfilters.models.synthetic.room import floor_camera, looking, room_camera, room_image
 from jaxfilters.models.synthetic.walkers import Walker, body
 
+pytestmark = pytest.mark.system
+
 SHAPE = (120, 160)
 POSITION = (0.5, -4.0, 2.5)
 CLOTHES = jnp.array([((10.0, 10, 250), (250, 10, 10)), ((10.0, 250, 10), (250, 250, 10))])
@@ -58,7 +60,6 @@ def hulls(people, P):
     return masks
 
 
-@pytest.mark.system
 def test_the_matrix_of_a_camera_projects_as_its_pinhole_does(pinhole):
     transform = looking(POSITION, 70.0, 25.0)
     points = np.random.default_rng(0).uniform((-1, 0, 0), (2, 4, 2), (50, 3))
@@ -82,7 +83,6 @@ def test_a_camera_looks_where_it_is_told(pinhole):
     assert above[0] == pytest.approx(79.5, abs=0.01)
 
 
-@pytest.mark.system
 def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
     """They do not overlap in this image. OpenCV also fills pixels that the border only touches, of every part."""
     _, who = image_of(empty_room, people)
@@ -96,7 +96,6 @@ def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
         assert mine.sum() > 200
 
 
-@pytest.mark.system
 def test_clothes_and_heads_are_in_their_places(empty_room, people):
     image, who = image_of(empty_room, people)
     rows, cols = np.nonzero(who == 1)

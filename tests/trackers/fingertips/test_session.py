@@ -12,6 +12,8 @@ from jaxfilters.trackers.fingertips.drawing import NOTHING_DRAWN, Drawing, Drawi
 from jaxfilters.trackers.fingertips.events import Recognised
 from jaxfilters.trackers.fingertips.session import FingertipSession
 
+pytestmark = pytest.mark.system
+
 FRAMES, PIECE, CAPACITY = 240, 60, 5
 ANGLES = thumb.usual()
 OPEN = np.array([[-75.0, -50.0], [-39.0, -108.0]])
@@ -54,7 +56,6 @@ def circle(n):
     return np.stack([320 + 80 * np.cos(angle), 300 - 80 * np.sin(angle)], axis=1)
 
 
-@pytest.mark.system
 def test_a_stroke_with_the_thumb_folded_is_a_symbol_in_its_place():
     strokes = []
 
@@ -81,7 +82,6 @@ def test_a_stroke_with_the_thumb_folded_is_a_symbol_in_its_place():
     np.testing.assert_array_equal(strokes[0].counts, 1)
 
 
-@pytest.mark.system
 def test_the_thumb_switches_from_symbols_to_manipulation():
     """Closing and opening is a pinch, with the move between; a turn and a stretch of the open hand are told."""
     palm = np.array([320.0, 300.0])

@@ -23,6 +23,8 @@ from jaxfilters.trackers.head.registration import (
     register_monocular,
 )
 
+pytestmark = pytest.mark.system
+
 CAMERA = Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640))
 SEEDS = range(6)
 
@@ -55,7 +57,6 @@ def truth(face):
     return np.asarray(place(jnp.asarray(face.shapes[0]), jnp.asarray(face.poses[0])), float)
 
 
-@pytest.mark.system
 def test_matches_are_right_to_a_part_of_a_pixel_and_depths_follow():
     """Noise of 2 grey levels; 0.15 px in each coordinate is asked for. Depth errs by z^2 / (f B) per pixel (4.4 mm)."""
     pixels, depths = [], []
@@ -80,7 +81,6 @@ def test_matches_are_right_both_ways(scene):
     assert np.sqrt(np.mean((uv - face.uv[0, 0]) ** 2)) < 0.15
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("num_cameras", [2, 3])
 def test_rigs_need_not_be_rectified(num_cameras):
     face = first(5, toed_in(num_cameras=num_cameras), (55.0, 5, 620, 0.05, -0.1, 0.08))
@@ -91,7 +91,6 @@ def test_rigs_need_not_be_rectified(num_cameras):
     assert found.model.templates.shape == (num_cameras, 10, 16, 16)
 
 
-@pytest.mark.system
 def test_what_repeats_along_a_line_does_not_mislead(scene):
     """An exact copy of the left window at 900 mm: its score is 1, the true one's less."""
     images, points, face = scene
@@ -106,7 +105,6 @@ def test_what_repeats_along_a_line_does_not_mislead(scene):
     assert float(copied) > score[k]
 
 
-@pytest.mark.system
 def test_the_model_has_the_axes_of_the_camera_or_of_the_face():
     turn = (0.08, -0.2, 0.1)
     face = first(2, pose=(40.0, 10, 600, *turn))
@@ -161,7 +159,6 @@ def test_a_rig_turned_about_its_axes_is_refused(scene, axis, degrees):
     refused(images, points, rig, "epipolar error: the rig contradicts")
 
 
-@pytest.mark.system
 @pytest.mark.parametrize(
     ("baseline", "words"), [(60.0, "326 mm away"), (180.0, "eyes are 4. and"), (240.0, "baseline")]
 )
@@ -170,7 +167,6 @@ def test_a_wrong_baseline_is_refused(scene, baseline, words):
     refused(images, points, nominal(baseline), words)
 
 
-@pytest.mark.system
 def test_images_of_two_moments_or_two_scenes_are_refused(scene):
     images, points, face = scene
     later = first(3, pose=(60.0, 12, 650, 0, 0, 0)).frames(0, 1)[0]
@@ -200,7 +196,6 @@ def test_what_does_not_belong_together_is_an_error(scene, function):
         function(images[:1], points, monocular(CAMERA))
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("pose", [(0.0, 0, 650, 0, 0, 0), (30.0, -20, 500, 0.1, 0.25, -0.15)])
 def test_one_camera_gives_an_average_face_on_the_given_points(pose):
     face = first(1, monocular(CAMERA), pose)
@@ -215,7 +210,6 @@ def test_one_camera_gives_an_average_face_on_the_given_points(pose):
     np.testing.assert_allclose(wider.pose[2] / found.pose[2], 68 / 62, rtol=0.01)
 
 
-@pytest.mark.system
 def test_an_average_face_is_posed_exactly():
     rig = monocular(CAMERA)
     points = np.asarray(project_shape(rig, jnp.asarray(MEAN_SHAPE, float), jnp.array([5.0, 8, 700, 0, 0, 0]))[0][0])
@@ -253,7 +247,6 @@ def test_a_registered_face_scores_highest_where_it_is(scene):
     assert score > 20 - 0.6
 
 
-@pytest.mark.system
 def test_float64_is_kept(scene, x64):
     images, points, _ = scene
     found = register(images, points.astype(float), nominal())

@@ -17,6 +17,8 @@ from jaxfilters.trackers.head_mono.adjustment import Frame, adjusted, choose, fr
 from jaxfilters.trackers.head_mono.start import Start, begin, detected
 from jaxfilters.trackers.head_mono.state import PUBLISHED, REACH, MonoOptions, Window
 
+pytestmark = pytest.mark.system
+
 NUM = 5
 USUAL = MonoOptions(num_particles=20)
 PAPER = replace(PUBLISHED, num_particles=20)
@@ -120,7 +122,6 @@ def gains(window, new, options, face):
     return np.array([0.5 * (log_det(matrix) - log_det(all_of_them)) for matrix in exchanged])
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
 def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     """Of the first one too if it may: it is made the one that tells least."""
@@ -137,14 +138,12 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     assert bool(does)
 
 
-@pytest.mark.system
 def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
     window = window_of(rig, face, seen, USUAL)
     _, does = choose(face, window, USUAL.prior, mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL)
     assert not bool(does)
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
 def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landmarks):
     options = replace(USUAL, landmarks=landmarks, selection="angles")
@@ -176,7 +175,6 @@ def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
     assert bool(does)
 
 
-@pytest.mark.system
 def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, seen):
     """Pose and expression are solved for anew for 4000 persons drawn from the posterior, with a linear camera.
 
@@ -225,7 +223,6 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     assert np.abs(z).max() < 4.5
 
 
-@pytest.mark.system
 def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, seen):
     rng = np.random.default_rng(5)
     state = state_of(rig, face, seen, PAPER)
@@ -243,13 +240,11 @@ def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, seen
     assert 0.01 < way.max() <= REACH.identity * (1 + 1e-4)
 
 
-@pytest.mark.system
 def test_the_usual_person_is_the_adjusted_one(moved):
     _, after, _ = moved
     np.testing.assert_array_equal(after.person.identity, after.identities[0])
 
 
-@pytest.mark.system
 def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     _, after, place = moved
     window = after.window
@@ -262,7 +257,6 @@ def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     np.testing.assert_array_equal(after.search.estimate, mean)
 
 
-@pytest.mark.system
 def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, moved):
     """They are exact: what is left is what the prior pulls."""
     before, after, place = moved
@@ -273,7 +267,6 @@ def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, mov
     assert not np.allclose(uv, before.window.views.uv[place], atol=5.0)
 
 
-@pytest.mark.system
 def test_an_adjustment_keeps_the_covariance_of_the_pose(moved):
     before, after, _ = moved
     old, new = before.belief.covariance, after.belief.covariance
@@ -285,7 +278,6 @@ def test_an_adjustment_keeps_the_covariance_of_the_pose(moved):
     np.testing.assert_allclose(spread(after.model, new), expected, atol=1e-4 * np.abs(expected).max())
 
 
-@pytest.mark.system
 def test_particles_go_with_the_estimate(moved):
     before, after, _ = moved
     apart_before = np.asarray(before.search.particles - before.belief.mean[:, None])
@@ -296,7 +288,6 @@ def test_particles_go_with_the_estimate(moved):
     np.testing.assert_array_equal(after.search.velocity, before.search.velocity)
 
 
-@pytest.mark.system
 def test_what_frames_leave_behind_never_stops_an_adjustment(rig, face, seen):
     """Each tells nothing of some directions, but for rounding: in single precision the sum has no Cholesky root."""
     options = replace(USUAL, past="marginalised")

@@ -9,6 +9,8 @@ from jaxfilters.trackers.people.appearance import BINS, appearances, dissimilari
 from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
+pytestmark = pytest.mark.system
+
 PLACES = ((-0.8, 1.5, 1.75, 0.45), (0.9, 0.5, 1.70, 0.45))
 SHIRTS, TROUSERS = ((250, 10, 10), (10, 250, 10)), ((10, 10, 250), (90, 90, 90))
 
@@ -68,7 +70,6 @@ def bin_of(value):
     return int(BINS * np.sqrt(value / 256))
 
 
-@pytest.mark.system
 def test_shirts_and_trousers_are_told_apart(found):
     """Nearly all of either half has one colour: at the waist the drawn line and the middle of the outline differ."""
     histograms, good = found[0]()

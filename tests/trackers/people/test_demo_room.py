@@ -7,13 +7,14 @@ import pytest
 from jaxfilters.models.person.scene import walkable
 from jaxfilters.trackers.people.demo_room import BOXES, FLOOR_M, PLACES, SHAPE, demo_room
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def room():
     return demo_room(3, cameras=2, frames=240)
 
 
-@pytest.mark.system
 def test_images_are_those_of_the_seed(room):
     first = room.image(1, 40)
     assert first.shape == (*SHAPE, 3)
@@ -22,7 +23,6 @@ def test_images_are_those_of_the_seed(room):
     assert len(room) == len(room.routes.xy) == 240
 
 
-@pytest.mark.system
 def test_seeds_differ_in_speeds(room):
     other = demo_room(4, frames=240)
     assert np.abs(other.routes.xy - room.routes.xy).max() > 0.3

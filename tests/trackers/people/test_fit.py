@@ -13,6 +13,8 @@ from jaxfilters.trackers.people.fit import Fit, _nearest_first, as_measurement, 
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
+pytestmark = pytest.mark.system
+
 PLACES = ((-0.9, 2.2, 1.75, 0.45), (0.2, 1.0, 1.70, 0.45), (0.45, 0.3, 1.65, 0.42))
 """The second and the third overlap in the image."""
 OFF_M = np.array([(0.12, -0.10), (-0.10, 0.15), (0.08, 0.14)])
@@ -37,7 +39,6 @@ def parabolas(seed, n):
     return Fit(jnp.asarray(place), jnp.asarray(axes), steps, quadratic, none, none, none, none), mean, precision
 
 
-@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_readings_of_an_exact_parabola_are_its_gaussian():
     """Information H^T R^-1 H and information times mean, added up over the four readings."""
@@ -52,7 +53,6 @@ def test_readings_of_an_exact_parabola_are_its_gaussian():
     np.testing.assert_allclose(found, mean, atol=1e-10)
 
 
-@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_shape_and_gait_add_to_every_reading():
     fit, *_ = parabolas(1, 5)
@@ -60,7 +60,6 @@ def test_shape_and_gait_add_to_every_reading():
     np.testing.assert_allclose(rough - plain, np.broadcast_to(0.05**2 * np.eye(4), plain.shape), atol=1e-15)
 
 
-@pytest.mark.system
 @pytest.mark.usefixtures("x64")
 def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_moves_nobody_far():
     fit, *_ = parabolas(2, 1)
@@ -92,7 +91,6 @@ def found(camera, draw, floor):
     return run, frame, np.bincount(who[who >= 0], minlength=3)
 
 
-@pytest.mark.system
 def test_everybody_is_found_where_drawn_though_two_overlap(found):
     """A pixel at the farthest is 0.12 m in depth, 150 px * 3 m / (7.2 m)^2 to the metre, and 0.05 m sideways."""
     run, _, pixels = found
@@ -107,7 +105,6 @@ def test_everybody_is_found_where_drawn_though_two_overlap(found):
     assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
 
 
-@pytest.mark.system
 def test_slots_mean_nothing_to_the_search(found):
     run, *_ = found
     plain, moved = run({0: 0, 1: 1, 2: 2}), run({3: 0, 0: 1, 4: 2})
