@@ -5,11 +5,11 @@ from typing import TypeVar, dataclass_transform, no_type_check
 
 import jax
 
-Class = TypeVar("Class", bound=type)
+Class = TypeVar("Class")
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
-def pytree_dataclass(cls: Class) -> Class:
+def pytree_dataclass(cls: type[Class]) -> type[Class]:
     """Make a class a frozen dataclass and a pytree.
 
     Fields are leaves or subtrees; those declared as `field(metadata={"static": True})` are part of the tree's

@@ -160,12 +160,12 @@ def gradients(
 ) -> Callable[[Array, Array, Array], tuple[Array, Array]]:
     """`(theta, ys, keys) -> (log evidences, gradients)`, compiled."""
 
-    def log_evidence(key: AnyKey, theta: Array, ys: Array) -> Array:
+    def of_parameters(key: AnyKey, theta: Array, ys: Array) -> Array:
         return log_evidence(filter_of(theta, num_particles, scheme), key, ys)
 
     @jax.jit
     def evaluate(theta: Array, ys: Array, keys: Array) -> tuple[Array, Array]:
-        both = jax.value_and_grad(log_evidence, 1)
+        both = jax.value_and_grad(of_parameters, 1)
         return jax.lax.map(lambda key: both(key, theta, ys), keys, batch_size=CHUNK)
 
     return evaluate

@@ -121,7 +121,7 @@ class LogEvidence:
     filter_of: Callable[[PyTree], Filter]
     observations: PyTree
     controls: PyTree
-    mask: Array | np.ndarray | None
+    mask: Any
     sequences: bool = field(default=False, metadata={"static": True})
     """Whether the leaves hold several sequences along their last axis."""
 

@@ -109,7 +109,7 @@ def _positive_semidefinite(name: str, P: np.ndarray) -> None:
             )
 
 
-def belief(name: str, value: Any, kind: type) -> None:
+def belief(name: str, value: Any, kind: Any) -> None:
     """Raise an error unless `value` is one belief of this kind, and a possible one."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a {kind.__name__}; got a {type(value).__name__}.")

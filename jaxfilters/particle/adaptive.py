@@ -76,7 +76,7 @@ class AdaptiveDiffusion:
     high: Float[Array, " m"]
     steady_std: Float[Array, " d-m"]
     mode_scale: Float[Array, " d"]
-    mode_distance: float | Float[Array, ""]
+    mode_distance: ArrayLike
     partitions: Partitions | None
     num_particles: int = field(metadata={"static": True})
     scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
@@ -132,28 +132,30 @@ def adaptive_diffusion(
     checks.check_ensemble(num_particles, 1.0, scheme, None)
     if not isinstance(fit, DiffusionFit):
         raise TypeError(f"fit must be a DiffusionFit of jaxfilters.math.diffusion.start; got {fit!r}.")
-    sizes = _Sizes(low, high, () if steady_std is None else steady_std, mode_scale).as_arrays(fit.scale.shape)
-    callbacks = (as_pytree(sample_prior), as_pytree(log_likelihood), fit, as_pytree(update_fit))
-    params = AdaptiveDiffusion(*callbacks, *sizes, mode_distance, partitions, num_particles, scheme)
+    params = AdaptiveDiffusion(
+        as_pytree(sample_prior),
+        as_pytree(log_likelihood),
+        fit,
+        as_pytree(update_fit),
+        _limits("low", low, fit.scale.shape),
+        _limits("high", high, fit.scale.shape),
+        jnp.asarray(() if steady_std is None else steady_std, dtype=float),
+        jnp.asarray(mode_scale, dtype=float),
+        mode_distance,
+        partitions,
+        num_particles,
+        scheme,
+    )
     _check(params)
     return Filter(params, _init, _predict, _update)
 
 
-class _Sizes(NamedTuple):
-    """Standard deviations and scales of the coordinates, in the order of the fields of `AdaptiveDiffusion`."""
-
-    low: ArrayLike
-    high: ArrayLike
-    steady_std: ArrayLike
-    mode_scale: ArrayLike
-
-    def as_arrays(self, shape: tuple[int, ...]) -> "_Sizes":
-        """Floating-point arrays, the limits one for each coordinate that keeps its velocity."""
-        low, high, steady_std, mode_scale = (jnp.asarray(size, dtype=float) for size in self)
-        for name, limit in (("low", low), ("high", high)):
-            if limit.shape not in ((), shape):
-                raise ValueError(f"{name} must be one number or have the shape {shape}; got {limit.shape}.")
-        return _Sizes(jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), steady_std, mode_scale)
+def _limits(name: str, limit: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """One limit for each coordinate that keeps its velocity."""
+    given = jnp.asarray(limit, dtype=float)
+    if given.shape not in ((), shape):
+        raise ValueError(f"{name} must be one number or have the shape {shape}; got {given.shape}.")
+    return jnp.broadcast_to(given, shape)
 
 
 def _init(model: AdaptiveDiffusion, key: AnyKey) -> AdaptiveDiffusionState:

@@ -56,7 +56,7 @@ class Bootstrap:
     sample_transition: SampleTransition
     log_likelihood: LogLikelihood
     temper: Temper
-    ess_threshold: float | Float[Array, ""]
+    ess_threshold: ArrayLike
     num_particles: int = field(metadata={"static": True})
     noise: DrawNoise = field(metadata={"static": True})
     scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
@@ -109,8 +109,17 @@ def bootstrap(
     checks.check_callables(sample_prior=sample_prior, sample_transition=sample_transition)
     checks.check_callables(log_likelihood=log_likelihood, noise=noise)
     checks.check_ensemble(num_particles, ess_threshold, scheme, temper)
-    callbacks = map(as_pytree, (sample_prior, sample_transition, log_likelihood, temper or no_tempering))
-    return Filter(Bootstrap(*callbacks, ess_threshold, num_particles, noise, scheme), _init, _predict, _update)
+    params = Bootstrap(
+        as_pytree(sample_prior),
+        as_pytree(sample_transition),
+        as_pytree(log_likelihood),
+        as_pytree(temper or no_tempering),
+        ess_threshold,
+        num_particles,
+        noise,
+        scheme,
+    )
+    return Filter(params, _init, _predict, _update)
 
 
 def _init(model: Bootstrap, key: AnyKey) -> ParticleState:

@@ -171,7 +171,7 @@ def checked_noise(noise: PyTree, particles: PyTree) -> PyTree:
 
 def like(name: str, value: PyTree, reference: PyTree, reference_name: str, hint: str = "") -> PyTree:
     """The value, which must be a pytree with the structure, shapes and types of `reference`."""
-    structures = jax.tree.structure(value), jax.tree.structure(reference)
+    structures: tuple[Any, Any] = (jax.tree.structure(value), jax.tree.structure(reference))
     if structures[0] != structures[1]:
         raise ValueError(f"{name} must have the structure of {reference_name}, {structures[1]}; got {structures[0]}.")
     pairs = zip(jax.tree_util.tree_leaves_with_path(value), jax.tree.leaves(reference), strict=True)
@@ -239,7 +239,7 @@ def check_ancestors(ancestors: Any, count: int) -> None:
         raise ValueError(f"scheme must return ancestor indices, integers of shape ({count},); got {got}.")
 
 
-def checked_dynamics(dynamics: Callable, noise_dim: int, linear_size: int) -> Callable:
+def checked_dynamics(dynamics: Callable, noise_dim: int | tuple[int, ...], linear_size: int) -> Callable:
     """The dynamics of one particle of a Rao-Blackwellized filter, whose fields must have the shapes of the model."""
     n, l = noise_dim, linear_size
     expected = {"A_n": (n, l), "Q_n": (n, n), "f_l": (l,), "A_l": (l, l), "Q_l": (l, l)}

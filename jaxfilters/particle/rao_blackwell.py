@@ -70,7 +70,7 @@ class RaoBlackwell:
     retract: Callable
     condition: Callable
     temper: Temper
-    ess_threshold: float | Float[Array, ""]
+    ess_threshold: ArrayLike
     num_particles: int = field(metadata={"static": True})
     noise: StandardNormal = field(metadata={"static": True})
     proposal: Proposal = field(metadata={"static": True})

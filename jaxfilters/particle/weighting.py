@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int32, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int32, PyTree
 
 from jaxfilters import weights
 from jaxfilters.particle import checks
@@ -34,7 +34,7 @@ def resample(
     particles: PyTree,
     log_weights: Float[Array, " n"],
     scheme: ResamplingScheme | EnsembleScheme,
-    ess_threshold: float | Float[Array, ""],
+    ess_threshold: ArrayLike,
 ) -> tuple[PyTree, Float[Array, " n"], Int32[Array, " n"]]:
     """Resample where the effective sample size is below `ess_threshold * n`; the total weight stays the same.
 

@@ -1,12 +1,11 @@
 """Arrays of `.npz` files of unknown origin: nothing is allocated that the file cannot hold."""
 
-import io
 import math
 import zipfile
 import zlib
 from collections.abc import Collection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,7 +63,7 @@ def names_in_npz(path: Path, wanted: str) -> list[str]:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
-def read_array_header(stream: io.BufferedIOBase) -> ArrayHeader:
+def read_array_header(stream: Any) -> ArrayHeader:
     """The header of an array in NumPy's format; the stream is then at its first element.
 
     Raises:

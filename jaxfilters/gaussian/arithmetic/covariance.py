@@ -220,7 +220,7 @@ def _condition_jvp(form, primals, tangents):
 
 def kept(gain: Float[Array, "n m"], H: Float[Array, "m n"]) -> Float[Array, "n n"]:
     """What of a deviation from the mean remains after the update, `I - K H`."""
-    return factor.identity(gain.shape[0], gain.dtype) - linalg.matmul(gain, H)
+    return -linalg.matmul(gain, H) + factor.identity(gain.shape[0], gain.dtype)
 
 
 def update(

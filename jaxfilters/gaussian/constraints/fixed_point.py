@@ -101,8 +101,8 @@ def fixed_point(
     carry = start, given, jnp.int32(0), jnp.full((), jnp.inf, given.dtype)
     _, natural, sweeps, change = jax.lax.while_loop(unfinished, sweep, carry)
     # Once more from the start: the mean and the sites have been rounded in different ways in the loop.
-    belief, remaining = _conditioned(start, natural - given)
-    return Approximation(natural, belief.mean, linalg.matmul(belief.root, belief.root.T), remaining, sweeps, change)
+    found, remaining = _conditioned(start, natural - given)
+    return Approximation(natural, found.mean, linalg.matmul(found.root, found.root.T), remaining, sweeps, change)
 
 
 def _conditioned(belief: GaussianRoot, natural):

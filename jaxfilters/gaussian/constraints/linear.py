@@ -89,7 +89,8 @@ def check_rows(constraints: LinearConstraints) -> None:
             form = f"({rows}, n)" if expected == 2 else f"({rows},)"
             raise ValueError(f"{name}: expected {form}, one for each row; got shape {shape}.")
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(constraints)):
-        _check_values(*_on_host(constraints), constraints.names)
+        normals, lower, upper = _on_host(constraints)
+        _check_values(normals, lower, upper, constraints.names)
 
 
 def feasible(constraints: LinearConstraints) -> bool:
