@@ -19,7 +19,7 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Num, PyTree, Shaped
+from jaxtyping import Array, ArrayLike, Float, Num, PyTree, Shaped
 
 _TEMPER_STEPS = 24
 _TEMPER_LOWEST_LOG2 = -40.0
@@ -83,7 +83,7 @@ def mean_around_mode(
     log_weights: Float[Array, " n"],
     scale: Float[Array, " d"],
     *,
-    distance: float | Num[Array, ""] = 2.0,
+    distance: ArrayLike | Num[Array, ""] = 2.0,
 ) -> Float[Array, " d"]:
     """Return the weighted mean `(d,)` of the particles near the one with the largest weight.
 

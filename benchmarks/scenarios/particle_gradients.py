@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.filter import Filter
+from jaxfilters.filter import Filter, log_evidence
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.noise import StandardNormal

@@ -241,7 +241,8 @@ def check_ancestors(ancestors: Any, count: int) -> None:
 
 def checked_dynamics(dynamics: Callable, noise_dim: int | tuple[int, ...], linear_size: int) -> Callable:
     """The dynamics of one particle of a Rao-Blackwellized filter, whose fields must have the shapes of the model."""
-    n, l = noise_dim, linear_size
+    n: Any = noise_dim
+    l = linear_size
     expected = {"A_n": (n, l), "Q_n": (n, n), "f_l": (l,), "A_l": (l, l), "Q_l": (l, l)}
 
     def checked(x: PyTree, control: PyTree) -> Any:

@@ -127,7 +127,7 @@ def _on_diagonal(n):
 
 def lower_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The elements on the diagonal and below it, zeros elsewhere, whatever is there."""
-    return jnp.where(np.tri(*A.shape) > 0, A, 0.0) if len(A) <= _CONSTANT else jnp.tril(A)
+    return jnp.where(np.tri(A.shape[0], A.shape[1]) > 0, A, 0.0) if len(A) <= _CONSTANT else jnp.tril(A)
 
 
 def root_tangent(L: Float[Array, "n n"], dS: Float[Array, "n n"]) -> Float[Array, "n n"]:
