@@ -83,7 +83,7 @@ def mean_around_mode(
     log_weights: Float[Array, " n"],
     scale: Float[Array, " d"],
     *,
-    distance: ArrayLike | Num[Array, ""] = 2.0,
+    distance: ArrayLike = 2.0,
 ) -> Float[Array, " d"]:
     """Return the weighted mean `(d,)` of the particles near the one with the largest weight.
 
