@@ -28,7 +28,7 @@ def test_the_kalman_filter_reaches_the_steady_spread_of_the_specification():
 def test_every_filter_has_its_row(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(linear_gaussian, "NUM_FRAMES", 5)
     metrics = linear_gaussian.run(quick=True, seed=0, out=tmp_path)
-    rows = ("exact", "paper", "paper_corrected", "joint_pf")
+    rows = ("exact", "plug_in", "plug_in_corrected", "joint_pf")
     quantities = ("pose_rms", "velocity_rms", "pose_variance_error", "velocity_variance_error", "log_evidence_gap")
     assert set(metrics) == {f"{quantity}_{row}" for quantity in quantities for row in rows}
     assert (tmp_path / "linear_gaussian.txt").read_text() in capsys.readouterr().out
