@@ -2,12 +2,11 @@
 
 The plain particle filter on the pose against the Rao-Blackwellized one, without a guide, N = 512, on the paper's data A
 (the pose walks at random) and B (its velocity does) with sensor noise: the comparison of Kajihara and Tanaka, figures
-6, 7 and 10. Once with the improved set-up of the specification, once with the paper's own cost and likelihood
-(`*_paper_cost`). The full run adds, on data B, the other two proposals (`rbpf_plug_in`, `rbpf_plug_in_corrected`), a plain
-filter whose noise is as wide as what the Rao-Blackwellized one draws (`pf_wide`), and the tracker with its guide
-(`pf_guided`, `rbpf_guided`). Errors are means after the first ten frames; p-values are those of one-sided paired
-Wilcoxon signed-rank tests over the seeds. A folder given with `--out` receives every run as it finishes, the tables,
-and plots.
+6, 7 and 10. Once with the improved set-up, once with the paper's own cost and likelihood (`*_paper_cost`). The full run
+adds, on data B, the other two proposals (`rbpf_plug_in`, `rbpf_plug_in_corrected`), a plain filter whose noise is as
+wide as what the Rao-Blackwellized one draws (`pf_wide`), and the tracker with its guide (`pf_guided`, `rbpf_guided`).
+Errors are means after the first ten frames; p-values are those of one-sided paired Wilcoxon signed-rank tests over the
+seeds. A folder given with `--out` receives every run as it finishes, the tables, and plots.
 """
 
 import sys
