@@ -82,7 +82,7 @@ def fake_tracker():
 
 @pytest.fixture
 def fake_hand_depth(monkeypatch, recording):
-    """Puts a random walk in the place of the hand tracker, so that the application is tested without its cost."""
+    """Puts a random walk in the place of the hand tracker, so that the application is tested quickly."""
     from jaxfilters.trackers.hand_depth import tracker as hand_depth
 
     monkeypatch.setattr(hand_depth, "build", build_fake)
@@ -179,7 +179,7 @@ def perfect_track(features):
 
 @pytest.fixture
 def fake_articulated(monkeypatch, features):
-    """Puts a random walk in the place of the articulated tracker, so that the application is tested without its cost."""
+    """Puts a random walk in the place of the articulated tracker, so that the application is tested quickly."""
     from jaxfilters.trackers.articulated import tracker as articulated_hand
 
     monkeypatch.setattr(articulated_hand, "build", build_fake_articulated)
