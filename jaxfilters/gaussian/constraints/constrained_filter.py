@@ -148,8 +148,9 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
     Raises:
         TypeError: `inner` or `constrain` is of the wrong kind, the state of `inner` is not Gaussian, or
             `constrain.lasting` is not Boolean.
-        ValueError: The rows do not fit the state, their numbers are not valid, a row that is declared lasting
-            moves in time, or one is too narrow for a covariance in float32. Values are checked where they are known, that is, not under `jit` or `grad`.
+        ValueError: The rows do not fit the state, their numbers are not valid, a row that is declared lasting moves in
+            time, or one is too narrow for a covariance in float32. Values are checked where they are known, that is,
+            not under `jit` or `grad`.
 
     Example:
         A random walk that stays above 0:
