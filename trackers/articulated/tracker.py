@@ -40,7 +40,7 @@ from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
 from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
-from jaxfilters.trackers.tracker import Tracker
+from jaxfilters.trackers.tracker import Tracker, track_frames
 
 SEARCHING, TRACKING, LOST = range(3)
 LOST_NIS = 25.0
@@ -155,6 +155,23 @@ def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) ->
         raise ValueError(f"{sequence.name}: start must be ({n},) and ({n}, {n}); got {np.shape(sequence.start.mean)}.")
     start = None if sequence.start is None else Start(*(jnp.asarray(part, dtype=float) for part in sequence.start))
     return tracker_of(hand, _limits(hand.layout), start, config)
+
+
+def track(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> ArticulatedTrack:
+    """The hand in every frame of a recording of features, equal to that of `jaxfilters track articulated`.
+
+    Args:
+        sequence: The features, as `from_keypoints` or `jaxfilters.trackers.io.features.open_features` make them.
+        config: Options of the tracker.
+
+    Returns:
+        The track as NumPy arrays, the frame axis first.
+
+    Raises:
+        ValueError: as for `build`.
+    """
+    config = config or ArticulatedConfig()
+    return track_frames(build(sequence, config), jax.random.key(config.seed), sequence, sequence.times_s)
 
 
 def tracker_of(hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig) -> Tracker:

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfilters.models.fingertip.thumb import ThumbAngles, calibrated, usual
 from jaxfilters.models.gesture import coded
 from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
 from jaxfilters.trackers.fingertips.files import FingertipFiles
-from jaxfilters.trackers.fingertips.input import DemoHand, User, hands_in, know_user, open_hands, shown
+from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
+from jaxfilters.trackers.fingertips.input import DemoHand, open_hands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures
 from jaxfilters.trackers.fingertips.session import FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
@@ -56,11 +56,11 @@ def track(options: argparse.Namespace) -> str:
     files = FingertipFiles(options.out)
     began = time.perf_counter()
     try:
-        user = know_user(source, options.mask)
+        user = _user(source, options.mask)
         if not user.has_open_hand:
             warn(f"{source.name}: no open hand in the first images; thumbs are told by the usual angles")
         session = FingertipSession(
-            _angles(user),
+            angles_of(user),
             handedness=user.parameters.handedness,
             num_hands=options.hands,
             height=float(source.image_size[1]),
@@ -105,10 +105,12 @@ def _symbols(path: str) -> SymbolsFile:
     return file
 
 
-def _angles(user: User) -> ThumbAngles:
-    if not user.has_open_hand:
-        return usual()
-    return calibrated(np.array([user.parameters.phi_thumb]), np.array([user.parameters.phi_index]))
+def _user(source: Any, mask: str) -> User:
+    """The user, from images of the recording; of a live camera the first ones, which are then gone."""
+    try:
+        return estimate_user(source.sample(OPEN_HAND_IMAGES), mask)
+    except ValueError as error:
+        raise InputError(f"{source.name}: {error}") from None
 
 
 def _follow(

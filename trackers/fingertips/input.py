@@ -1,40 +1,19 @@
 """Where images of hands over a desk come from, and what is learnt of the user before they are followed."""
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import jax
 import numpy as np
 
-from jaxfilters.models.fingertip.detection import detect_hands
-from jaxfilters.models.fingertip.first_image import fit_hand_parameters, fit_hand_to_mask
-from jaxfilters.models.fingertip.hand_parameters import HandParameters
-from jaxfilters.models.fingertip.observation import HandObservation
-from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold
-from jaxfilters.models.fingertip.skin import fit_skin_model, skin_mask
 from jaxfilters.models.synthetic.desk_hand import DeskFrame, desk_video
 from jaxfilters.models.synthetic.desk_script import script
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.video_input import LiveCamera, open_video
 
-OPEN_HAND_IMAGES = 60
-"""Images in which an open hand is looked for before a recording is followed."""
 DEMO_FPS, DEMO_SHAPE = 30.0, (480, 640)
-USUAL_TIP_RADIUS = 13.0
-"""Pixels of an image with 480 rows, of somebody who showed no open hand."""
-Segment = Callable[[np.ndarray], np.ndarray]
-"""`image -> mask` (rows, cols) bool."""
-
-
-class User(NamedTuple):
-    """What is known of the user and the desk."""
-
-    parameters: HandParameters
-    segment: Segment
-    has_open_hand: bool
-    """Whether an open hand was seen; otherwise the parameters are the usual ones."""
 
 
 class DemoHand:
@@ -132,37 +111,6 @@ def open_hands(place: str | None, mask: str, *, fps: float | None, seed: int) ->
     return LiveHands(source) if isinstance(source, LiveCamera) else source
 
 
-def know_user(source: Any, mask: str) -> User:
-    """What the images in which the user's hand is open say; of a live camera the first ones, which are then gone.
-
-    Raises:
-        InputError: images that show nothing in the colours of skin.
-    """
-    images = source.sample(OPEN_HAND_IMAGES)
-    if not images:
-        raise InputError(f"{source.name}: no image.")
-    learn = {"infrared": _by_brightness, "depth": _by_height, "colour": _by_colour}[mask]
-    usual, why = None, ""
-    for image in images:
-        try:
-            user = learn(image)
-        except ValueError as error:
-            why = str(error)
-            continue
-        if user.has_open_hand:
-            return user
-        usual = usual or user
-    if usual is None:
-        raise InputError(f"{source.name}: no image in which a hand can be told from the desk; of the last one: {why}")
-    return usual
-
-
-def hands_in(image: np.ndarray, user: User, num_hands: int) -> HandObservation:
-    """What an image shows of each hand, (1, hands, ...) as a session wants it."""
-    found = detect_hands(user.segment(image), user.parameters, capacity=num_hands)
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves])[None], *found)
-
-
 def shown(image: np.ndarray) -> np.ndarray:
     """A picture (rows, cols, 3) of an image that is one, or of depths."""
     if image.ndim == 3:
@@ -171,38 +119,3 @@ def shown(image: np.ndarray) -> np.ndarray:
     low, high = np.percentile(image[near], [1, 99]) if near.any() else (0.0, 1.0)
     grey = np.where(near, 255 * np.clip((high - np.where(near, image, 0)) / max(high - low, 1e-6), 0, 1), 0)
     return cv2.cvtColor(grey.astype(np.uint8), cv2.COLOR_GRAY2BGR)
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-
-
-def _by_brightness(image: np.ndarray) -> User:
-    grey = _grey(image)
-    try:
-        parameters, is_open = fit_hand_parameters(grey), True
-    except ValueError:
-        parameters, is_open = _usual(grey.shape[0], otsu_threshold(grey)), False
-    return User(parameters, lambda image: bright_mask(_grey(image), parameters.threshold), is_open)
-
-
-def _by_height(image: np.ndarray) -> User:
-    desk = fit_desk(image)
-    return _of_mask(lambda image: depth_mask(image, desk), image)
-
-
-def _by_colour(image: np.ndarray) -> User:
-    model = fit_skin_model(image)
-    return _of_mask(lambda image: skin_mask(image, model), image)
-
-
-def _of_mask(segment: Segment, image: np.ndarray) -> User:
-    try:
-        return User(fit_hand_to_mask(segment(image)), segment, True)
-    except ValueError:
-        return User(_usual(image.shape[0]), segment, False)
-
-
-def _usual(rows: int, threshold: float = 128.0) -> HandParameters:
-    radius = max(USUAL_TIP_RADIUS * rows / 480, 2.0)
-    return HandParameters(threshold=threshold, tip_radius=radius, half_size=round(radius) + 3)

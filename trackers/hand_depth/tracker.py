@@ -5,6 +5,7 @@ The filter is `rao_blackwell_shared` on the 22-number hand with `HandMotion`; it
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -52,7 +53,7 @@ from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.hand_depth.detect import nearest_hand
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
-from jaxfilters.trackers.tracker import HandTrack, Tracker
+from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
 SEARCHING, TRACKING, LOST = range(3)
 
@@ -161,6 +162,27 @@ def build(camera: Pinhole, config: HandDepthConfig | None = None) -> Tracker:
     likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
     setup = _Setup(camera, likelihood, config, stride)
     return Tracker(partial(_start, setup), partial(_advance, setup))
+
+
+def track(
+    frames: Iterable[np.ndarray], times_s: np.ndarray, camera: Pinhole, config: HandDepthConfig | None = None
+) -> HandTrack:
+    """The hand in every frame of a depth recording, equal to that of `jaxfilters track hand-depth` with the same seed.
+
+    Args:
+        frames: (rows, cols) metres each, NaN where there is no reading.
+        times_s: (frames,) seconds, strictly increasing.
+        camera: The depth camera.
+        config: Options of the tracker.
+
+    Returns:
+        The track as NumPy arrays, the frame axis first.
+
+    Raises:
+        ValueError: There are no frames, or more or fewer than times.
+    """
+    config = config or HandDepthConfig()
+    return track_frames(build(camera, config), jax.random.key(config.seed), frames, times_s)
 
 
 def _start(setup: _Setup, key: Array, frame: np.ndarray) -> TrackState:

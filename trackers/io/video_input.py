@@ -15,8 +15,6 @@ from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.images import images_in, read_image
 
 DEFAULT_FPS = 30.0
-PRIMING_IMAGES = 40
-"""Images from which the empty room is learnt before a recording is followed."""
 SILENT_S = 2.0
 """A live camera that delivers nothing for so long has stopped."""
 

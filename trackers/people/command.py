@@ -20,12 +20,12 @@ from jaxfilters.trackers.io.cameras import open_camera
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
 from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.io.video_input import PRIMING_IMAGES, LiveCamera, open_video, together
+from jaxfilters.trackers.io.video_input import LiveCamera, open_video, together
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.drawing import drawn, write_plan
 from jaxfilters.trackers.people.files import TracksWriter, write_mot, write_report
 from jaxfilters.trackers.people.recorded import Sighting
-from jaxfilters.trackers.people.session import PeopleEstimate, PeopleSession
+from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleEstimate, PeopleSession
 from jaxfilters.trackers.people.state import TRACKED, PeopleConfig, PeopleScene
 from jaxfilters.trackers.people.tracker import people_scene
 

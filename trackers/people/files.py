@@ -18,7 +18,7 @@ from jaxfilters.trackers.people.session import PeopleSession
 from jaxfilters.trackers.people.silhouettes import body_of, place_of
 from jaxfilters.trackers.people.state import PeopleScene
 
-COLUMNS = ("frame", "id", "x_m", "y_m", "sd_radial_m", "sd_lateral_m", "height_m", "score", "mode")
+COLUMNS = ("frame", "id", "x_m", "y_m", "radial_std_m", "lateral_std_m", "height_m", "score", "mode")
 
 
 CHECKPOINT_EVERY_S = 2.0

@@ -14,6 +14,8 @@ from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, f
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, start, step
 
+PRIMING_IMAGES = 40
+"""Images from which the empty room is estimated before a recording is tracked."""
 KEPT_BEYOND = 1.4
 """The background does not follow the image within a person's outline of this size."""
 
@@ -29,6 +31,34 @@ class PeopleEstimate(NamedTuple):
     """By identity: of this frame and, for newly confirmed people, of the frames before."""
     seconds: float
     """From the foreground to the report."""
+
+
+def track(
+    images: Sequence[Sequence[np.ndarray | None]], times_s: np.ndarray, scene: PeopleScene, subtraction: str = "median"
+) -> dict[int, list[Sighting]]:
+    """Everybody's smoothed track in recorded images, by identity.
+
+    Args:
+        images: For each time, (rows, cols, 3) uint8 of every camera in the order of the scene, without lens distortion;
+            `None` where a camera has nothing new.
+        times_s: Seconds, strictly increasing.
+        scene: Cameras, floor and furniture, as `people_scene` makes them.
+        subtraction: Of the background: `median`, `mog2` or `knn`.
+
+    Returns:
+        The tracks: positions and velocities in metres with their covariances, one `Sighting` a frame.
+
+    Raises:
+        ValueError: There are no images, or more or fewer than times; or no such method.
+    """
+    if not len(images) or len(images) != len(times_s):
+        raise ValueError(f"times_s: expected one for each of at least one image; got {len(times_s)} and {len(images)}.")
+    session = PeopleSession(scene, subtraction)
+    every = max(1, len(images) // PRIMING_IMAGES)
+    session.prime([[one for one in views[::every] if one is not None] for views in zip(*images, strict=True)])
+    for views, time_s in zip(images, times_s, strict=True):
+        session.process(views, float(time_s) - float(times_s[0]))
+    return session.tracks.smoothed()
 
 
 class PeopleTracks:

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.past import Past
 from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.remembered import Remembered, joined
-from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import Beginning, Following
 from jaxfilters.trackers.head.common.state import INITIALISING, POSE
@@ -129,6 +130,35 @@ class MonoSession:
             ValueError: if images or times do not fit the rig and each other.
         """
         return self._following.process(images, times)
+
+
+def track(
+    images: UInt8[np.ndarray, "b rows cols"],
+    times_s: Float[np.ndarray, " b"],
+    camera: Pinhole,
+    face: MultilinearFace,
+    options: MonoOptions | None = None,
+    **known: Any,
+) -> MonoTrack:
+    """The head in images in memory; `MonoSession` takes them in pieces.
+
+    Args:
+        images: Grey, without lens distortion.
+        times_s: Seconds, growing.
+        camera: Which took them.
+        face: Model of ten landmarks, or of the 68 of iBUG; `jaxfilters.trackers.io.face_models.default_face_model` is a
+            general one.
+        options: Constants.
+        known: `points`, `detections`, `detector` and `remembered` of `MonoSession`.
+
+    Returns:
+        The track: millimetres and radians, NaN where the head is not tracked.
+
+    Raises:
+        ValueError: as for `MonoSession` and its `process`.
+    """
+    session = MonoSession(monocular(camera), face, options, **known)
+    return session.process(images[:, None], np.asarray(times_s))
 
 
 class _MonoTracker:

@@ -1,1 +1,5 @@
 """Head pose and face deformation from two calibrated cameras."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -91,6 +91,31 @@ class HeadSession:
         return self._following.process(images, times)
 
 
+def track(
+    images: UInt8[np.ndarray, "b C rows cols"],
+    times_s: Float[np.ndarray, " b"],
+    rig: CameraRig,
+    options: HeadOptions | None = None,
+    points: Float[np.ndarray, "K 2"] | None = None,
+) -> HeadTrack:
+    """The head in images in memory; `HeadSession` takes them in pieces.
+
+    Args:
+        images: Grey, of all cameras at one moment each, without lens distortion.
+        times_s: Seconds, growing.
+        rig: One camera or more.
+        options: Constants.
+        points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
+
+    Returns:
+        The track: millimetres and radians, NaN where the head is not tracked.
+
+    Raises:
+        ValueError: as for `HeadSession` and its `process`.
+    """
+    return HeadSession(rig, options, points).process(images, np.asarray(times_s))
+
+
 def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:
     """Whether landmarks given by a person can be used.
 

@@ -1,0 +1,42 @@
+"""Trackers called from Python: the same track as by the command, and errors. The pages in docs/ run all six."""
+
+from importlib import import_module
+
+import jax
+import numpy as np
+import pytest
+
+from jaxfilters.trackers import hand_depth
+from jaxfilters.trackers.app.cli import main
+from jaxfilters.trackers.fingertips.images import estimate_user
+from jaxfilters.trackers.registry import SYSTEMS
+from jaxfilters.trackers.tracker import step_chunk, track_frames
+
+def test_every_system_can_be_run_from_python():
+    for system in SYSTEMS:
+        assert callable(import_module(system.package).track), system.name
+
+
+@pytest.mark.usefixtures("fake_hand_depth")
+def test_the_same_seed_gives_the_same_track_by_command_and_from_python(npz_file, tmp_path, monkeypatch, recording):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    arguments = ["track", "hand-depth", str(npz_file), "--seed", "3", "--no-video", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    frames, config = list(recording), hand_depth.HandDepthConfig(seed=3)
+    found = hand_depth.track(frames, recording.times_s, recording.camera, config)
+    with np.load(tmp_path / "out" / "track.npz") as saved:
+        for name, array in found._asdict().items():
+            np.testing.assert_array_equal(saved[name], array, err_msg=name)
+
+
+def test_frames_and_times_that_do_not_fit_are_refused(fake_tracker, recording):
+    frames, key = list(recording)[:3], jax.random.key(0)
+    for times_s in (recording.times_s[:2], recording.times_s[:4], recording.times_s[:0]):
+        with pytest.raises(ValueError, match="times_s: expected one for each frame"):
+            track_frames(fake_tracker, key, frames, times_s)
+    with pytest.raises(ValueError, match="times_s: expected one for each frame, at least one; got 0 for 0 frames"):
+        track_frames(fake_tracker, key, [], np.zeros(0))
+    with pytest.raises(ValueError, match="frames: expected 1 to 16, with a time each; got 0"):
+        step_chunk(fake_tracker, None, [], np.zeros(0))
+    with pytest.raises(ValueError, match="mask: expected one of infrared, depth, colour; got 'red'"):
+        estimate_user([np.zeros((4, 4), np.uint8)], "red")

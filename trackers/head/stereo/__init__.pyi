@@ -1,0 +1,2 @@
+from .session import HeadSession as HeadSession
+from .session import track as track
