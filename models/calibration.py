@@ -218,7 +218,7 @@ def calibrate_pose(points_m: np.ndarray, pixels: np.ndarray, K: np.ndarray, dist
 
 
 def floor_errors_m(calibration: Calibration, points_m: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(n,) metres between points and where their pixels are seen in the horizontal plane of their height.
+    """(n,) metres between points and where their pixels are visible in the horizontal plane of their height.
 
     For points on the floor this is what an error in their pixels does to a position; NaN where the ray through a
     pixel does not meet that plane.

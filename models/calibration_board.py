@@ -9,7 +9,7 @@ import numpy as np
 from jaxfilters.models.calibration import Calibration, calibrate_pose
 
 FEWEST_CORNERS = 6
-"""Of a board that counts as seen."""
+"""Of a board that counts as observed."""
 FEWEST_VIEWS = 3
 """Of intrinsics that are not guessed."""
 _UPWARDS = np.diag([1.0, -1.0, -1.0])
@@ -56,7 +56,7 @@ def charuco_board(
 
 
 def detect_board(image: np.ndarray, board: Any) -> BoardView:
-    """What an image (rows, cols) or (rows, cols, 3), uint8, shows of the board; no rows where it is not seen."""
+    """What an image (rows, cols) or (rows, cols, 3), uint8, shows of the board; no rows where it is not visible."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
     if corners is None or ids is None or len(ids) == 0:
@@ -94,12 +94,12 @@ def calibrate_on_floor(view: BoardView, K: np.ndarray, distortion: np.ndarray) -
     """A camera over a board that lies on the floor: the origin is the board's first corner, X along its columns.
 
     Args:
-        view: The board on the floor, seen by the camera where it stands.
+        view: The board on the floor, observed by the camera where it stands.
         K: (3, 3) intrinsics.
         distortion: (5,) k1, k2, p1, p2, k3.
 
     Raises:
-        ValueError: too little of the board is seen, or the camera would be below the floor.
+        ValueError: too little of the board is visible, or the camera would be below the floor.
     """
     if not _is_usable(view):
         raise ValueError(

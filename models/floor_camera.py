@@ -73,7 +73,7 @@ class FloorCamera:
         return homogeneous[..., :2] / safe[..., None], depth
 
     def floor_points(self, uv: Float[Array, "*batch 2"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
-        """Floor points (X, Y) seen at pixels, and their depths; not positive where a pixel sees no floor."""
+        """Floor points (X, Y) at pixels, and their depths; not positive where a pixel sees no floor."""
         directions = self.rays(uv)
         center = self.position()
         down = jnp.where(jnp.abs(directions[..., 2]) > 1e-12, directions[..., 2], 1e-12)

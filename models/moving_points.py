@@ -1,4 +1,4 @@
-"""Points that move by constant velocity and are seen through noise: what both noises are, learnt from tracks.
+"""Points that move with constant velocity and are observed with noise: both noises, estimated from tracks.
 
 Every coordinate is a sequence of its own, a Kalman filter with position and velocity; all share the two noises. Tracks
 are what a detector says: no truth is needed, since jitter that no motion explains is the sensor's.
@@ -32,7 +32,7 @@ class Tracks(NamedTuple):
     """Coordinates of points over time, each about its own mean; one sequence a column."""
 
     y: Float[Array, "t 1 n"]
-    """NaN where nothing was seen."""
+    """NaN where nothing was observed."""
     seconds: Float[Array, "t n"]
     """Since the frame before, the same in all columns."""
     extent: Float[Array, ""]
@@ -40,17 +40,17 @@ class Tracks(NamedTuple):
 
 
 def tracks_of(points: Float[np.ndarray, "t *point"], times: Float[np.ndarray, " t"]) -> tuple[Tracks, np.ndarray]:
-    """Tracks of points, NaN where not seen, and the mean of each coordinate, which they lack.
+    """Tracks of points, NaN where not observed, and the mean of each coordinate, which they lack.
 
     Raises:
-        ValueError: If times do not rise, there are fewer than three frames, or a coordinate was never seen.
+        ValueError: If times do not rise, there are fewer than three frames, or a coordinate was never observed.
     """
     points = np.asarray(points, float).reshape(len(points), -1)
     if len(points) < 3 or len(times) != len(points) or np.any(np.diff(times) <= 0):
         raise ValueError(f"times must rise and be one of each of 3 or more frames; got {len(times)} of {len(points)}.")
     never = np.flatnonzero(~np.isfinite(points).any(axis=0))
     if never.size:
-        raise ValueError(f"points must each be seen in some frame; coordinates {never.tolist()} never are.")
+        raise ValueError(f"points must each be observed in some frame; coordinates {never.tolist()} never are.")
     means = np.nanmean(points, axis=0)
     about = points - means
     seconds = np.diff(times, prepend=times[0])
@@ -67,7 +67,7 @@ def drift(x: Float[Array, "2"], seconds: Float[Array, ""]) -> Float[Array, "2"]:
 
 
 def position(x: Float[Array, "2"]) -> Float[Array, "1"]:
-    """What is seen of position and velocity."""
+    """The observed part of position and velocity."""
     return x[:1]
 
 

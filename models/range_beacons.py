@@ -1,8 +1,8 @@
 """A wheeled robot that measures distances to beacons whose places are known, one at a time.
 
-Ranges of radio beacons are too long, the more so the further off, and some are wild (J. Djugash, B. Hamner, S. Roth,
-"Navigating with ranging radios: five data sets with ground truth", Journal of Field Robotics 26(9), 2009): by how
-much, the noise and the share of outliers are parameters, to be learnt with those of the odometry.
+Ranges of radio beacons are too long, the more so the further off, and some are outliers (J. Djugash, B. Hamner,
+S. Roth, "Navigating with ranging radios: five data sets with ground truth", Journal of Field Robotics 26(9), 2009). The
+excess, the noise and the share of outliers are parameters, to be estimated with those of the odometry.
 """
 
 from collections.abc import Callable
@@ -47,14 +47,14 @@ class LinearExcess:
 
 @pytree_dataclass
 class RangeRobot:
-    """Parameters of the robot's motion and of its ranges: what can be learnt."""
+    """Parameters of the robot's motion and of its ranges: what can be estimated."""
 
     excess: Callable[[Array], Array]
-    """`distances -> metres by which ranges are too long`; its leaves can be learnt, as those of `LinearExcess`."""
+    """`distances -> metres by which ranges are too long`; its leaves can be estimated, as those of `LinearExcess`."""
     noise: Float[Array, ""]
     """Standard deviation of a range, metres."""
     outlier_share: Float[Array, ""]
-    """Share of ranges that are wild, in (0, 1)."""
+    """Share of ranges that are outliers, in (0, 1)."""
     outlier_noise: Float[Array, ""]
     """Their standard deviation, metres."""
     slip: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""The paper's sequence and its open problem, over many seeds: runs of the three filters, and what is told of them."""
+"""The paper's sequence and its open problem, over many seeds: runs of the three filters, and what is given of them."""
 
 from functools import partial
 from typing import NamedTuple

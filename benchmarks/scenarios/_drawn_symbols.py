@@ -1,4 +1,4 @@
-"""Twelve shapes, drawn with one finger or with two: learnt of one writer, recognised of others (P, table 2).
+"""Twelve shapes, drawn with one finger or with two: estimated from one writer, recognised of others (P, table 2).
 
 The protocol is the paper's: 80 symbols of each of 24 kinds by one person, 20 of each by six others. A symbol is right
 if both its shape and its number of fingers are, and wrong if it is rejected. Writers are not those with whom settings
@@ -35,7 +35,7 @@ METHODS: dict[str, tuple[str, Callable[..., Recognition], float]] = {
     "_published": ("codes", recognise_each, -np.inf),
     "_published_rejecting": ("codes", recognise_each, 0.0),
 }
-"""By what names of metrics end in: what is learnt, how it is recognised, and the margin over the threshold model."""
+"""By what names of metrics end in: what is estimated, how it is recognised, and the margin over the threshold model."""
 
 
 def drawn_metrics(scale: Scale, seed: int) -> dict[str, Metric]:

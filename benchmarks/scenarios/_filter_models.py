@@ -89,7 +89,7 @@ def plain(model: Drift, num_particles: int) -> Filter:
 
 @pytree_dataclass
 class Mixed:
-    """A nonlinear state that a linear one drives, seen through an arctangent."""
+    """A nonlinear state that a linear one drives, observed through an arctangent."""
 
     A_n: Float[Array, "..."]
     """(n, l)."""

@@ -16,7 +16,7 @@ from jaxfilters.gaussian.extended import extended_kalman
 
 @pytree_dataclass
 class Coupled:
-    """A state whose components all drive one another, seen through saturating sensors."""
+    """A state whose components all drive one another, observed through saturating sensors."""
 
     A: Float[Array, "..."]
     """(n, n)."""

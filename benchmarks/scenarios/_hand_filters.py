@@ -1,7 +1,7 @@
 """The hand filters that are compared, and the compiled step and loop that run any of them over a recording.
 
 Source of the set-ups: Kajihara and Tanaka, "A method for 3D hand pose tracking using a Rao-Blackwellized particle
-filter", sections 6 and 7; what the paper leaves open is the specification's, as each constant says.
+filter", sections 6 and 7; what the paper leaves open is said at each constant.
 """
 
 import math
@@ -48,11 +48,11 @@ PAPER_SIGMA = 0.02
 SIGMA = 3e-4
 """Metres: so sharp that tempering always has something to flatten."""
 TEMPERED_SHARE = 0.2
-"""Effective sample size after an update, as a share of N (specification, section 5)."""
+"""Effective sample size after an update, as a share of N."""
 DAMPING_TIME = 0.3
-"""Seconds in which the velocity of a joint angle falls to 1/e (specification, section 5)."""
+"""Seconds in which the velocity of a joint angle falls to 1/e."""
 START_STD = (0.005, 0.04, math.radians(5))
-"""Of the pose before the first frame: metres, radians, radians (specification, section 3)."""
+"""Of the pose before the first frame: metres, radians, radians."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Setting:
 
 
 def improved() -> Setting:
-    """Union cost, tempering, soft limits, damped angles, half the velocity noise: the specification's best row."""
+    """Union cost, tempering, soft limits, damped angles, half the velocity noise: the best of the variants."""
     motion = paper_motion(FRAME_INTERVAL)
     motion = replace(
         motion,

@@ -97,7 +97,7 @@ def hand_video_metrics(folder: Path, out: Path | None = None, *, num_frames: int
 
 
 def load_hand_video(folder: Path, *, num_frames: int | None = None) -> HandVideo:
-    """The recording, with the skin and the hand of its first frame learnt.
+    """The recording, with the skin and the hand of its first frame estimated.
 
     Raises:
         RecordingError: a file that cannot be read.

@@ -1,4 +1,4 @@
-"""A face that deforms while the head moves: the registered rigid model beside the one that is learnt."""
+"""A face that deforms while the head moves: the registered rigid model beside the one that is estimated."""
 
 import sys
 from pathlib import Path
@@ -55,7 +55,7 @@ class Schedule(NamedTuple):
 
     @property
     def trackers(self) -> dict[str, HeadOptions]:
-        """By name; deformations are learnt, and not yet used, until the face deforms."""
+        """By name; deformations are estimated, and not yet used, until the face deforms."""
         return {
             "rigid": HeadOptions(learn=False),
             "deformable": HeadOptions(rigid_frames=self.start),

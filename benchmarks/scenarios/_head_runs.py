@@ -44,7 +44,7 @@ class HeadRun(NamedTuple):
 
     @property
     def is_tracked(self) -> Bool[np.ndarray, " t"]:
-        """Whether there is a pose, and a face of the true shape that had it would be seen where the face is."""
+        """Whether there is a pose, and a face of the true shape that had it would be visible where the face is."""
         at_pose = _projected(self.truth.rig, self.truth.shapes[1:], np.asarray(self.track.pose, np.float32))
         off = np.asarray(at_pose, float) - self.truth.uv[1:]
         return np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=(1, 2))) < ASTRAY_PX
@@ -64,7 +64,7 @@ class HeadRun(NamedTuple):
 def follow(sequence: FaceSequence, trackers: Mapping[str, HeadOptions]) -> dict[str, HeadRun]:
     """Runs of all trackers over one sequence, which is rendered once.
 
-    They are told where the landmarks are in the first image of the first camera, and nothing else.
+    They are given where the landmarks are in the first image of the first camera, and nothing else.
     """
     points = np.asarray(sequence.uv[0, 0], float)
     sessions = {name: HeadSession(sequence.rig, options, points) for name, options in trackers.items()}

@@ -19,12 +19,12 @@ from jaxfilters.trackers.head.common.search import Searches, at, searches
 from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState
 from jaxfilters.trackers.head.stereo.registration import register
 from jaxfilters.trackers.head.stereo.track import SHARPENING, advance, begin
-from jaxfilters.trackers.head.stereo.ways import WAYS
+from jaxfilters.trackers.head.stereo.variants import VARIANTS
 
 BATCH = 8
 """Frames in one call."""
 WARM_UP = 5
-"""Calls before the one that is timed: modes have been learnt by then."""
+"""Calls before the one that is timed: modes have been estimated by then."""
 USUAL = 1000
 """Particles."""
 
@@ -173,5 +173,5 @@ def _recalculated(rig, state: HeadState, images: Array, x: Array):
 
 
 def _way(mode: str):
-    way = WAYS[mode]
+    way = VARIANTS[mode]
     return way.follow, way.still

@@ -1,4 +1,4 @@
-"""How well the size of a face can be told from its shape alone, which is all that one camera sees of a stranger."""
+"""How well the size of a face follows from its shape alone, which is all that one camera shows of an unknown person."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxfilters.models.synthetic.face import Identity, make_identity
 
 NUM_PEOPLE = 20_000
-"""Of the generator, from whom the regression is learnt."""
+"""Of the generator, from whom the regression is estimated."""
 
 
 def size_errors(shapes: Float[np.ndarray, "n K 3"]) -> Float[np.ndarray, " n"]:

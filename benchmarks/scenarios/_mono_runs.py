@@ -27,7 +27,7 @@ from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
 DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
 """From millimetres and radians to millimetres and degrees."""
 START_FRAMES, DETECTED_PX = (0, 6, 12, 18, 24), 0.5
-"""In which landmarks are detected, and the standard deviation of each coordinate (specification, section 4)."""
+"""In which landmarks are detected, and the standard deviation of each coordinate."""
 BLOCK = 40
 """Frames in memory at once."""
 TRAINING_KEY = 77
@@ -51,7 +51,7 @@ class MonoRun(NamedTuple):
 
     @property
     def who(self) -> Int[np.ndarray, " t"]:
-        """Whom of those who are remembered the face is taken for; -1 for a stranger."""
+        """Whom of those who are remembered the face is taken for; -1 for an unknown person."""
         return np.asarray(self.track.who)
 
     @property
@@ -106,7 +106,7 @@ class Learnt(NamedTuple):
 
 
 def camera() -> CameraRig:
-    """The one of the specification: 800 px, 640 x 480."""
+    """Focal length 800 px, 640 x 480."""
     return monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
 
 
@@ -117,7 +117,7 @@ def talking_head(user: int, num_frames: int) -> FaceSequence:
 
 
 def learnt_from(people: list[Identity], identities: int, seed: int) -> Learnt:
-    """The model of the specification's training faces of some people, and these people."""
+    """The model of the training faces of some people, and these people."""
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *people)
     key = jax.random.fold_in(jax.random.key(TRAINING_KEY), seed)
     shapes = generator_shapes(key, together)

@@ -15,7 +15,7 @@ from jaxfilters.trackers.head.mono.state import NUM_FRAMES, MonoOptions
 
 SPREADS = (0.1, 0.5, 1.0, 2.0)
 TURNED_DEG = (3.0, 12.0, 7.0)
-"""Standard deviations of roll, yaw and pitch at a spread of 1 (specification, section 5)."""
+"""Standard deviations of roll, yaw and pitch at a spread of 1."""
 MOVED_MM = (10.0, 10.0, 20.0)
 
 

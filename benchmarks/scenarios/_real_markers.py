@@ -1,4 +1,4 @@
-"""Hands of which only markers are seen: points fixed to the palm or between the joints of a finger."""
+"""Hands of which only markers are visible: points fixed to the palm or between the joints of a finger."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Motion capture of a hand seen by a virtual camera: lengths between markers on the fingers, from one view.
+"""Motion capture of a hand observed by a virtual camera: lengths between markers on the fingers, from one view.
 
 A triangle of markers is fixed to the back of the hand; its measured sides set the scale. A finger's chain begins at a
 marker of the triangle: one link inside the hand that hardly moves, to a joint that nobody sees; from it one to the

@@ -1,10 +1,11 @@
-"""Thirteen gestures of a hand with 20 joints, learnt of single recordings and found in streams of several.
+"""Thirteen gestures of a hand with 20 joints, estimated from single recordings and found in streams of several.
 
 SFINGE 3D (F. M. Caputo et al., Computers & Graphics 2020): 20 frames a second, poses such as "three", and movements
-such as a circle. Learnt of the dictionary alone; what hands do between gestures is in no example, and the threshold
-model stands for it. A gesture counts as detected if more than half of its annotated frames are in a detection with its
-label that no other gesture has; a detection that serves no gesture is a false positive. The Jaccard index is the mean
-over gestures and false positives of the frames that annotation and detections of a label share, over those of either.
+such as a circle. Models are trained on the dictionary alone; what hands do between gestures is in no example, and the
+threshold model stands for it. A gesture counts as detected if more than half of its annotated frames are in a detection
+with its label that no other gesture has; a detection that serves no gesture is a false positive. The Jaccard index is
+the mean over gestures and false positives of the frames that annotation and detections of a label share, over those of
+either.
 """
 
 from dataclasses import replace
@@ -28,7 +29,7 @@ FPS = 20.0
 NUM_GESTURES = 13
 FINGERTIPS = (3, 7, 11, 15, 19)
 HAND_M, SPEED_M_S, BEND_PER_S = 0.08, 0.2, 8.0
-"""What features are told in: positions of fingertips from the palm, speeds of the palm, and changes of the former."""
+"""What features are given in: positions of fingertips from the palm, speeds of the palm, and changes of the former."""
 NUM_STATES, MIN_VARIANCE = 16, 0.05
 TEMPER = 0.3
 """Share of a frame's log-likelihood that counts: neighbouring frames say nearly the same."""

@@ -94,7 +94,7 @@ def straightened(
 
 
 def desk(xy: Float[Array, " 2"]) -> Float[Array, "5 3 3"]:
-    """The sides and the top of a box on the floor between somebody and camera 1."""
+    """The sides and the top of a box on the floor between a person and camera 1."""
     (x, y), (width, depth, height) = xy - jnp.array([0.0, DESK_AHEAD_M]), DESK_SIZE_M
     low, high = jnp.stack([x - width / 2, y - depth / 2]), jnp.stack([x + width / 2, y + depth / 2])
     along, across, up = jnp.array([width, 0.0, 0.0]), jnp.array([0.0, depth, 0.0]), jnp.array([0.0, 0.0, height])
@@ -123,7 +123,7 @@ LOOKS = {
     "shadow": Look(flaws=Flaws(), with_shadow=True),
     "taller": Look(taller=1.05),
 }
-"""The columns of table 1 of the specification; `shadow` has holes too."""
+"""The columns of table 1 of Kato et al. (1999); `shadow` has holes too."""
 
 
 class Runs(NamedTuple):

@@ -1,8 +1,8 @@
-"""Where adaptive diffusion and halfway partitioned sampling help: targets that rest and jerk, seen through noise.
+"""Where adaptive diffusion and halfway partitioned sampling help: targets that rest and jerk, observed through noise.
 
 Two problems with known truth and Gaussian noise. A pose of six coordinates rests for a second, jerks in a third of
 one, and rests again. Particle filters with a fixed small and a fixed large diffusion, with `A = I, b = 1` (`adaptive`),
-and with the regression learnt while tracking (`learnt`): `error_rest` and `error_jerk` are root mean square errors in
+and with the regression updated while tracking (`online`): `error_rest` and `error_jerk` are root mean square errors in
 standard deviations of the noise, `worst_error` is the largest such error of any frame.
 
 Then eleven coordinates, the pose and five deformations that the observation confounds with it: one stage against two
@@ -121,7 +121,7 @@ def pose_filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
         "fixed_small": build(diffusion.start(SMALL * ones, slope=0.0), update_fit=keep),
         "fixed_large": build(diffusion.start(LARGE * ones, slope=0.0), update_fit=keep),
         "adaptive": build(diffusion.start(ones), update_fit=keep),
-        "learnt": build(diffusion.start(ones)),
+        "online": build(diffusion.start(ones)),
     }
 
 

@@ -1,6 +1,6 @@
 """An articulated hand from one camera: do loose limits resolve depth, and does the covariance stay honest?
 
-The paper's sequence of 55 frames (Shimada et al., figures 12 to 16; E1 of the specification) for two hands from the
+The paper's sequence of 55 frames (Shimada et al., figures 12 to 16) for two hands from the
 same start, by three filters: `unconstrained`, `literal` (the paper's) and `recommended`. Then the authors' open
 problem, `held_*`: one pose repeated for 500 frames, of which only the first few can teach anything. Where
 JAXFILTERS_DATA names the folder of recordings, real hands follow. Errors are over all seeds; `nees` is a mean over
@@ -83,7 +83,7 @@ def _judged(runs: paper.Runs) -> dict[str, float]:
 
 
 def held_metrics(seeds: range, num_frames: int, out: Path | None) -> dict[str, Metric]:
-    """What becomes of lengths and of their covariance while nothing new is seen."""
+    """What becomes of lengths and of their covariance while nothing new is visible."""
     metrics: dict[str, Metric] = {}
     curves: dict[str, paper.Runs] = {}
     for mode in ("literal", "recommended"):

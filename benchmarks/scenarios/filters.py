@@ -116,7 +116,7 @@ def ask(python: str, request: Request, cores: int = 1) -> dict[str, Metric]:
 
 
 def _answer(command: list[str], python: str):
-    # One device for a process, whatever this one was told: particles of one filter are compared.
+    # One device for a process, whatever this one was given: particles of one filter are compared.
     environment = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
     finished = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=environment, check=False)
     if finished.returncode != 0:

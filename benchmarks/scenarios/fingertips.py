@@ -1,6 +1,6 @@
 """How many fingers, and which: figure 5 of Oka et al., with and without correspondence, in points and in images.
 
-Section 4.2 of the specification of fingertips and gestures: seven subjects with one to five fingers out, 900 frames
+Seven synthetic subjects with one to five fingers out, 900 frames
 each. `accuracy_with_<n>` is the percentage of frames, the first ones included, whose number of tips is right in that
 frame, a mean over subjects; `least_with_<n>` the smallest over seven subjects, averaged over groups of seven. Names
 without a suffix are the modern tracker's, with `_published` the paper's, with `_detected` those of single frames,
@@ -140,7 +140,7 @@ def render(key: jax.Array, count: int, frames: int) -> list[desk_hand.DeskFrame]
 
 
 def open_hand(key: jax.Array) -> HandParameters:
-    """What detection is told of the user, from an open hand at rest."""
+    """What detection is given of the user, from an open hand at rest."""
     (frame,) = desk_hand.desk_video(jax.random.fold_in(key, 99), np.ones((1, MAX_TIPS), bool), shape=SHAPE, speed=0.0)
     return fit_hand_parameters(frame.image)
 
@@ -239,7 +239,7 @@ def tracked_video_metrics(video: HandVideo) -> dict[str, float]:
 
 
 def _thumb_is_right(report: HandReport, nearest: np.ndarray, usable: np.ndarray) -> float:
-    """Share of the extended fingers with a track that are told for what they are."""
+    """Share of the extended fingers with a track that are given for what they are."""
     called = np.take_along_axis(np.asarray(report.is_thumb)[:, 0], nearest, axis=1)
     return float((called == (np.arange(MAX_TIPS) == 0))[usable].mean())
 

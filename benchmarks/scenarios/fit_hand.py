@@ -1,9 +1,9 @@
-"""The size of a hand and the noise of a depth camera learnt from stills, by gradient through the renderer.
+"""The size of a hand and the noise of a depth camera estimated from stills, by gradient through the renderer.
 
 First on rendered hands of known proportions, then on eight key poses of a real one (E. Remelli et al.,
 "Low-dimensionality hand model calibration from monocular depth", ICCV 2017, its user 1). The real hand has no truth:
-its proportions are learnt on half of the images, and judged on the other half by the error that remains when only the
-poses may adapt, beside that of an average hand.
+its proportions are estimated on half of the images, and judged on the other half by the error that remains when only
+the poses may adapt, beside that of an average hand.
 """
 
 import sys
@@ -63,7 +63,7 @@ class Stills(NamedTuple):
 
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
-    """Learn, print what was learnt, and draw the real hand over its images."""
+    """Learn, print what was estimated, and draw the real hand over its images."""
     method = QUICK_ADAM if quick else ADAM
     found = [learn_size(rendered(np.random.default_rng(seed + i)), method) for i in range(1 if quick else NUM_HANDS)]
     metrics = _errors([each.theta for each in found])
@@ -200,7 +200,7 @@ def _errors(found: list[HandStills]) -> dict[str, Metric]:
 
 
 def _draw(path: Path, stills: Stills, theta: HandStills) -> None:
-    """Observed depth above, the learnt hand as rendered below."""
+    """Observed depth above, the estimated hand as rendered below."""
     poses = _poses(stills, theta)
     hand = theta.proportions.of(hand_geometry())
     rendered_rows = []

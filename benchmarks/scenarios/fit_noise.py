@@ -1,10 +1,10 @@
-"""Process and sensor noise of a keypoint tracker learnt from what networks say, without truth, on real hands.
+"""Process and sensor noise of a keypoint tracker estimated from what networks say, without truth, on real hands.
 
 NYU hand poses (J. Tompson et al., "Real-time continuous pose recovery of human hands", 2014) as eight networks saw
-them. Noises are learnt on the first half of the frames; the other half is filtered and smoothed with them, and compared
-with the truth. `jitter_ratio` is the learnt sensor noise over that part of a network's error that changes from frame to
-frame: 1 where the noises are told apart well. Most of a network's error is the same in neighbouring frames, which no
-filter without a model of hands can remove.
+them. Noises are estimated on the first half of the frames; the other half is filtered and smoothed with them, and
+compared with the truth. `jitter_ratio` is the estimated sensor noise over that part of a network's error that changes
+from frame to frame: 1 where the noises are separated well. Most of a network's error is the same in neighbouring
+frames, which no filter without a model of hands can remove.
 """
 
 import sys

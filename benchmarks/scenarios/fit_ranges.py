@@ -1,9 +1,9 @@
-"""Range bias, noise and outliers of radio beacons learnt by maximum likelihood; a robot's error before and after.
+"""Range bias, noise and outliers of radio beacons estimated by maximum likelihood; a robot's error before and after.
 
 Real recording: Plaza 1 (J. Djugash, B. Hamner, S. Roth, "Navigating with ranging radios", Journal of Field Robotics
-26(9), 2009), odometry and ranges to four beacons at known places. What is learnt never sees the true path, nor the
+26(9), 2009), odometry and ranges to four beacons at known places. The fit uses neither the true path nor the
 second half of the recording; errors are those of both halves apart. `nominal` is the filter with round numbers in
-place of what was learnt; `bias` learns a constant excess of the ranges, `scale` one that grows with the distance, and
+place of the estimates; `bias` fits a constant excess of the ranges, `scale` one that grows with the distance, and
 `network` any function of the distance, a small network trained through the filter.
 """
 
@@ -30,7 +30,7 @@ from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, loca
 from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 NOISES = tuple(map(jnp.float32, (1.0, 0.01, 10.0, 0.1, 0.02)))
-"""A metre of noise, one range in a hundred wild, a decimetre a metre, a degree a second."""
+"""A metre of noise, one range in a hundred outlying, a decimetre a metre, a degree a second."""
 POSITIVE = (fit.positive, fit.interval(0.0, 0.5), fit.positive, fit.positive, fit.positive)
 NOMINAL = RangeRobot(LinearExcess(jnp.float32(0), jnp.float32(0)), *NOISES)
 """No excess at all."""
@@ -113,7 +113,7 @@ class Localisation:
 
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
-    """Learn, localise, print, and draw what was learnt."""
+    """Learn, localise, print, and draw what was estimated."""
     del seed  # Nothing is drawn.
     recording = read(recording_folder("plaza_range_slam") / "Plaza1_.mat")
     recording = recording.part(slice(QUICK_NUM_RANGES)) if quick else recording
@@ -197,7 +197,7 @@ def _metrics(recording: Recording, robots: dict, errors: dict, half: int) -> dic
 
 def _learnt_metrics(recording: Recording, found: fit.Fit) -> dict[str, Metric]:
     excess = float(mean_excess(recording, found.theta))
-    sys.stdout.write(f"mean bias of the ranges: learnt {excess:.3f} m, true {_true_excess(recording):.3f} m\n")
+    sys.stdout.write(f"mean bias of the ranges: estimated {excess:.3f} m, true {_true_excess(recording):.3f} m\n")
     return {
         "learnt_mean_bias_m": Metric(excess, "m", "lower"),
         "learnt_noise_m": Metric(float(found.theta.noise), "m", "lower"),
@@ -218,7 +218,7 @@ def _true_excess(recording: Recording) -> float:
 
 
 def _draw(path: Path, recording: Recording, robots: dict, errors: dict) -> None:
-    """Errors over time; below, the excess of the ranges by distance, learnt and true."""
+    """Errors over time; below, the excess of the ranges by distance, estimated and true."""
     colors = {"nominal": (60, 60, 60), "bias": (40, 120, 230), "scale": (200, 110, 30), "network": (60, 160, 60)}
     curves = [Curve(name, error, colors[name]) for name, error in errors.items()]
     over_time = draw_chart((320, 900), "error of the place, m", recording.seconds, curves, "s", from_zero=True)

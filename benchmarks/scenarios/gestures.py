@@ -1,7 +1,7 @@
 """Symbols: drawn ones of other writers (table 2), recorded ones of unseen people, and gestures spotted in a stream.
 
-Symbols that the generator draws are learnt of one writer and recognised of six others, in percent; `_codes` is with the
-same models from direction codes alone, `_published` with the paper's models of codes, whose best symbol counts, and
+Models are trained on symbols of one synthetic writer and tested on six others, in percent; `_codes` is with the same
+models from direction codes alone, `_published` with the paper's models of codes, whose best symbol counts, and
 `_published_rejecting` with its threshold model. Oka, Sato and Koike report 99.2 and 97.5 % of people and shapes of
 their own.
 
@@ -30,7 +30,7 @@ RECORDINGS = {
     "midair_loso": ("midair_leap_gestures", "midair_leap.npz", None),
     "unipen_unseen_donor": ("unipen_digits", "unipen_1a_digits.npz", 120),
 }
-"""By the names of metrics: folder, file, and most examples of a symbol that are learnt from one person."""
+"""By the names of metrics: folder, file, and most examples of a symbol that are estimated from one person."""
 SFINGE = "sfinge3d_gestures"
 QUICK_PEOPLE, QUICK_SEQUENCES = 1, 3
 

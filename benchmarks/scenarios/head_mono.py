@@ -1,19 +1,18 @@
 """Heads before one camera: the thesis's experiments on rendered faces, starts, ablations, modelled people, real video.
 
-Tables 4.1 to 4.3 of Sugano's thesis (2007) as section 5 of the specification has them: errors over eight users, of `b_`
-and `b_eyes_` over 24, by mean, median and worst. `a_` knows faces of eleven people, the user among them, and may
-recognise them; `c_` is `a_` with an adjustment at the start alone, `a_strange_` takes everybody for a stranger. `b_`
-does not know the user: it has learnt from 200 other people of the generator and remembers nobody; beside its error in
-depth stands that of the size which the exact shapes of the same faces tell, `error_b_z_of_exact_shape`. `b_ten_` has
-learnt from the ten of the eleven who are not the user, as in the thesis, and may take the user for one of them.
-`b_eyes_` is `b_` and knows the distance between the user's eyes to a millimetre, `b_past_` keeps what frames told that
-leave the window, `b_angles_` and `b_latest_` choose frames otherwise, `b_rendered_modelled_` has learnt from people of
-the ICT face model. `_paper` is the tracker of the thesis, `_paper_map` the same with priors, `_projected` without
-measured landmarks. Starts are judged by how widely the five heads are turned. Modelled people are followed by two
-models of faces, by one of them also from 68 landmarks, `modelled_68_`; they need `ict_face_model`,
-`biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos `talking_face_video`; what is
-missing is said and left out. All of it takes hours: with `--out`, a run that was cut off goes on after the last user
-and the last part that it had finished.
+Tables 4.1 to 4.3 of Sugano's thesis (2007): errors over eight users, of `b_` and `b_eyes_` over 24, by mean, median and
+worst. `a_` knows faces of eleven people, the user among them, and may recognise them; `c_` is `a_` with an adjustment
+at the start alone, `a_strange_` takes everybody for unknown. `b_` does not know the user: its model is of 200 other
+people of the generator, and its gallery is empty; beside its error in depth stands that of the size which the exact
+shapes of the same faces tell, `error_b_z_of_exact_shape`. `b_ten_` has the model of the ten of the eleven who are not
+the user, as in the thesis, and may take the user for one of them. `b_eyes_` is `b_` and knows the distance between the
+user's eyes to a millimetre, `b_past_` keeps the information of frames that leave the window, `b_angles_` and
+`b_latest_` choose frames otherwise, `b_rendered_modelled_` has the model of people of the ICT face model. `_paper` is
+the tracker of the thesis, `_paper_map` the same with priors, `_projected` without measured landmarks. Starts are judged
+by how widely the five heads are turned. Modelled people are followed by two models of faces, by one of them also from
+68 landmarks, `modelled_68_`; they need `ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder
+JAXFILTERS_DATA, the videos `talking_face_video`; what is missing is said and left out. All of it takes hours: with
+`--out`, a run that was cut off goes on after the last user and the last part that it had finished.
 """
 
 import sys
@@ -58,7 +57,7 @@ AXIS_ORDER = [0, 1, 2, 3, 5, 4]
 """Where they are in a pose of the tracker."""
 FIRST_USER, NUM_USERS, NUM_KNOWN, NUM_MANY = 300, 8, 11, 200
 NUM_STRANGERS = 24
-"""Users of `b` and `b_eyes`: how large a stranger is is luck, and the mean over eight people says little."""
+"""Users of `b` and `b_eyes`: how large an unknown person is is luck, and the mean over eight people says little."""
 DISTANCE_MM = 650.0
 """Of the heads."""
 FIRST_OTHER = 1000
@@ -176,7 +175,7 @@ def errors_of(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
 
 
 def _floor(users: range) -> dict[str, Metric]:
-    """How well the depth of the same strangers can be told from their exact shapes."""
+    """How well the depth of the same unknown people can be distinguished from their exact shapes."""
     shapes = np.stack([np.asarray(_identity(FIRST_USER + user).neutral) for user in users])
     told = DISTANCE_MM * np.abs(size_errors(shapes))
     return {"error_b_z_of_exact_shape": Metric(float(np.mean(told)), "mm", "lower")}
@@ -184,7 +183,7 @@ def _floor(users: range) -> dict[str, Metric]:
 
 @cache
 def _of_many(seed: int) -> MultilinearFace:
-    """Learnt from people who are never users."""
+    """Estimated from people who are never users."""
     return learnt_from([_identity(FIRST_OTHER + i) for i in range(NUM_MANY)], WIDE_IDENTITIES, seed).face
 
 

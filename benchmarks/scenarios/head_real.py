@@ -126,7 +126,7 @@ def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
 
 
 def modelled(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int) -> IctSequence:
-    """A person who turns and speaks as recorded, before the two cameras of the specification."""
+    """A person who turns and speaks as recorded, before the two cameras of the nominal rig."""
     poses, expressions = biwi_course(turns, num_frames), livelink_course(speech, num_frames)
     return ict_sequence(jax.random.key(person), model, poses, expressions=expressions)
 

@@ -1,6 +1,6 @@
 """Proposals of the Rao-Blackwellized filter where the truth is known: one coordinate, all linear and Gaussian.
 
-The table of the specification, section 2.6 (its E5): pose and velocity of one coordinate, the pose observed, 150
+Pose and velocity of one coordinate, the pose observed, 150
 frames; `exact`, `plug_in` and `plug_in_corrected` proposals and a plain filter on pose and velocity (`joint_pf`), each
 against the joint Kalman filter, averaged over random keys. `rms` is the difference of the posterior means,
 `variance_error` how far the ratio of the posterior variances is from 1, `log_evidence_gap` the difference in log

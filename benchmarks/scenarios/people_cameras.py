@@ -5,11 +5,11 @@ background, as for any video. Names without a suffix are of four cameras that al
 has the middle two fifths of its image only, so that people leave one view for the next and are often in one alone;
 `_rates` has cameras of which some deliver every second or third frame; in `_stopped` the first camera delivers nothing
 in the second half; `_one_camera` is the first camera alone, judged on what it sees. `handovers` counts how often, with
-narrow views, another camera became the nearest of those that see somebody whole.
+narrow views, another camera became the nearest of those that see a person whole.
 
 Where JAXFILTERS_DATA names a folder with `pom_lab_2cam`, two real cameras follow, by their silhouettes. There is no
 truth for them: `pom_agreement` is the share of the people that a published method found (Fleuret et al. 2008, on a grid
-of 0.2 m) within 0.5 m of somebody who is tracked.
+of 0.2 m) within 0.5 m of a person who is tracked.
 """
 
 import sys
@@ -37,7 +37,7 @@ NUM_SEEDS = 3
 NUM_FRAMES, QUICK_FRAMES = 240, 60
 PRIME_IMAGES = 24
 WHOLE_M = (0.1, 1.5)
-"""Heights that a camera must have in its image to see somebody whole."""
+"""Heights that a camera must have in its image to see a person whole."""
 CAPACITY = 12
 NARROW = 0.4
 """Of the columns."""
@@ -52,7 +52,7 @@ class Setup(NamedTuple):
     first_stops: bool = False
     """Whether the first camera delivers nothing in the second half."""
     width: float = 1.0
-    """Share of its columns, in the middle, that each camera has; nothing is seen beside them."""
+    """Share of its columns, in the middle, that each camera has; nothing is visible beside them."""
 
     def delivers(self, camera: int, frame: int, frames: int) -> bool:
         """Whether a camera delivers a frame of a recording of some frames."""
@@ -123,7 +123,7 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
 
 
 def truth(room: DemoRoom, setup: Setup) -> FloorTracks:
-    """Who is on the floor and seen whole by a camera that is still running."""
+    """Who is on the floor and observed whole by a camera that is still running."""
     frames = len(room)
     rows = []
     for i in range(frames):
@@ -146,7 +146,7 @@ def sees_whole(camera: FloorCamera, xy: np.ndarray, width: float = 1.0) -> np.nd
 
 
 def handovers(room: DemoRoom, width: float) -> int:
-    """How often the nearest camera that sees somebody whole became another one."""
+    """How often the nearest camera that sees a person whole became another one."""
     centers = np.stack([np.asarray(camera.position())[:2] for camera in room.cameras])
     seen = np.stack([[sees_whole(camera, xy, width) for camera in room.cameras] for xy in room.routes.xy])
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)

@@ -1,6 +1,6 @@
 """People on a real video, PETS 2009 S2.L1 View_001, followed automatically and compared with annotations.
 
-Needs the folder `pets09_s2l1_view001` of JAXFILTERS_DATA. The whole video is decoded, straightened, told from its
+Needs the folder `pets09_s2l1_view001` of JAXFILTERS_DATA. The whole video is decoded, straightened, given from its
 background (median of every 20th frame) and tracked with the constants that everything else has; scores are on the
 frames from the first to the last of the file of truth, `gt_0_399.csv` or what `--truth` names (columns `frame`, `id`,
 `x_m`, `y_m` and, if there is one, `in_area`). Names without a suffix are of the tracks that remain of a recording,

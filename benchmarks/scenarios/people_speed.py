@@ -1,6 +1,6 @@
 """Frames a second of the people tracker for 1 to 32 people at three image sizes, with and without the background.
 
-People stand in a room that is seen in the same field of view at every size; everybody is tracked when the clock starts.
+People stand in a room, in the same field of view at every size; everybody is tracked when the clock starts.
 All have a capacity of 32 people. `fps_*` includes finding the foreground by the median background, from an image
 without lens distortion in memory; `tracking_fps_*` begins with the foreground. `person_ms_*` is what each of the seven
 others adds to the time of one alone. `candidates_per_second_*` counts the places and sizes that are compared with the

@@ -1,6 +1,6 @@
 """People who stand or cross in front of the paper's two cameras: the modern tracker beside the paper's.
 
-Experiments E1 to E6 and E8 of the specification of Kato et al. (1999), made with bodies of six ellipsoids whose
+Experiments after Kato et al. (1999), made with bodies of six ellipsoids whose
 silhouettes have holes, stray pixels and a shadow. Names without a suffix are the modern tracker's, with `_paper` the
 paper's, with `_halving` the paper's with finer last steps. In E1 the height is known to 3 cm, as the paper has it;
 `_unknown_height` are the same runs without that.
@@ -41,7 +41,7 @@ GAPS_M, QUICK_GAPS_M = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.5), (0.25, 0.5)
 GAP_Y_M = 1.0
 """Of the nearer of them."""
 MERGED_M = 0.5
-"""Off by more than this at the end, somebody was lost to the other."""
+"""Off by more than this at the end, a person was lost to the other."""
 HEIGHTS, QUICK_HEIGHTS = (0.90, 0.95, 1.0, 1.05, 1.10), (1.10,)
 """True heights by the model's (E5)."""
 MISSING = (0.5, 0.7)
@@ -50,7 +50,7 @@ SMALL_FOCAL = 0.45
 OFFSETS_M = (0.15, 0.3, 0.5, 0.7, 0.9)
 """Of starts from the truth, in random directions (E8)."""
 FOUND_M = 0.15
-"""Off by less than this at the end, somebody was found."""
+"""Off by less than this at the end, a person was found."""
 PAPER, HALVING = PaperConfig(capacity=2), PaperConfig(capacity=2, steps_m=STEP_HALVING)
 MODERN = PeopleConfig(capacity=4, spread_px=0.0)
 """The silhouettes made here end at their edges, as no camera's do."""
@@ -90,7 +90,7 @@ class Rooms:
         }
 
     def simulate(self, seeds: range, name: str, points, look: Look, **options) -> Runs:
-        """Somebody at each of the points, for every seed; the numbers drawn depend on the seed and the name."""
+        """A person at each of the points, for every seed; the numbers drawn depend on the seed and the name."""
         still = np.broadcast_to(np.asarray(points, float)[:, None, None], (len(points), NUM_FRAMES, 1, 2))
         return self.simulate_moving(seeds, name, still, look, **options)
 
@@ -129,7 +129,7 @@ def _errors(suffix: str, runs: Runs, estimates: Estimates) -> dict[str, Metric]:
 
 
 def desk_metrics(seeds: range, rooms: Rooms) -> dict[str, Metric]:
-    """E2: table 2 of the paper, and whether it is noticed that depth cannot be seen."""
+    """E2: table 2 of the paper, and whether it is noticed that depth cannot be visible."""
     metrics: dict[str, Metric] = {}
     for name, points, with_desk in (
         ("a", GROUPS["a"], False),
@@ -195,7 +195,7 @@ def _ways(ends) -> np.ndarray:
 
 
 def _confused(runs: Runs, estimates: Estimates) -> np.ndarray:
-    """(runs,) whether anybody ended as somebody else, or nowhere."""
+    """(runs,) whether anybody ended as another person, or nowhere."""
     apart = np.linalg.norm(estimates.xy[:, -1, :, None] - runs.truth[:, -1, None], axis=-1)
     own = np.diagonal(apart, axis1=1, axis2=2)
     return np.any((own > apart.min(axis=-1)) | (own > MERGED_M), axis=-1)

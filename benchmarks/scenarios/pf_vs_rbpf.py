@@ -119,7 +119,7 @@ def _filtering(setting: hand.Setting, filter: Filter) -> Filtering:
 
 
 def _guided(name: str, num_particles: int) -> Filtering:
-    """The tracker as users run it, told the size of the hand but not where it starts."""
+    """The tracker as users run it, given the size of the hand but not where it starts."""
     tracker = hand_depth.build(
         kinect_v2(), hand_depth.HandDepthConfig(filter=name, num_particles=num_particles, scale=1.0)
     )

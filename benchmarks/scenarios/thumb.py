@@ -1,12 +1,11 @@
 """Is it the thumb: table 1 of Oka et al. on angles with a person's habit, drifting postures and noise.
 
-Section 4.3 of the specification of fingertips and gestures: seven subjects who draw with the forefinger, pinch, and
-draw with the thumb, six tracks of 150 frames for each finger. What counts is the share of frames in which a finger is
-told for what it is, decided in that frame with what was seen so far; accuracies are means over subjects, averaged over
-groups of seven, and `sd_` their standard deviation over the subjects of a group. Names without a suffix are the
-posterior's after three seconds of an open hand, with `_uncalibrated` without these; `_published` is the paper's mean
-score with the standard angles, `_published_calibrated` with those that were measured; `_single_frame` the paper's
-without history.
+Seven synthetic subjects who draw with the forefinger, pinch, and draw with the thumb, six tracks of 150 frames for each
+finger. What counts is the share of frames in which a finger is recognised for what it is, decided in that frame with
+what was observed so far; accuracies are means over subjects, averaged over groups of seven, and `sd_` their standard
+deviation over the subjects of a group. Names without a suffix are the posterior's after three seconds of an open hand,
+with `_uncalibrated` without these; `_published` is the paper's mean score with the standard angles,
+`_published_calibrated` with those that were measured; `_single_frame` the paper's without history.
 """
 
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""A hand of links seen by one camera: state, geometry, image features, inequalities, depth ambiguities."""
+"""A hand of links observed by one camera: state, geometry, image features, inequalities, depth ambiguities."""

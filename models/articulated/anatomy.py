@@ -73,5 +73,5 @@ def _fan():
 
 
 def _side(layout):
-    """+1 for a right hand, -1 for a left one: where the index begins, seen from the middle of the palm."""
+    """+1 for a right hand, -1 for a left one: where the index begins, viewed from the middle of the palm."""
     return float(np.sign(layout.base_shares[1, 1]))

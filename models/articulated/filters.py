@@ -44,7 +44,7 @@ from jaxfilters.models.articulated.limits import LimitRows
 from jaxfilters.typing import AnyKey
 
 NEW_VIEW = 4.0
-"""Standard deviations of a point's noise by which some joint must be seen elsewhere for a view to be new."""
+"""Standard deviations of a point's noise by which some joint must be visible elsewhere for a view to be new."""
 SKIP = 4.0
 """The paper's c_skip: standard deviations beyond which an inequality is not applied."""
 REJECT = -3.0
@@ -97,7 +97,7 @@ class HandBelief:
 
 
 def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
-    """Second-order filter, limits counted once, lengths learnt from new views; observations are `Look`s."""
+    """Second-order filter, limits counted once, lengths estimated from new views; observations are `Look`s."""
     inner = constrained(_belief(hand, prior, gate, second_order_covariance_only, turned), EPConstraints(*limits))
     constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
     return schmidt_kalman(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
@@ -115,7 +115,7 @@ def unconstrained(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, 
 
 
 def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"]:
-    """What is seen of a hand wherever it is in the image: its joints from the wrist, pixels."""
+    """What is visible of a hand wherever it is in the image: its joints from the wrist, pixels."""
     points = hand.points(x)
     wrist = hand.projection.camera_points(x, hand.layout, jnp.zeros(3, x.dtype))
     return (hand.projection.image_points(points) - hand.projection.image_points(wrist)).ravel()
@@ -139,7 +139,7 @@ class Report(NamedTuple):
     least_distance: Float[Array, ""]
     """Standard deviations to the nearest limit before the cut, negative outside; infinite without limits."""
     is_new_view: Bool[Array, ""]
-    """Whether lengths were learnt."""
+    """Whether lengths were estimated."""
 
 
 def report_of(info: SchmidtInfo | ConstrainedInfo | KalmanInfo) -> Report:

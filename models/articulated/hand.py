@@ -1,4 +1,4 @@
-"""The articulated hand as one model: how its state moves, what is seen of it, and with how much noise."""
+"""The articulated hand as one model: how its state moves, what is visible of it, and with how much noise."""
 
 from dataclasses import field
 
@@ -28,7 +28,7 @@ POINT_STD, ALPHA_STD, RHO_STD = 1.0, float(np.deg2rad(2.0)), 1.0
 
 @pytree_dataclass
 class ArticulatedHand:
-    """Links seen by one camera, for any Gaussian filter; made by `articulated_hand`.
+    """Links observed by one camera, for any Gaussian filter; made by `articulated_hand`.
 
     `transition`, `process_noise`, `observe`, `observation_noise` and `residual` are what the filters take. Frames are
     the unit of time; the `inputs` of a step are the time since the last state in frames, `None` for one.
@@ -134,7 +134,7 @@ def articulated_hand(
     rho_std: float = RHO_STD,
     origin: tuple[float, float] | None = None,
 ) -> ArticulatedHand:
-    """The model with checked numbers; the defaults are weak perspective, motion and noise of the specification.
+    """The model with checked numbers; the defaults are weak perspective, motion and noise of Shimada et al.
 
     Args:
         layout: Of the state.

@@ -1,1 +1,1 @@
-"""Heads and deforming faces seen by one camera or more: geometry, templates, likelihood, recalculated landmarks."""
+"""Heads and deforming faces observed by one camera or more: geometry, templates, likelihood, recalculated landmarks."""

@@ -143,7 +143,7 @@ def _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig):
 
 
 def taken_over(found: Alignment, again: Alignment, better: Bool[Array, "C K"]) -> Alignment:
-    """The first alignment, but for landmarks that the second has seen better; of slopes only the first speaks."""
+    """The first alignment, but for landmarks that the second measures better; of slopes only the first speaks."""
     pick = lambda a, b: jnp.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), a, b)
     names = ("uv", "covariance", "score", "by_slope")
     return found._replace(**{name: pick(getattr(again, name), getattr(found, name)) for name in names})

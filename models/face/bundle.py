@@ -1,8 +1,8 @@
-"""Bundle adjustment of a multilinear face: who somebody is, from landmarks in several frames of one video.
+"""Bundle adjustment of a multilinear face: the identity of a person, from landmarks in several frames of one video.
 
 The shape in frame i is `M(s, a_i) + d`: identity s and offset d are the person's, expression a_i and pose p_i the
 frame's (Sugano 2007, section 4.3). The offset, which the thesis does not have, is what the model lacks of this face: a
-person whom it has not seen, an asymmetry, a landmark that was marked beside its place. Everything is found by
+person outside of its training set, an asymmetry, a landmark that was marked beside its place. Everything is found by
 Levenberg-Marquardt within a box ([4.25]-[4.37]), first the poses alone, then all of it.
 """
 
@@ -70,7 +70,7 @@ class Adjustment(NamedTuple):
     energy: Float[Array, ""]
     """Half of the sum of squared residuals, the prior's included."""
     reprojection_px: Float[Array, ""]
-    """Root mean square distance of the landmarks that are seen, a coordinate."""
+    """Root mean square distance of the landmarks that are visible, a coordinate."""
     iterations: Int[Array, ""]
     """Of the second stage."""
 
@@ -190,7 +190,7 @@ def frame_residuals(
 def _of_views(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, loss: Loss) -> Array:
     apart = projected(face, rig, bundle) - views.uv
     apart = jnp.where(jnp.isfinite(apart), apart, HIDDEN_PX)
-    # Unit covariance stands where nothing was seen: its root must exist.
+    # Unit covariance stands where nothing was observed: its root must exist.
     covariance = jnp.where(views.seen[..., None, None], views.covariance, jnp.eye(2))
     (a, b), (_, c) = jnp.moveaxis(covariance, (-2, -1), (0, 1))
     first = apart[..., 0] / jnp.sqrt(a)

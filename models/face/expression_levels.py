@@ -1,4 +1,4 @@
-"""Equally spaced strengths of an expression out of a sequence of one person's shapes (specification, section 2.2)."""
+"""Equally spaced strengths of an expression out of a sequence of one person's shapes."""
 
 from collections.abc import Callable
 

@@ -21,7 +21,7 @@ def by_angles(
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The frame that the new one replaces for the largest variance of the facing direction, and that variance.
 
-    The new frame is always taken (specification, section 2.5).
+    The new frame is always taken.
 
     Args:
         angles: Yaw and pitch of the frames so far, radians.
@@ -48,7 +48,7 @@ def by_information(
     tell more than any set with the new one.
 
     Args:
-        information: Of each frame so far about the person, as `Told.information`.
+        information: Of each frame so far about the person, as `FrameInformation.information`.
         new: Of the new frame.
         prior: Before all frames.
         may_go: Frames that may be replaced.
@@ -62,7 +62,7 @@ def by_information(
     return best, gains[best]
 
 
-class Told(NamedTuple):
+class FrameInformation(NamedTuple):
     """What one frame tells of a person, in standard deviations of the training set's identities and of the offset."""
 
     information: Float[Array, "d d"]
@@ -73,8 +73,10 @@ class Told(NamedTuple):
     """Of the frame's energy, in the same units, at the person that the frame was given."""
 
 
-def told(face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prior: Prior) -> Told:
-    """What one frame tells of identity and offset.
+def frame_information(
+    face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prior: Prior
+) -> FrameInformation:
+    """The information of one frame about identity and offset.
 
     Args:
         face: Model.
@@ -97,7 +99,7 @@ def told(face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prio
 
     of_person, own = jnp.zeros(count + frame.person.offset.size), jnp.zeros_like(units)
     information, by_person, gradient = reduced(residuals, of_person, own)
-    return Told(information, units[:, None] * by_person, gradient)
+    return FrameInformation(information, units[:, None] * by_person, gradient)
 
 
 def reduced(

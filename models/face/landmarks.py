@@ -1,7 +1,6 @@
 """The ten landmarks of a face: names, mean places, which of them move with expressions.
 
-Left and right are the subject's: right is at negative x, left in the image. The order is that of the specification,
-section 4.
+Left and right are the subject's: right is at negative x, left in the image. The order is fixed.
 """
 
 import numpy as np
@@ -43,4 +42,4 @@ MEAN_SHAPE = _TABLE - _TABLE.mean(axis=0)
 """(10, 3) millimetres about the centroid: x to the image's right, y down, z away from a camera that the face faces."""
 
 RIGID_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 0.1, 0.1])
-"""(10,) how far each landmark speaks for the motion of the skull (specification, section 2.10)."""
+"""(10,) how far each landmark speaks for the motion of the skull."""

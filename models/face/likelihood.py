@@ -49,7 +49,9 @@ def log_weights(
     num_scores: int,
     sigma: float | Float[Array, ""] = 3.0,
 ) -> Float[Array, " N"]:
-    """Log weights, not normalised: `-(n - c)^2 / (2 sigma^2) - sum_b (a_b / mu_b)^2 / 2` ([P17], [S3.27]).
+    """Log weights, not normalised: `-(n - c)^2 / (2 sigma^2) - sum_b (a_b / mu_b)^2 / 2`.
+
+    Oka and Sato 2006, equation 17; Sugano 2007, equation 3.27.
 
     Args:
         score_sum: c, sum of the scores over cameras and landmarks.

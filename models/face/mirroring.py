@@ -40,7 +40,7 @@ def mirror_map(pairs: Pairs, num_landmarks: int) -> tuple[int, ...]:
 
 
 def mirrored(shape: Float[Array, "K 3"], pairs: Pairs = PAIRS) -> Float[Array, "K 3"]:
-    """A shape seen in a mirror at x = 0, its landmarks in their usual order."""
+    """A shape reflected at x = 0, its landmarks in their usual order."""
     flip = jnp.array([-1, 1, 1], shape.dtype)
     return shape[np.array(mirror_map(pairs, shape.shape[0]))] * flip
 
@@ -48,7 +48,7 @@ def mirrored(shape: Float[Array, "K 3"], pairs: Pairs = PAIRS) -> Float[Array, "
 def symmetrised(shape: Float[Array, "K 3"], pairs: Pairs = PAIRS) -> Float[Array, "2 K 3"]:
     """Two symmetric shapes: the right half with its mirror image, and the left half with its own.
 
-    The shape is cut at x = 0; landmarks on the midline are moved there (specification, section 2.2).
+    The shape is cut at x = 0; landmarks on the midline are moved there.
 
     Args:
         shape: Millimetres, x to the subject's left.

@@ -1,4 +1,4 @@
-"""A person's parameters from measured shapes, and how well people who were not learnt from are described."""
+"""A person's parameters from measured shapes, and how well people outside of the training set are described."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -41,7 +41,7 @@ class Fit(NamedTuple):
 
 
 class Generalisation(NamedTuple):
-    """How well people are described by a model that was learnt from all others."""
+    """How well people are described by a model that was fitted to all others."""
 
     rms_mm: Float[Array, " people"]
     """Distance of a landmark from the closest faces within two standard deviations."""

@@ -2,7 +2,7 @@
 
 A patch is taken for a small piece of a curved surface. From the pose follows how its picture is stretched and turned,
 an affine map for each camera and landmark, and how it bends. How the surface is inclined is known only roughly at
-first, from an average head, and how it is curved not at all; what a turned head shows of both is learnt (`Slopes`).
+first, from an average head, and how it is curved not at all; what a turned head shows of both is estimated (`Slopes`).
 """
 
 from typing import NamedTuple
@@ -43,7 +43,7 @@ NUM_RELIEF = 5
 
 @pytree_dataclass
 class Patches:
-    """What was seen at registration; C cameras, K landmarks, windows of T x T pixels in TT numbers."""
+    """The images at registration; C cameras, K landmarks, windows of T x T pixels in TT numbers."""
 
     wide: Float[Array, "C K W W"]
     """Grey levels of a larger window."""
@@ -67,7 +67,7 @@ class Patches:
 
 
 class Slopes(NamedTuple):
-    """How the skin rises out of the plane that was assumed for it, learnt while the head turns.
+    """How the skin rises out of the plane that was assumed for it, estimated while the head turns.
 
     At a mm along the first direction within the plane and b mm along the second one it rises by
     `s_1 a + s_2 b + s_3 a^2 / 2 + s_4 a b + s_5 b^2 / 2` mm.

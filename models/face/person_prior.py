@@ -1,4 +1,4 @@
-"""What is known of a face before the images: how large faces are, how they differ, and what was learnt of this one.
+"""What is known of a face before the images: the sizes of faces, how they differ, and estimates of this one.
 
 A small face near by looks like a large one far away. Its millimetres are fewer, too, and whatever counts in squared
 millimetres likes it better for that, which is no evidence. So a face is held by its size, and by what it differs by
@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfilters.models.face import past
+from jaxfilters.models.face import square_root_prior as past
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis, shape
-from jaxfilters.models.face.past import Past
+from jaxfilters.models.face.square_root_prior import SquareRootPrior
 
 
 class Person(NamedTuple):
@@ -38,8 +38,8 @@ class Prior(NamedTuple):
     """Millimetres between the centres of the eyes, if that is known: the size of everything follows from it."""
     eyes_apart_std: Float[ArrayLike, ""] = 0.0
     """Millimetres; 0 where it is not known."""
-    past: Past | None = None
-    """What frames that are no longer adjusted told of `parameters`."""
+    past: SquareRootPrior | None = None
+    """Information of frames that are no longer adjusted about `parameters`."""
 
 
 def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
@@ -52,7 +52,7 @@ def parameters(person: Person) -> Float[Array, " d"]:
     return jnp.concatenate([person.identity, person.offset.ravel()])
 
 
-def nothing_past(face: MultilinearFace) -> Past:
+def nothing_past(face: MultilinearFace) -> SquareRootPrior:
     """Of a person who is new."""
     return past.nothing(face.num_identities + face.mean.size, face.mean.dtype)
 
@@ -107,12 +107,12 @@ def expression_residuals(
 def residuals(
     face: MultilinearFace, person: Person, expressions: Float[Array, "n A"], prior: Prior
 ) -> Float[Array, " rows"]:
-    """Of identity, offset and size, and of what past frames told, in standard deviations.
+    """Of identity, offset and size, and of the information of past frames, in standard deviations.
 
     Args:
         face: Model.
         person: Whose face.
-        expressions: With which it is seen. They change its size, too: it would shrink by them if they did not count.
+        expressions: In the images. They change its size, too: it would shrink by them if they did not count.
         prior: What is known.
     """
     known = jnp.asarray(prior.offset_std) > 0

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 
 def rotation(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rotation matrix `Rz(roll) Ry(yaw) Rx(pitch)` of (roll, yaw, pitch) in radians (specification, section 2.1)."""
+    """Rotation matrix `Rz(roll) Ry(yaw) Rx(pitch)` of (roll, yaw, pitch) in radians."""
     (ca, cb, cc), (sa, sb, sc) = jnp.cos(angles), jnp.sin(angles)
     return jnp.stack(
         [
@@ -55,5 +55,5 @@ def turn(shape: Float[Array, "K 3"], R: Float[Array, "3 3"]) -> Float[Array, "K 
 
 
 def place(shape: Float[Array, "K 3"], pose: Float[Array, "6"]) -> Float[Array, "K 3"]:
-    """World points `R(pose) X + (x, y, z)` of model points, millimetres (specification, section 2.1)."""
+    """World points `R(pose) X + (x, y, z)` of model points, millimetres."""
     return turn(shape, rotation(pose[3:])) + pose[:3]

@@ -1,9 +1,9 @@
-"""Landmark positions recalculated from grey levels, near a prediction of the shape (specification, section 2.9).
+"""Landmark positions from grey levels, near a prediction of the shape (Oka and Sato 2006, equations 25-28).
 
 The energy that is minimised over the shape M, with windows of 16 x 16 pixels about the landmarks'
 images m = P(pose, M):
 
-    sum_windows rho |I_t(m) - I_{t-1}|^2 + |I_t(m) - I_1|^2  +  epsilon |M - M_estimated|^2        [P25]-[P28]
+    sum_windows rho |I_t(m) - I_{t-1}|^2 + |I_t(m) - I_1|^2  +  epsilon |M - M_estimated|^2
 
 A window depends on its own landmark only, so that the normal equations are 3 x 3 for each.
 """

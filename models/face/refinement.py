@@ -1,7 +1,7 @@
 """Pose and deformation that fit the aligned landmarks best, with an honest covariance.
 
 Each landmark is where the model puts it, moved by a small unknown amount in space (what registration got wrong, and
-deformations that no mode describes), seen with the error that its alignment reports. One landmark's pictures in all
+deformations that no mode describes), observed with the error that its alignment reports. One landmark's pictures in all
 cameras share that unknown, so they are weighed together. Heavy tails (Student's t by iterated reweighting) keep a
 hidden or mistaken landmark from pulling the head along.
 """
@@ -32,7 +32,7 @@ COMMON_BIAS_PX = 0.004
 """Standard deviation, pixels, of what all landmarks of one image are off alike: interpolation favours some phases of
 the grid, and the landmarks of two images share their phase of depth."""
 UNSEEN = 1e4
-"""Standard deviation, pixels, of a landmark that was not seen."""
+"""Standard deviation, pixels, of a landmark that was not visible."""
 
 
 class Refined(NamedTuple):
@@ -46,7 +46,7 @@ class Refined(NamedTuple):
     """Squared residual beyond what the alignment's error explains, mm^2 on each axis; may be negative."""
     trust: Float[Array, " K"]
     """Weight in the last iteration: about 1 for a landmark that fits, towards 0 for one that does not."""
-    misfit: Float[Array, ""]
+    residual_scale: Float[Array, ""]
     """Squared errors of the alignments over what they claim, as this frame has it; 1 in the mean if they are right."""
     misfit_share: Float[Array, ""]
     """How far this frame can tell, 0 to 1: the share of the alignments' errors in what residuals are expected."""
@@ -59,7 +59,7 @@ def refine(
     found: Alignment,
     slopes: Slopes,
     model: FaceModel,
-    looseness: Float[Array, "K 3 3"],
+    model_variance: Float[Array, "K 3 3"],
     rig: CameraRig,
     start: Float[Array, " n"],
     is_own: Bool[Array, "C K"] | None = None,
@@ -75,10 +75,10 @@ def refine(
         found: Landmarks in the images.
         slopes: How the skin around them is inclined.
         model: Shape and modes.
-        looseness: Covariance of each landmark about the model, model frame, mm^2.
+        model_variance: Covariance of each landmark about the model, model frame, mm^2.
         rig: Cameras.
         start: Where the iteration begins.
-        is_own: Landmarks whose covariances are those of alignments alone; all if none. Only these tell the misfit.
+        is_own: Landmarks whose covariances are those of alignments alone; all if none. Only these give the scale.
     """
     seen = found.seen & (found.score > LEAST_SCORE)
     precision = jnp.linalg.inv(prior.covariance)
@@ -86,7 +86,7 @@ def refine(
 
     def pieces(x):
         M = shape(model, x[6:])
-        residual, H, S, by_shape = _rows(x, M, found, slopes, seen, model, looseness, rig)
+        residual, H, S, by_shape = _rows(x, M, found, slopes, seen, model, model_variance, rig)
         distance = jnp.einsum("ki,ki->k", residual, _solve(S, residual))
         trust = (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + distance)
         return residual, H, S, by_shape, distance, trust
@@ -104,13 +104,13 @@ def refine(
     covariance = _covariance(precision, information, trust, per_landmark, SH, H)
     log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + _laplace(x - prior.mean, precision, information)
     own = jnp.where((seen if is_own is None else seen & is_own)[..., None, None], found.covariance, 0.0)
-    misfit, share = _misfit(own, residual, S, SH, trust, information)
+    residual_scale, share = _misfit(own, residual, S, SH, trust, information)
     return Refined(
         belief=Gaussian(x, covariance),
         log_evidence=log_evidence,
         excess=_excess(found, seen, residual, S, by_shape, x.size),
         trust=trust,
-        misfit=misfit,
+        residual_scale=residual_scale,
         misfit_share=share,
         num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
     )
@@ -165,21 +165,21 @@ def displaced(
     found: Alignment,
     slopes: Slopes,
     model: FaceModel,
-    looseness: Float[Array, "K 3 3"],
+    model_variance: Float[Array, "K 3 3"],
     rig: CameraRig,
 ) -> Float[Array, "K 3"]:
-    """Shape of which every landmark has moved from the model towards where it was found, as far as `looseness` allows.
+    """Shape of which every landmark has moved from the model towards where it was found, as `model_variance` allows.
 
     The posterior mean of each landmark's place in the model frame, millimetres, for a pose and mode coefficients `x`.
     """
     seen = found.seen & (found.score > LEAST_SCORE)
     M = shape(model, x[6:])
-    residual, _, S, by_shape = _rows(x, M, found, slopes, seen, model, looseness, rig)
+    residual, _, S, by_shape = _rows(x, M, found, slopes, seen, model, model_variance, rig)
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(len(M), -1, 3)
-    return M + jnp.einsum("kxy,kiy,ki->kx", looseness, stacked, _solve(S, residual))
+    return M + jnp.einsum("kxy,kiy,ki->kx", model_variance, stacked, _solve(S, residual))
 
 
-def _rows(x, M, found, slopes, seen, model, looseness, rig):
+def _rows(x, M, found, slopes, seen, model, model_variance, rig):
     """Residuals (K, 2C), their derivatives by the state, their covariances, and the derivative by the shape."""
     C, K = seen.shape
     uv, _ = project_shape(rig, M, x[:6])
@@ -191,7 +191,7 @@ def _rows(x, M, found, slopes, seen, model, looseness, rig):
     residual = jnp.where(seen[..., None], found.uv - uv, 0.0)
     noise = jnp.where(mask, found.covariance + PIXEL_FLOOR**2 * jnp.eye(2), UNSEEN**2 * jnp.eye(2))
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(K, 2 * C, 3)
-    S = jnp.einsum("kix,kxy,kjy->kij", stacked, looseness, stacked)
+    S = jnp.einsum("kix,kxy,kjy->kij", stacked, model_variance, stacked)
     inclined = jnp.moveaxis(jnp.where(mask, found.by_slope, 0.0), 1, 0).reshape(K, 2 * C, -1)
     S += jnp.einsum("kix,kxy,kjy->kij", inclined, slopes.covariance, inclined)
     for camera in range(C):
@@ -210,7 +210,7 @@ def _solve(S, b):
 
 
 def _log_t(distance, size, S, seen):
-    """Log density of Student's t over the seen rows; unseen rows have a constant share of the determinant."""
+    """Log density of Student's t over the observed rows; the others have a constant share of the determinant."""
     nu = DEGREES_OF_FREEDOM
     unseen_rows = 2.0 * jnp.sum(~seen, axis=0)
     log_det = jnp.linalg.slogdet(S)[1] - unseen_rows * 2 * math.log(UNSEEN)

@@ -1,8 +1,7 @@
 """People who may come back: each is a model of the face of its own, whose identity is known to within a little.
 
 The training set's people are not a Gaussian: whoever is among them is exactly one of them. A mixture of narrow
-components about those who are remembered and a wide one for strangers says so (the specification of Sugano 2007 names
-it among the improvements, section 6).
+components about those who are remembered and a wide one for unknown people says so.
 """
 
 from dataclasses import replace
@@ -62,7 +61,7 @@ def joined(*people: Remembered) -> Remembered:
 
 
 def hypotheses(face: MultilinearFace, people: Remembered) -> MultilinearFace:
-    """Models for a stranger and for each of the people, stacked: leaves (1 + P, ...), the stranger first."""
+    """Models for an unknown person, first, and for each of the people, stacked: leaves (1 + P, ...)."""
 
     def known(identity: Array, covariance: Array, offset: Array) -> MultilinearFace:
         return replace(face, mean=face.mean + offset, identity_mean=identity, identity_covariance=covariance)

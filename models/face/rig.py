@@ -72,7 +72,7 @@ class CameraRig:
 
 
 def nominal(baseline_mm: float = 120.0) -> CameraRig:
-    """Two parallel cameras of 800 px and 640 x 480 pixels (specification, section 4)."""
+    """Two parallel cameras of 800 px and 640 x 480 pixels."""
     camera = Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640))
     return CameraRig.from_cameras([camera] * 2, np.tile(np.eye(3), (2, 1, 1)), [(0, 0, 0), (-baseline_mm, 0, 0)])
 
@@ -95,7 +95,7 @@ def jacobian(
     """Derivatives of the pixels by their model points (px/mm) and by the pose (px/mm, px/rad).
 
     `d(u, v)/dX_c = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]`, times `R_c` for world points; times `R(pose)` for
-    model points (specification, section 2.9). NaN for points that are not in front.
+    model points. NaN for points that are not in front.
     """
     R = head.rotation(pose[3:])
     turned = head.turn(shape, R)

@@ -9,14 +9,14 @@ from jaxfilters.math import linalg
 
 @pytree_dataclass
 class FaceModel:
-    """K landmarks with B modes of deformation, seen by C cameras; B may be 0."""
+    """K landmarks with B modes of deformation, observed by C cameras; B may be 0."""
 
     mean: Float[Array, "K 3"]
     """Mean shape in the model frame, millimetres about the centroid of the registered landmarks."""
     basis: Float[Array, "3*K B"]
-    """Modes as orthonormal columns for shapes flattened landmark by landmark; zero columns are modes not yet learnt."""
+    """Modes as orthonormal columns for shapes flattened landmark by landmark; zero where not yet estimated."""
     deviation: Float[Array, " B"]
-    """Standard deviations mu of the mode coefficients, millimetres; 0 for modes not yet learnt."""
+    """Standard deviations mu of the mode coefficients, millimetres; 0 for modes not yet estimated."""
     templates: Float[Array, "C K T T"]
     """Grey levels around the landmarks at registration."""
 
@@ -27,10 +27,13 @@ class FaceModel:
 
 
 def rigid(mean: Float[Array, "K 3"], templates: Float[Array, "C K T T"], *, num_modes: int = 0) -> FaceModel:
-    """A face that does not deform, with room for modes to be learnt."""
+    """A face that does not deform, with room for modes to be estimated."""
     return FaceModel(mean, jnp.zeros((mean.size, num_modes), mean.dtype), jnp.zeros(num_modes, mean.dtype), templates)
 
 
 def shape(model: FaceModel, a: Float[Array, " B"]) -> Float[Array, "K 3"]:
-    """Landmarks in the model frame, millimetres: `mean + basis a` ([P14], [S3.1])."""
+    """Landmarks in the model frame, millimetres: `mean + basis a`.
+
+    Oka and Sato 2006, equation 14; Sugano 2007, equation 3.1.
+    """
     return model.mean + linalg.matmul(model.basis, a[:, None]).reshape(model.mean.shape)

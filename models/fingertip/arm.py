@@ -1,4 +1,4 @@
-"""Palm and forearm in the silhouette of one hand (section 2.1 of the specification of the fingertip tracker)."""
+"""Palm and forearm in the silhouette of one hand."""
 
 from typing import NamedTuple
 

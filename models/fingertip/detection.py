@@ -1,4 +1,4 @@
-"""Hands in a mask: palm, forearm, fingertips and where the fingers begin (section 2.1 of the specification)."""
+"""Hands in a mask: palm, forearm, fingertips and where the fingers begin."""
 
 import math
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ class _Silhouette(NamedTuple):
 
 
 def no_hand() -> HandObservation:
-    """The observation of a frame in which no hand is seen."""
+    """The observation of a frame in which no hand is visible."""
     numbers, no = np.zeros(MAX_TIPS, np.float32), np.zeros(MAX_TIPS, bool)
     points, vector = np.zeros((MAX_TIPS, 2), np.float32), np.zeros(2, np.float32)
     hand: Any = {  # numpy's arrays until a device needs them

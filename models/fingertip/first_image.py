@@ -1,4 +1,4 @@
-"""What is measured of a user in a first image that shows an open hand (sections 1.1 and 6 of the specification)."""
+"""What is measured of a user in a first image that shows an open hand."""
 
 import math
 
@@ -15,7 +15,7 @@ from jaxfilters.models.fingertip.segmentation import bright_mask, otsu_threshold
 LEAST_CONTRAST = 30
 """Grey values between a hand and a desk that a threshold can part."""
 LEAST_AREA, MOST_AREA = 0.03, 0.4
-"""Of the image, that a hand with its forearm covers (section 8.3 of the specification)."""
+"""Of the image, that a hand with its forearm covers."""
 WINDOW = 9.0 / 6.5
 """Tip radii from the middle to the side of the template's window."""
 FINGER_SHARE = 0.45
@@ -92,7 +92,7 @@ def fit_hand_to_mask(mask: np.ndarray, *, threshold: float = 128.0) -> HandParam
 
 
 def base_angles(hand: HandObservation) -> Float[np.ndarray, " tips"]:
-    """Angles of the bases about the palm from the arm's axis, radians, counter-clockwise as seen; 0 without a base."""
+    """Angles of the bases about the palm from the arm's axis, radians, counter-clockwise; 0 without a base."""
     x, y = (hand.bases - hand.palm).T
     ahead, left = x * hand.axis[0] + y * hand.axis[1], x * hand.axis[1] - y * hand.axis[0]
     return np.where(hand.has_base, np.arctan2(left, ahead), 0.0)

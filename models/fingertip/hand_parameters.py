@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class HandParameters:
-    """Of one user before one camera (sections 1.1 and 3 of the specification); pixels of the camera's image."""
+    """Of one user before one camera; pixels of the camera's image."""
 
     threshold: float = 128.0
     """Grey value between desk and skin, for images in which skin is brighter."""
@@ -16,13 +16,13 @@ class HandParameters:
     """From the middle to the side of the window that is compared with the template of a tip."""
     min_correlation: float = 0.35
     """Of a disc with the silhouette around a tip, from 0 to 1: what has more is looked at more closely, so that it may
-    be less than the 0.5 of the specification, for thin and for tapered fingers."""
+    be less than 0.5 for thin and for tapered fingers."""
     phi_thumb: float = math.radians(55.0)
     """Direction of the thumb's base from the palm, radians from the arm's axis to the side of the thumb."""
     phi_index: float = math.radians(15.0)
     """Likewise of the forefinger; less than `phi_thumb`."""
     handedness: int = 1
-    """1: in the image the thumb is counter-clockwise of the arm's axis, as of a right hand seen from its back; -1: it
+    """1: in the image the thumb is counter-clockwise of the arm's axis, as of a right hand viewed from its back; -1: it
     is clockwise, as of a left hand, or of the palm of a right one."""
 
     def __post_init__(self):

@@ -1,6 +1,9 @@
 """How a fingertip moves in the image, and what is known of it: a Kalman filter in units of the measurement noise.
 
-Section 2.2 of the specification of fingertips and gestures. State (x, y, vx, vy) in pixels and pixels a frame; every
+After K. Oka, Y. Sato, H. Koike, "Real-time fingertip tracking and gesture recognition", IEEE Computer Graphics and
+Applications 22(6), 2002, and a report of Oka and Sato of 2006, whose equations are cited.
+
+State (x, y, vx, vy) in pixels and pixels a frame; every
 covariance is divided by the variance of a measured coordinate, so that it has no unit but frames, a measurement has
 the identity as noise, and `q` is the variance of the drive by that of the measurement.
 """
@@ -18,20 +21,23 @@ from jaxfilters.math import linalg
 
 STATE = 4
 H = np.eye(2, STATE)
-"""[P6]: a measurement is the position."""
+"""Oka and Sato 2006, equation 6: a measurement is the position."""
 H_VELOCITY = np.eye(2, STATE, 2)
 """Of a measurement of the velocity."""
 
 
 class Motion(NamedTuple):
-    """One frame ahead: `x' = F x + G w`, w ~ N(0, sigma_w^2 I) [P2]."""
+    """One frame ahead: `x' = F x + G w`, w ~ N(0, sigma_w^2 I) (Oka and Sato 2006, equation 2)."""
 
     F: Float[Array, "4 4"]
     G: Float[Array, "4 2"]
 
 
 def velocity_driven(dt: float | Float[Array, ""] = 1.0) -> Motion:
-    """The paper's motion [P4, P5]: noise changes the velocity, and the position only through it."""
+    """The published motion: noise changes the velocity, and the position only through it.
+
+    Oka and Sato 2006, equations 4 and 5.
+    """
     return Motion(_constant_velocity(dt), jnp.asarray(np.eye(STATE, 2, -2), dtype=float))
 
 
@@ -64,41 +70,43 @@ def new_belief(
 
 
 def predict(motion: Motion, belief: Gaussian, q: float | Float[Array, ""]) -> Gaussian:
-    """Belief one frame later [P8, P9, the part outside the braces]; all there is to do in a frame without a match."""
+    """Belief one frame later (Oka and Sato 2006, equations 8 and 9); all there is to do in a frame without a match."""
     return arithmetic.joseph.predict(belief, motion.F, _drive(motion, q))
 
 
 def correct(
-    belief: Gaussian, position: Float[Array, "2"], seen: Bool[Array, ""] | None = None
+    belief: Gaussian, position: Float[Array, "2"], is_observed: Bool[Array, ""] | None = None
 ) -> tuple[Gaussian, KalmanInfo]:
-    """Belief after a measured position, and its diagnostics [P7, P8]; as it was where `seen` is False.
+    """Belief after a measured position, and its diagnostics; as it was where `is_observed` is False.
+
+    Oka and Sato 2006, equations 7 and 8.
 
     The covariance has Joseph's form, which stays symmetric. `nis` is in units of the measurement's variance.
     """
-    mask = None if seen is None else jnp.broadcast_to(seen, (2,))
+    mask = None if is_observed is None else jnp.broadcast_to(is_observed, (2,))
     return arithmetic.joseph.update(belief, position, jnp.asarray(H, dtype=float), jnp.eye(2), mask=mask)
 
 
 def correct_velocity(
-    belief: Gaussian, velocity: Float[Array, "2"], variance: float | Float[Array, ""], seen: Bool[Array, ""]
+    belief: Gaussian, velocity: Float[Array, "2"], variance: float | Float[Array, ""], is_observed: Bool[Array, ""]
 ) -> Gaussian:
-    """Belief after a hint at the velocity, as from the palm that carries the finger; as it was where `seen` is False.
+    """Belief after a hint at the velocity, as from the palm that carries the finger; as it was where there is none.
 
     Args:
         belief: In the state.
         velocity: Pixels a frame.
         variance: Of a coordinate of the hint, divided by that of a measured position.
-        seen: Whether there is a hint.
+        is_observed: Whether there is a hint.
     """
-    innovation = jnp.where(seen, velocity - belief.mean[2:], 0.0)
+    innovation = jnp.where(is_observed, velocity - belief.mean[2:], 0.0)
     found = arithmetic.joseph.condition(
         belief.covariance, jnp.asarray(H_VELOCITY, dtype=float), jnp.eye(2) * variance, innovation
     )
-    return Gaussian(belief.mean + found.shift, jnp.where(seen, found.covariance, belief.covariance))
+    return Gaussian(belief.mean + found.shift, jnp.where(is_observed, found.covariance, belief.covariance))
 
 
 def ahead(motion: Motion, belief: Gaussian, q: float | Float[Array, ""], frames: int) -> Gaussian:
-    """Belief several frames after a corrected one [P10, P11].
+    """Belief several frames after a corrected one (Oka and Sato 2006, equations 10 and 11).
 
     Raises:
         ValueError: If `frames` is not at least 1.

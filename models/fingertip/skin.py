@@ -1,4 +1,4 @@
-"""Hand masks from colour images: skin by its chroma, learnt from the first image of a user."""
+"""Hand masks from colour images: skin by its chroma, estimated from the first image of a user."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ SEED_CR, SEED_CB = (138, 180), (77, 124)
 LEAST_LUMA = 30
 """Darker pixels have no chroma that can be trusted."""
 MARGIN = 2
-"""Pixels on both sides of an outline that nothing is learnt from."""
+"""Pixels on both sides of an outline that are left out of the estimate."""
 SPREAD = 3.0
 """Standard deviation, levels of chroma, of the Gaussian over a histogram."""
 PRIOR_COUNT = 2e-6
-"""Density added to both histograms: a chroma that was never seen is as likely skin as not, and by the prior not."""
+"""Density added to both histograms: a chroma that was never observed is as likely skin as not, and by the prior not."""
 SKIN_PRIOR = 0.7
 REFINEMENTS = 2
 LEAST_AREA, MOST_AREA = 0.01, 0.5
-"""Of the image, that the hand covers while its colour is learnt."""
+"""Of the image, that the hand covers while its colour is estimated."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Whether a finger is the thumb: by the direction in which it leaves the palm, over all the frames of its track.
 
-Section 2.5 of the specification of fingertips and gestures. Angles are from the arm axis to the line from the palm
+After K. Oka, Y. Sato, H. Koike, IEEE Computer Graphics and Applications 22(6), 2002.
+
+Angles are from the arm axis to the line from the palm
 to the base of the finger, positive on the side of the thumb, in radians. `increment` and `score` are the paper's; the
 posterior of `ThumbBelief` knows that a hand's posture drifts, that a person holds the hand at an angle of their own,
 and that a hand has one thumb.
@@ -85,7 +87,9 @@ def base_angle(
 def increment(
     angle: Float[Array, "*b"], thumb: float | Float[Array, ""], index: float | Float[Array, ""]
 ) -> Float[Array, "*b"]:
-    """S'_T [P12]: 0 up to the angle of the forefinger, 1 from that of the thumb, a ramp in between.
+    """S'_T: 0 up to the angle of the forefinger, 1 from that of the thumb, a ramp in between.
+
+    Oka and Sato 2006, equation 12.
 
     Raises:
         ValueError: If both are Python numbers and `thumb` is not above `index`.
@@ -96,13 +100,13 @@ def increment(
 
 
 def score(increments: Float[Array, "n *b"]) -> Float[Array, "n *b"]:
-    """S_T after each frame [P13]: the mean of all increments so far."""
+    """S_T after each frame: the mean of all increments so far (Oka and Sato 2006, equation 13)."""
     frames = jnp.arange(1, len(increments) + 1).reshape(-1, *[1] * (increments.ndim - 1))
     return jnp.cumsum(increments, axis=0) / frames
 
 
 def usual(posture: Posture = POSTURE) -> ThumbAngles:
-    """Somebody of whom nothing was measured."""
+    """A person of whom nothing was measured."""
     thumb, index = jnp.asarray(posture.open_thumb, float), jnp.asarray(posture.open_forefinger, float)
     return ThumbAngles(thumb, index, jnp.zeros_like(thumb), jnp.asarray(posture.person_sd**2, float))
 
@@ -142,9 +146,9 @@ def unknown(angles: ThumbAngles, posture: Posture = POSTURE) -> ThumbBelief:
 
 
 def observe(
-    belief: ThumbBelief, angle: Float[Array, ""], seen: Bool[Array, ""], posture: Posture = POSTURE
+    belief: ThumbBelief, angle: Float[Array, ""], is_observed: Bool[Array, ""], posture: Posture = POSTURE
 ) -> ThumbBelief:
-    """What is known after one more frame; the drift goes on where no angle was `seen`.
+    """What is known after one more frame; the drift goes on where no angle `is_observed`.
 
     One Kalman filter for each thing that the finger may be, whose evidence tells which; their beliefs interact as the
     track may have become another finger (H. Blom, Y. Bar-Shalom, "The interacting multiple model algorithm", 1988).
@@ -159,14 +163,14 @@ def observe(
 
     def one(before: Gaussian, newly: Array, deviation: Array) -> tuple[Gaussian, Array]:
         predicted = _partly_new(before, newly, posture)
-        innovation = jnp.where(seen, deviation - jnp.sum(predicted.mean), 0.0)
+        innovation = jnp.where(is_observed, deviation - jnp.sum(predicted.mean), 0.0)
         found = arithmetic.joseph.condition(predicted.covariance, H, R, innovation[None])
-        covariance = jnp.where(seen, found.covariance, predicted.covariance)
+        covariance = jnp.where(is_observed, found.covariance, predicted.covariance)
         corrected = Gaussian(predicted.mean + found.shift, covariance)
         return arithmetic.joseph.predict(corrected, F, Q), found.log_density
 
-    following, evidence = jax.vmap(one)(belief.angle, jnp.where(seen, newly, 0.0), deviations)
-    return ThumbBelief(following, jnp.where(seen, log_odds + evidence[1] - evidence[0], belief.log_odds))
+    following, evidence = jax.vmap(one)(belief.angle, jnp.where(is_observed, newly, 0.0), deviations)
+    return ThumbBelief(following, jnp.where(is_observed, log_odds + evidence[1] - evidence[0], belief.log_odds))
 
 
 def probabilities(log_odds: Float[Array, " tracks"], there: Bool[Array, " tracks"]) -> Float[Array, " tracks"]:

@@ -1,4 +1,4 @@
-"""Ends of fingers in a silhouette, by correlation with a disc (section 2.1 of the specification of the tracker)."""
+"""Ends of fingers in a silhouette, by correlation with a disc."""
 
 from functools import lru_cache
 from typing import NamedTuple

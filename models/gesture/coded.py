@@ -48,7 +48,7 @@ def learn_codes(
         strokes: Codes (t,) from 1 to 17 and numbers of tips (t,) from 0 to 5; each of at least one frame.
         labels: The symbol of each.
         num_states: States of each left-right model.
-        pseudo_count: Times that training adds to those that each code, and number, was seen in a state.
+        pseudo_count: Times that training adds to those that each code, and number, was observed in a state.
         spread: Standard deviation of the blur of the trained directions, in sectors.
         max_iterations: Of Baum-Welch.
 
@@ -129,7 +129,7 @@ def codes_of(paths: Sequence[Float[np.ndarray, "_ 2"]]) -> list[Int[np.ndarray, 
 
 
 def voted(counts: Int[np.ndarray, " t"]) -> int:
-    """The number of tips that was seen most often, if any was seen; the least of several; 0 if none was."""
+    """The number of tips that was observed most often, if any was observed; the least of several; 0 if none was."""
     times = np.bincount(np.asarray(counts, int), minlength=1)
     return int(np.argmax(times[1:])) + 1 if times[1:].any() else 0
 

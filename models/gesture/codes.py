@@ -1,4 +1,4 @@
-"""A moving fingertip as one of 17 codes a frame (specification of fingertips and gestures, section 2.6)."""
+"""A moving fingertip as one of 17 codes a frame."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def direction_code(displacement: Float[Array, "... 2"], still: float | Float[Arr
 
 
 def blurred(codes: Codes, spread: float | Float[Array, ""] = 1.0) -> Codes:
-    """Emissions whose 16 directions are blurred around the circle; what is learnt of one writer then fits others.
+    """Emissions whose 16 directions are blurred around the circle; what is fitted to one writer then suits others.
 
     Args:
         codes: Of 17 symbols, direction 1 first and still last.
@@ -55,13 +55,13 @@ def blurred(codes: Codes, spread: float | Float[Array, ""] = 1.0) -> Codes:
 
 
 def displacements(tips: Float[Array, "t f 2"], present: Bool[Array, "t f"]) -> Float[Array, "t 2"]:
-    """How a hand moved since the frame before: the mean over the tips that were seen in both (section 2.6), pixels.
+    """How a hand moved since the frame before: the mean over the tips that were observed in both, pixels.
 
     Zero where there is none, as in the first frame. Their running sum is the path of the hand.
 
     Args:
-        tips: (x, y) of each finger in pixels; anything where it is not seen.
-        present: Whether each finger is seen.
+        tips: (x, y) of each finger in pixels; anything where it is not visible.
+        present: Whether each finger is visible.
     """
     both = (present[1:] & present[:-1])[..., None]
     moved = jnp.where(both, tips[1:], 0.0) - jnp.where(both, tips[:-1], 0.0)
@@ -75,8 +75,8 @@ def observed(
     """Direction code and number of fingertips of a hand in every frame; the first frame is still.
 
     Args:
-        tips: (x, y) of each finger in pixels; anything where it is not seen.
-        present: Whether each finger is seen, at most five at once.
+        tips: (x, y) of each finger in pixels; anything where it is not visible.
+        present: Whether each finger is visible, at most five at once.
         still: Length of a displacement below which there is no direction, in pixels a frame.
     """
     counts = jnp.sum(present, axis=1, dtype=jnp.int32)

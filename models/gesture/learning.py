@@ -1,4 +1,4 @@
-"""Symbols learnt from whatever strokes there are, and how well they are recognised of people who did not draw any."""
+"""Models of symbols fitted to strokes, and how well they recognise strokes of people outside of the training set."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ PATH_STATES, PATH_VARIANCE = 16, 0.15
 
 
 class LeftOut(NamedTuple):
-    """How strokes of one person were recognised by models that were learnt of the others."""
+    """How strokes of one person were recognised by models that were fitted to those of the others."""
 
     person: str
     right: int
@@ -96,7 +96,7 @@ def leave_one_out(
         strokes: In two dimensions or in three.
         labels: The symbol of each.
         people: Who drew each.
-        most: Examples of a symbol that are learnt from one person, drawn at random but always the same; `None` is all.
+        most: Examples of a symbol that are used of one person, drawn at random but always the same; `None` is all.
         left_out: Who is left out; `None` is everybody.
         num_states: As of `learn_strokes`.
         num_variants: As of `learn_strokes`.
@@ -129,7 +129,7 @@ def accuracy(found: Sequence[LeftOut]) -> float:
 
 
 def _shown(labels: np.ndarray, who: np.ndarray, person: str, most: int | None) -> np.ndarray:
-    """Indices of what is learnt where one person is left out."""
+    """Indices of the training set where one person is left out."""
     rng = np.random.default_rng(0)
     groups = [
         rng.permutation(np.flatnonzero((who == other) & (labels == label)))[:most]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxfilters.math.linalg import safe_norm
 
 NUM_POINTS = 40
-"""Of a resampled stroke, unless told otherwise."""
+"""Of a resampled stroke, by default."""
 Drawn = tuple[Sequence[Float[np.ndarray, "_ d"]], int | float]
 """A symbol: the pieces of its stroke, positions in time, and how many fingers drew it."""
 TURN_SCALE = 12.0

@@ -1,4 +1,4 @@
-"""Symbols told apart by hidden Markov models of what their strokes look like."""
+"""Symbols distinguished by hidden Markov models of what their strokes look like."""
 
 from collections.abc import Sequence
 from dataclasses import field
@@ -116,7 +116,7 @@ def trained(
 
 
 def extended(symbols: Symbols, others: Symbols) -> Symbols:
-    """Both sets of symbols in one, e.g. one more symbol that was learnt of a few strokes.
+    """Both sets of symbols in one, e.g. one more symbol that was fitted to a few strokes.
 
     Raises:
         ValueError: If a name is in both, or their models have different shapes.

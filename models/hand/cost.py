@@ -4,8 +4,8 @@ Source: Kajihara and Tanaka, equations [3], [4], [47], [48], and the union cost
 
 $$D_\cup = \frac{1}{|O \cup M|} \Big( \sum_{O \cap M} \min(|d - y|, c) + c\,|O \mathbin{\triangle} M| \Big)$$
 
-with $M$ the rendered and $O$ the observed hand pixels. Observed images are in metres; `inf` is background (seen, and
-not the hand), NaN no reading. A pixel without a reading belongs to neither set; a rendered pixel over background
+with $M$ the rendered and $O$ the observed hand pixels. Observed images are in metres; `inf` is background (measured,
+and not the hand), NaN no reading. A pixel without a reading belongs to neither set; a rendered pixel over background
 counts `c`.
 """
 

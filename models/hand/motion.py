@@ -57,7 +57,7 @@ def per_coordinate(position: float, rotation: float, angle: float) -> Float[Arra
 
 
 def paper_motion(frame_interval: float = 1 / 30) -> HandMotion:
-    """The noise of the specification, section 3, with undamped velocities: 2 mm, 0.016 rad and 2 degrees a frame."""
+    """The noise of the synthetic recordings, with undamped velocities: 2 mm, 0.016 rad and 2 degrees a frame."""
     return HandMotion(
         per_coordinate(0.002, 0.016, math.radians(2)) ** 2 / frame_interval,
         per_coordinate(0.02, 0.1, math.radians(12)) ** 2 / frame_interval,

@@ -45,7 +45,7 @@ class HandProportions(NamedTuple):
 
 
 class HandStills(NamedTuple):
-    """What is to be learnt of some depth images of one hand in different poses."""
+    """The parameters to estimate from some depth images of one hand in different poses."""
 
     proportions: HandProportions
     noise: Float[Array, ""]

@@ -45,7 +45,7 @@ class Sighting(NamedTuple):
     center: Float[Array, " 3"]
     """Middle of the palm, metres, camera frame."""
     forearm: Float[Array, " 3"]
-    """Unit vector from the palm to the forearm; zero where none was seen."""
+    """Unit vector from the palm to the forearm; zero where none was observed."""
 
 
 class Start(NamedTuple):

@@ -42,7 +42,7 @@ PARTS = (Part(0.31, 0.28, 0.38, 0.80, 3), Part(0.66, 0.20, 0.39, 0.98, 4), Part(
 """Legs, trunk with arms, head. One ellipsoid that touches soles, crown and arms cannot be found where bodies are:
 people are then taken for shorter and nearer than they are. These are the most likely ones, rounded, for the silhouettes
 of 600 bodies of `models.synthetic.walkers` (heights 1.72 +- 0.09 m, widths 0.26 +- 0.02 heights, walking or standing,
-turned anyhow, seen 3 to 75 degrees from above): 0.203 nats a pixel, where the best single ellipsoid has 0.224."""
+turned anyhow, viewed 3 to 75 degrees from above): 0.203 nats a pixel, where the best single ellipsoid has 0.224."""
 _BLOCK = 16
 """Factors multiplied before a logarithm: 16 factors of at most 1 / LEAST stay far from the ends of float32."""
 

@@ -43,7 +43,7 @@ def compare_capsules(
     """Depth terms of capsules in the camera frame against an observed image.
 
     Written for one pose and fast for many: `vmap` over the capsules renders pose after pose without a stack of images.
-    Derivatives in camera, capsules and `max_error` are those inside silhouettes (who is seen where is held fixed).
+    Derivatives in camera, capsules and `max_error` are those inside silhouettes (who is visible where is held fixed).
 
     Args:
         camera: of `observed`.

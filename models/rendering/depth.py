@@ -1,7 +1,7 @@
-"""Depth images: metres along z, `inf` where nothing is seen.
+"""Depth images: metres along z, `inf` where nothing is visible.
 
-Inside silhouettes they are differentiable in camera, shape and pose: which surface is seen where is found first and
-then held fixed, and the seen surface is evaluated again. Functions are compiled as a whole, outside `jit` too.
+Inside silhouettes they are differentiable in camera, shape and pose: which surface is visible where is found first and
+then held fixed, and the visible surface is evaluated again. Functions are compiled as a whole, outside `jit` too.
 """
 
 import jax
@@ -26,7 +26,7 @@ def render_capsules(
 ) -> Float[Array, "rows cols"]:
     """Depth of a union of capsules; without a transform they are in the camera frame already.
 
-    A sphere or cylinder that contains the camera is not seen. To compare many poses with one image,
+    A sphere or cylinder that contains the camera is not visible. To compare many poses with one image,
     `compare_capsules` is faster.
     """
     if T_camera_object is not None:
@@ -40,7 +40,7 @@ def render_ellipsoids(
 ) -> Float[Array, "rows cols"]:
     """Depth of a union of ellipsoids; without a transform they are in the camera frame already.
 
-    An ellipsoid that contains the camera is not seen.
+    An ellipsoid that contains the camera is not visible.
     """
     if T_camera_object is not None:
         ellipsoids = ellipsoids.moved(T_camera_object)
@@ -53,7 +53,7 @@ def render_convex_parts(
 ) -> Float[Array, "rows cols"]:
     """Depth of convex polyhedra, each moved by its own transform: rotation (k, 4), translation (k, 3).
 
-    A polyhedron that contains the camera is not seen.
+    A polyhedron that contains the camera is not visible.
     """
     return render_parts(convex_forms(camera, parts, T_camera_parts), CONVEX, camera.shape)
 
@@ -64,7 +64,7 @@ def render_mesh(
 ) -> Float[Array, "rows cols"]:
     """Depth of a triangle mesh; without a transform its vertices are in the camera frame already.
 
-    Open meshes are seen from both sides. Memory is in proportion to image and triangles.
+    Open meshes are visible from both sides. Memory is in proportion to image and triangles.
     """
     if T_camera_object is not None:
         mesh = mesh.moved(T_camera_object)

@@ -14,7 +14,7 @@ Turn = Callable[..., Array]
 
 
 def over_parts(parts: Parts, plan: Plan | None, shape: tuple[int, ...], turn: Turn, image: Array) -> Array:
-    """`image` after the turn of every part that can be seen; each in the whole image when there is no plan."""
+    """`image` after the turn of every part that is visible; each in the whole image when there is no plan."""
 
     def with_offsets(part, window, start, image):
         return turn(part, window, start, *_offsets(start, parts.anchor[part], window), image)

@@ -13,7 +13,7 @@ from jaxfilters.models.camera import Pinhole
 
 @pytree_dataclass
 class Parts:
-    """What the pixels need to know of k parts seen by one camera."""
+    """What the pixels need to know of k parts observed by one camera."""
 
     coefficients: Float[Array, "k c"]
     """As the kind of surface arranges them."""

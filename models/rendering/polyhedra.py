@@ -1,6 +1,6 @@
 """Convex polyhedra as inverse depth over the image plane.
 
-A face n . p <= b, seen along p = d / w with d_z = 1, bounds inverse depth by n . d / b, which is affine in the pixel:
+A face n . p <= b, viewed along p = d / w with d_z = 1, bounds inverse depth by n . d / b, which is affine in the pixel:
 from above when the face looks at the camera (b < 0), from below when it looks away. The surface is the least upper
 bound, and is hit when that exceeds every lower bound: no edges, no sorting.
 """

@@ -43,7 +43,7 @@ def plan_windows(box: Float[Array, "*poses k 4"], shape: Window, sides: tuple[Wi
     extent = jnp.minimum(jnp.floor(box[..., :1:-1]), last) - first_seen + 1
     held = jnp.stack([jnp.all(extent <= jnp.asarray(size, box.dtype), axis=-1) for size in sizes], axis=-1)
     smallest = jnp.where(jnp.any(held, axis=-1), jnp.argmax(held, axis=-1), len(sizes) - 1)
-    # Written so that bounds of NaN count as seen, and the whole image shows what becomes of them.
+    # Written so that bounds of NaN count as visible, and the whole image shows what becomes of them.
     rung = jnp.where(jnp.any(extent <= 0, axis=-1), -1, smallest)
     limit = jnp.asarray([(shape[0] - rows, shape[1] - columns) for rows, columns in sizes], jnp.int32)
     return Plan(

@@ -74,7 +74,7 @@ class ArticulatedSequence(NamedTuple):
 
 
 def paper_hand(features: FeatureSet = FULL) -> ArticulatedHand:
-    """The model of two fingers with the noise of the specification."""
+    """The model of two fingers with the noise of the synthetic sequences."""
     return articulated_hand(LAYOUT, features=features)
 
 
@@ -163,7 +163,7 @@ def simulate_paper(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES)
 
 
 def simulate_held(key: AnyKey, shape: int = 1, *, num_frames: int = 500, frame: int = 0) -> ArticulatedSequence:
-    """The same pose repeated: nothing new is learnt after the first frames; the start is that of `simulate_paper`.
+    """The same pose repeated: nothing new is in it after the first frames; the start is that of `simulate_paper`.
 
     Raises:
         ValueError: as `held_states`.
@@ -172,7 +172,7 @@ def simulate_held(key: AnyKey, shape: int = 1, *, num_frames: int = 500, frame: 
 
 
 def simulate_critical(key: AnyKey, *, num_frames: int = 2 * CRITICAL_FRAME + 1) -> ArticulatedSequence:
-    """The critical pose of figures 8 and 9, seen by axes, tips, outline and wrist; the start is nearly right.
+    """The critical pose of figures 8 and 9, observed as axes, tips, outline and wrist; the start is nearly right.
 
     Raises:
         ValueError: if `num_frames` < 1.

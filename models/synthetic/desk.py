@@ -64,7 +64,7 @@ class Rectangles:
 
 @dataclass(frozen=True)
 class InfraredDesk:
-    """Skin is warmer than the desk and whatever is projected on it (section 4.1 of the specification)."""
+    """Skin is warmer than the desk and whatever is projected on it."""
 
     shape: tuple[int, int]
     clutter: Rectangles

@@ -1,7 +1,7 @@
 """A hand that moves over a desk with things projected on it, rendered from above, with the truth about its fingers.
 
-The hand is a disc, a forearm and five fingers of constant width (section 4.1 of the specification of the fingertip
-tracker); lengths are pixels of an image with `LAYOUT_ROWS` rows and grow with the image. Finger 0 is the thumb.
+The hand is a disc, a forearm and five fingers of constant width; lengths are pixels of an image with `LAYOUT_ROWS` rows
+and grow with the image. Finger 0 is the thumb.
 """
 
 import math
@@ -47,7 +47,7 @@ class HandPose:
     lengths: Float[np.ndarray, "5"]
     """Of each finger, from 0 folded to about 1 stretched."""
     handedness: int = 1
-    """1: the thumb is counter-clockwise of the arm's axis, as of a right hand seen from its back; -1: the other way."""
+    """1: the thumb is counter-clockwise of the arm's axis, as of a right hand from its back; -1: the other way."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class Identity:
 
 @jax.jit
 def make_identity(key: AnyKey) -> Identity:
-    """A random person: twelve modes of shape, asymmetry, gains and curvatures (specification, section 4)."""
+    """A random person: twelve modes of shape, asymmetry, gains and curvatures."""
     modes, asymmetry, gains, curvatures = jax.random.split(key, 4)
     d = jax.random.normal(modes, (12,))
     x, y, z = jnp.asarray(MEAN_SHAPE, d.dtype).T
@@ -66,7 +66,7 @@ def make_identity(key: AnyKey) -> Identity:
 def face_shape(identity: Identity, e1: Float[ArrayLike, ""], e2: Float[ArrayLike, ""]) -> Float[Array, "10 3"]:
     """Landmarks of a person with an expression, millimetres about the centroid of the *neutral* face.
 
-    Section 4 of the specification, with a = g1 e1 and b = g2 e2.
+    The gains multiply the expressions: a = g1 e1 and b = g2 e2.
 
     Args:
         identity: Who.

@@ -75,7 +75,7 @@ def motion(
 def deformation_schedule(
     num_frames: int, amp: float = 1.8, *, start: int = 120, stop: int = 1200
 ) -> Float[np.ndarray, "frames 2"]:
-    """Expressions (e1, e2) of a face that is neutral until `start` and from `stop` on (specification, section 5.2).
+    """Expressions (e1, e2) of a face that is neutral until `start` and from `stop` on.
 
     With w the one-second ramps after `start` and before `stop` and s the time in seconds,
     `e1 = amp w 0.5 max(0, sin(2 pi .23 s)) sign(sin(2 pi .06 s) + .3)` and
@@ -105,7 +105,7 @@ def speech_schedule(num_frames: int, *, start: int = 60) -> Float[np.ndarray, "f
 
 
 def occlusion_schedule(num_frames: int, *, frames: tuple[int, int] = OCCLUSION_FRAMES) -> Bool[np.ndarray, " frames"]:
-    """Whether mouth and nostrils are covered: 30 frames (specification, section 5.1)."""
+    """Whether mouth and nostrils are covered: 30 frames."""
     frame = np.arange(num_frames)
     return (frame >= frames[0]) & (frame < frames[1])
 
@@ -113,7 +113,7 @@ def occlusion_schedule(num_frames: int, *, frames: tuple[int, int] = OCCLUSION_F
 def gain_schedule(
     num_frames: int, *, frames: tuple[int, int] = DIMMING_FRAMES, final: float = DIMMED
 ) -> Float[np.ndarray, " frames"]:
-    """Factor of the light: 1, then down in 40 frames to `final`, where it stays (specification, section 5.1)."""
+    """Factor of the light: 1, then down in 40 frames to `final`, where it stays."""
     share = np.clip((np.arange(num_frames) - frames[0]) / (frames[1] - frames[0]), 0, 1)
     return 1 + share * (final - 1)
 

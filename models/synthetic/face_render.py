@@ -1,4 +1,4 @@
-"""Pictures of faces of ten landmarks, seen by any number of cameras.
+"""Pictures of faces of ten landmarks, observed by any number of cameras.
 
 Specification of the stereo head tracker, section 4. The projection of a landmark is the centre of its patch exactly.
 """

@@ -110,14 +110,14 @@ def sequence(
     deform: bool = False,
     occlusion: bool = False,
 ) -> FaceSequence:
-    """A random person who moves: section 4 of the specification, disturbed as in section 5 if asked for.
+    """A random person who moves, with disturbances if asked for.
 
     Args:
         key: Of person, texture, backgrounds and noise.
         kind: `slow`, `fast` or `mix`.
         num_frames: How many.
         seed: Of the motion.
-        rig: Cameras; the two of the specification if none.
+        rig: Cameras; the two of `rig.nominal` if none.
         deform: Whether the face has the expressions of section 5.2.
         occlusion: Whether mouth and nostrils are covered for a while and the light goes down later (section 5.1).
 
@@ -148,7 +148,7 @@ def face_sequence(
     Args:
         key: Of person, texture, backgrounds and noise.
         poses: Of the head.
-        rig: Cameras; the two of the specification if none.
+        rig: Cameras; the two of `rig.nominal` if none.
         expressions: (e1, e2) of each frame; neutral if none.
         covered: Whether mouth and nostrils are behind a rectangle; never if none.
         gain: Factor of the light; 1 if none.

@@ -68,7 +68,7 @@ class FaceTexture:
 
 @pytree_dataclass
 class FaceScene:
-    """All that is seen besides shape and pose."""
+    """All that is visible besides shape and pose."""
 
     texture: FaceTexture
     background: Float[Array, "C rows cols"]
@@ -77,7 +77,7 @@ class FaceScene:
 
 @jax.jit
 def make_texture(key: AnyKey) -> FaceTexture:
-    """Random texture, alike on both sides of the face (specification, section 4).
+    """Random texture, alike on both sides of the face.
 
     The rms is taken over the square of three standard deviations of the window to all sides.
     """
@@ -96,7 +96,7 @@ def make_texture(key: AnyKey) -> FaceTexture:
 
 @partial(jax.jit, static_argnums=1)
 def make_background(key: AnyKey, shape: tuple[int, int]) -> Float[Array, "rows cols"]:
-    """Random waves about a mean grey level, not clipped (specification, section 4)."""
+    """Random waves about a mean grey level, not clipped."""
     lengths, orientations, phases = jax.random.split(key, 3)
     size = (NUM_BACKGROUND_WAVES,)
     low, high = BACKGROUND_WAVELENGTHS_PX

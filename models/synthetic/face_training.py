@@ -44,7 +44,7 @@ def people_of(key: AnyKey, num_people: int) -> Identity:
 
 @jax.jit
 def generator_shapes(key: AnyKey, people: Identity, noise_mm: float | Array = NOISE_MM) -> Float[Array, "S 10 10 3"]:
-    """The training faces of the specification, section 4: five levels of either expression, and noise.
+    """The training faces: five levels of either expression, and noise.
 
     Args:
         key: For the noise.

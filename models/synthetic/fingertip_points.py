@@ -1,6 +1,6 @@
 """Fingertips as a detector would report them, missed ones and false ones included, and thumbs' angles, without images.
 
-The point level of sections 4.1 and 4.3 of the specification of fingertips and gestures, for statistics of tracking.
+Points in place of images, for statistics of tracking.
 """
 
 import math

@@ -151,7 +151,7 @@ def simulate_sequence(
     camera: Pinhole | None = None,
     sensor: DepthSensor | None = None,
 ) -> HandSequence:
-    """A sequence of one of the `MOTIONS`, rendered from capsules and seen by a depth sensor.
+    """A sequence of one of the `MOTIONS`, rendered from capsules and observed by a depth sensor.
 
     Frame `i` is at time `(i + 1) * dt` seconds after the open palm at `START`. What is not given is the default of
     the kind, the average hand and a second Kinect.

@@ -1,4 +1,4 @@
-"""Pictures of modelled faces: a textured mesh with eyes, mouth and hair, lit from above, seen by C cameras."""
+"""Pictures of modelled faces: a textured mesh with eyes, mouth and hair, lit from above, observed by C cameras."""
 
 import jax
 import jax.numpy as jnp
@@ -121,7 +121,7 @@ def _seen_by(c, rig, world, faces, attributes, skin, background):
 
 
 def _winners(camera, vertices, faces):
-    """Which triangle is seen at each pixel, -1 for none."""
+    """Which triangle is visible at each pixel, -1 for none."""
     parts = mesh_parts(camera, Mesh(vertices, faces))
     plan = plan_windows(parts.box, camera.shape, COARSE)
     winner = winning_pieces(parts, plan, TRIANGLES, nearest_inverse(parts, plan, TRIANGLES, camera.shape))

@@ -40,7 +40,7 @@ class IctSequence:
     shapes: Float[np.ndarray, "frames 10 3"]
     """Landmarks in the model frame, millimetres about the centroid of the neutral face."""
     uv: Float[np.ndarray, "frames C 10 2"]
-    """Their pixels, whether they are seen or behind the nose."""
+    """Their pixels, whether they are visible or behind the nose."""
     uv68: Float[np.ndarray, "frames C 68 2"]
     """The same of all landmarks of iBUG."""
     gain: Float[np.ndarray, " frames"]
@@ -91,7 +91,7 @@ def ict_sequence(
         key: Of person, skin, backgrounds and noise.
         model: Of all people.
         poses: Of the head.
-        rig: Cameras; the two of the specification if none.
+        rig: Cameras; the two of `rig.nominal` if none.
         expressions: Strengths in the order of `model.names`; neutral if none.
         gain: Factor of the light; 1 if none.
     """

@@ -81,7 +81,7 @@ def room_camera(key: AnyKey, pinhole: Pinhole, T_camera_world: RigidTransform, f
 def room_image(
     key: AnyKey, camera: RoomCamera, people: Walker, clothes: Float[Array, "people 2 3"], here: Bool[Array, " people"]
 ) -> tuple[UInt8[Array, "rows cols 3"], Int[Array, "rows cols"]]:
-    """What the camera delivers, and who is seen at each pixel, -1 for nobody.
+    """What the camera delivers, and who is visible at each pixel, -1 for nobody.
 
     Args:
         key: Of the noise.

@@ -1,6 +1,6 @@
 """People who stand on a floor, with known truth: bodies of six ellipsoids, and the silhouettes that a camera gets.
 
-Source: section 4 of the specification of Kato, Nakazawa, Inokuchi, "Realtime human tracking using ellipsoid model",
+After the experiments of Kato, Nakazawa, Inokuchi, "Realtime human tracking using ellipsoid model",
 1999. The bodies are not the tracker's own ellipsoid, and the silhouettes have holes, stray pixels and a shadow.
 """
 
@@ -66,7 +66,7 @@ def sight(
     uv: Float[Array, "rows cols 2"] | None = None,
     furniture: Float[Array, "rows cols"] | None = None,
 ) -> Sight:
-    """A camera without lens distortion in an empty room, unless told otherwise."""
+    """A camera without lens distortion in an empty room, by default."""
     uv = pixel_grid(camera.shape) if uv is None else uv
     return Sight(camera, uv, jnp.full(camera.shape, jnp.inf) if furniture is None else furniture)
 
@@ -88,7 +88,7 @@ def silhouette(seen_by: Sight, body: Ellipsoid) -> Bool[Array, "rows cols"]:
 
 
 def shadow(seen_by: Sight, xy: Float[Array, " 2"]) -> Bool[Array, "rows cols"]:
-    """Pixels that see the shadow of somebody at a floor point."""
+    """Pixels that see the shadow of a person at a floor point."""
     floor, depth = seen_by.camera.floor_points(seen_by.uv)
     away = (floor - xy - jnp.array(SHADOW_OFFSET_M)) / jnp.array(SHADOW_SEMI_AXES_M)
     return (jnp.sum(away**2, axis=-1) <= 1) & (depth > 0) & (depth < seen_by.furniture)

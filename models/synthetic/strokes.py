@@ -1,6 +1,6 @@
 """Symbols that people draw on a desk with one finger or two, with known truth: twelve shapes, as tips are tracked.
 
-Source: section 4.4 of the specification of fingertips and gestures. Drawn in NumPy, and the same for the same seed
+Drawn in NumPy, and the same for the same seed
 everywhere. Image coordinates: x right, y down, pixels; 30 frames a second.
 """
 
@@ -25,7 +25,7 @@ ROUNDING_FRAMES = 1.2
 TREMOR_MEMORY, TREMOR_PX = 0.9, 0.35
 TIP_NOISE_PX = 1.0
 DROPPED, SPURIOUS, LOST = 0.04, 0.01, 0.005
-"""Shares of frames: in which one of two tips is not seen, in which there is one too many, and in which none is seen."""
+"""Shares of frames: one of two tips is not visible, there is one too many, none is visible."""
 SECOND_TIP_PX = (26.0, 6.0)
 """Of the second finger from the first."""
 _FRAMES = 64
@@ -57,9 +57,9 @@ class Drawings(NamedTuple):
     """What one writer drew: tips of fingers in the frames of every symbol, the n symbols last."""
 
     tips: Float[np.ndarray, "t 2 2 n"]
-    """Frame, finger, (x, y); zero where it is not seen."""
+    """Frame, finger, (x, y); zero where it is not visible."""
     present: Bool[np.ndarray, "t 2 n"]
-    """Whether each finger is seen; `False` after the last frame of a symbol."""
+    """Whether each finger is visible; `False` after the last frame of a symbol."""
     lengths: Int[np.ndarray, " n"]
     """Frames of each symbol."""
     labels: tuple[str, ...]
@@ -152,7 +152,7 @@ def _path(rng, corners, haste, turn):
 
 
 def _tips(rng, path, fingers):
-    """Tips (t, 2, 2) after a running mean over three frames, and whether each is seen (t, 2)."""
+    """Tips (t, 2, 2) after a running mean over three frames, and whether each is visible (t, 2)."""
     num_frames = len(path)
     tremor = np.zeros_like(path)
     for t in range(1, num_frames):

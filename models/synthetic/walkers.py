@@ -17,7 +17,7 @@ LEG_SWING, ARM_SWING = 0.42, 0.35
 HIP, SHOULDER = 0.53, 0.82
 """Heights of the joints, in body heights."""
 MODEL_HEIGHT_M, MODEL_WIDTH_M = 1.66, 0.42
-"""Of the body whose parts are given below (articulated as in section 4 of the specification of the people tracker)."""
+"""Of the body whose parts are given below."""
 
 
 @pytree_dataclass
@@ -97,7 +97,7 @@ def along_routes(
 ) -> Routes:
     """People who walk along polylines with rounded corners, each at a steady speed from some time on.
 
-    Before its start somebody stands at the first corner, afterwards at the last.
+    Before its start a person stands at the first corner, afterwards at the last.
 
     Args:
         waypoints: One (corners, 2) polyline a person, metres.

@@ -48,7 +48,7 @@ def test_adaptive_filters_beat_fixed_ones_and_two_stages_one(tmp_path, monkeypat
     face = {f"{q}_{n}" for q in ("error_pose", "error_deformation", "coverage_error") for n in adaptive.face_filters()}
     assert set(metrics) == pose | face
     value = {name: metric.value for name, metric in metrics.items()}
-    for name in ("adaptive", "learnt"):
+    for name in ("adaptive", "online"):
         assert value[f"error_rest_{name}"] < 0.85 * value["error_rest_fixed_large"]
         assert value[f"error_jerk_{name}"] < value["error_jerk_fixed_large"]
     assert value["worst_error_adaptive"] < 0.5 * value["worst_error_fixed_small"]

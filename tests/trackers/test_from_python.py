@@ -12,6 +12,7 @@ from jaxfilters.trackers.fingertips.images import estimate_user
 from jaxfilters.trackers.registry import SYSTEMS
 from jaxfilters.trackers.tracker import step_chunk, track_frames
 
+
 def test_every_system_can_be_run_from_python():
     for system in SYSTEMS:
         assert callable(import_module(system.package).track), system.name

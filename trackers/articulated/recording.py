@@ -17,7 +17,7 @@ from jaxfilters.trackers.io.recording import check_times
 NUM_KEYPOINTS = 21
 """Of one hand: wrist, thumb 1-4, index, middle, ring, little finger, base to tip."""
 LEAST_CONFIDENCE = 0.2
-"""Keypoints below it count as not seen; it is what OpenPose draws hands from."""
+"""Keypoints below it count as not visible; it is what OpenPose draws hands from."""
 NOISE_SHARE = 0.05
 """Noise of a keypoint's coordinate in one frame as a share of the hand's diagonal in the image, where nobody says
 better. Detectors look at a crop around the hand, so that their error grows with it. That of MediaPipe's network is
@@ -122,18 +122,18 @@ def from_keypoints(
     """Keypoints of a hand with five fingers as features: rows wrist, bases, joints.
 
     A keypoint of confidence c is off by `noise_px / min(c, 1)` in each coordinate (standard deviation), and was not
-    seen where c < `LEAST_CONFIDENCE` or one of its coordinates is NaN. The filter is told that times `persistence`.
+    observed where c < `LEAST_CONFIDENCE` or one of its coordinates is NaN. The filter gets that times `persistence`.
 
     Args:
         times_s: (frames,) seconds.
-        points: (frames, 21, 2) pixels, in the order of `NUM_KEYPOINTS`, NaN where nothing was seen.
+        points: (frames, 21, 2) pixels, in the order of `NUM_KEYPOINTS`, NaN where nothing was observed.
         name: For messages and reports.
         confidence: (frames, 21), 0 or more; 1 for all unless given.
         noise_px: Standard deviation of a coordinate in one frame at full confidence; `keypoint_noise` unless given.
         image_shape: Rows and columns of the camera's image.
 
     Raises:
-        InputError: wrong shapes, times, confidences or noise, or nothing was seen.
+        InputError: wrong shapes, times, confidences or noise, or nothing was observed.
     """
     expected = (len(times_s), NUM_KEYPOINTS)
     if points.shape != (*expected, 2):
@@ -172,7 +172,7 @@ def from_keypoints(
 def keypoint_noise(points: np.ndarray) -> float:
     """Pixels: `NOISE_SHARE` of the hand's diagonal, the median over the frames of points (frames, 21, 2), NaN missing.
 
-    Frames in which fewer than half of the keypoints were seen count only where there are no others.
+    Frames in which fewer than half of the keypoints were observed count only where there are no others.
     """
     seen = np.isfinite(points).all(axis=-1)
     counts = seen.sum(axis=-1)

@@ -1,4 +1,4 @@
-"""Where an articulated hand may be when it is seen for the first time: hypotheses from points in one image."""
+"""Where an articulated hand may be when it is observed for the first time: hypotheses from points in one image."""
 
 import math
 from functools import partial
@@ -52,7 +52,7 @@ class Starts(NamedTuple):
     costs: Float[Array, " h"]
     """Half the squared deviations of points, angles and limits."""
     found: Bool[Array, ""]
-    """Whether enough was seen: `FEWEST_POINTS` points."""
+    """Whether enough was observed: `FEWEST_POINTS` points."""
 
 
 def starts_from_points(
@@ -108,7 +108,7 @@ def _orientations(dtype: np.dtype) -> Float[Array, "k 4"]:
     x = jnp.eye(3, dtype=dtype)[0]
 
     def one(roll: Array, tilt: Array) -> Array:
-        # Tilted about the image's horizontal: fingers towards the camera whatever side of the hand is seen.
+        # Tilted about the image's horizontal: fingers towards the camera whatever side of the hand is visible.
         return quaternion_multiply(so3_exp(tilt * x), quaternion_multiply(upright, so3_exp(roll * x)))
 
     return jax.vmap(one)(jnp.asarray(rolls.ravel(), dtype), jnp.asarray(tilts.ravel(), dtype))

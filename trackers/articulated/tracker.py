@@ -91,7 +91,7 @@ class ArticulatedTrack(NamedTuple):
     """Share of the heaviest hypothesis."""
     num_hypotheses: Int[Array | np.ndarray, " b"]
     is_new_view: Bool[Array | np.ndarray, " b"]
-    """Whether lengths were learnt from this frame."""
+    """Whether lengths were estimated from this frame."""
     nis_per_row: Float[Array | np.ndarray, " b"]
     """Normalised innovation squared over the number of rows that count; about 1 where all is well."""
     least_distance: Float[Array | np.ndarray, " b"]
@@ -107,7 +107,7 @@ class TrackState(NamedTuple):
     time: Float[Array, ""]
     """Of the last frame, seconds."""
     misses: Array
-    """Frames in a row in which the hand was not seen; starts above `PATIENCE`."""
+    """Frames in a row in which the hand was not visible; starts above `PATIENCE`."""
     key: Array
 
 
@@ -246,7 +246,7 @@ def _scan(setup: _Setup, state: TrackState, frames: FeatureFrame, times: Array) 
 
 
 def _found_again(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) -> TrackState:
-    """The state with a new start where the hand has been missed for long and its keypoints are seen."""
+    """The state with a new start where the hand has been missed for long and its keypoints are visible."""
     if setup.start is not None:
         return state
     capacity = state.bank.log_weights.shape[0]
@@ -273,22 +273,22 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     bank, info = filter.update(filter.params, update_key, predicted, Look(frame.y, frame.mask, frame.std), elapsed)
     measured = jnp.any(frame.mask)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components)
-    told = report_of(best)
-    nis = told.kalman.nis / jnp.maximum(told.kalman.rank, 1)
+    reported = report_of(best)
+    nis = reported.kalman.nis / jnp.maximum(reported.kalman.rank, 1)
     # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
     rows = jnp.sum(frame.mask)
-    seen = measured & (nis < LOST_NIS) & (2 * told.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
+    seen = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
     bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
     searching = state.misses > PATIENCE
     misses = jnp.where(seen, 0, state.misses + 1).astype(jnp.int32)
     status = jnp.where(searching, SEARCHING, jnp.where(seen, TRACKING, LOST)).astype(jnp.int32)
     misses = jnp.where(searching, state.misses, misses)
-    track = _report(setup, bank, told, nis, jnp.where(measured, info.log_evidence, jnp.nan), status)
+    track = _report(setup, bank, reported, nis, jnp.where(measured, info.log_evidence, jnp.nan), status)
     return TrackState(bank, time, misses, key), track
 
 
 def _report(
-    setup: _Setup, bank: GaussianSumState, told: Report, nis: Array, log_evidence: Array, status: Array
+    setup: _Setup, bank: GaussianSumState, reported: Report, nis: Array, log_evidence: Array, status: Array
 ) -> ArticulatedTrack:
     belief = belief_of(map_component(bank))
     hand, q = setup.hand, belief.mean[setup.hand.layout.quaternion]
@@ -301,9 +301,9 @@ def _report(
         scale=jnp.sum(q * q),
         weight=jnp.exp(jnp.max(bank.log_weights)),
         num_hypotheses=jnp.sum(bank.log_weights > -jnp.inf, dtype=jnp.int32),
-        is_new_view=told.is_new_view & ~nothing,
+        is_new_view=reported.is_new_view & ~nothing,
         nis_per_row=jnp.where(nothing, jnp.nan, nis),
-        least_distance=jnp.where(nothing, jnp.nan, told.least_distance),
+        least_distance=jnp.where(nothing, jnp.nan, reported.least_distance),
         log_evidence=log_evidence,
         status=status,
     )

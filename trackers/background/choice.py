@@ -26,7 +26,7 @@ class Background(Protocol):
         """
 
     def state(self) -> dict[str, np.ndarray]:
-        """What was learnt, as arrays to save."""
+        """The background, as arrays to save."""
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from what `state` gave."""
@@ -57,7 +57,7 @@ class ReferenceBackground:
         """Nothing: the room is known."""
 
     def apply(self, image: np.ndarray, *, keep: np.ndarray | None = None) -> np.ndarray:  # noqa: ARG002
-        """As `Background.apply`; nothing is learnt."""
+        """As `Background.apply`; the background is not updated."""
         return self._difference.probability(image)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ SHADOW_PROBABILITY = 0.3
 """Of foreground, where the background looks darkened: less than even, since shadows are more frequent than clothes of
 just the colour of the floor."""
 SAMPLES = 25
-"""Images of which a background is made: enough that somebody may stand in each place in almost half of them."""
+"""Images of which a background is made: enough that a person may stand in each place in almost half of them."""
 DIFFERENCE = 30.0
 """Least difference from the background, of 255, at which foreground is as likely as not."""
 

@@ -19,13 +19,13 @@ from jaxfilters.trackers.background.median import (
 
 @runtime_checkable
 class Mixture(Protocol):
-    """One of OpenCV's models, with comparing and learning told apart."""
+    """One of OpenCV's models, with comparison apart from the update."""
 
     steps: int
-    """After which what was learnt before is forgotten."""
+    """After which earlier updates are forgotten."""
 
     def compare(self, image: np.ndarray) -> np.ndarray:
-        """(rows, cols) uint8: 0 background, 127 shadow, 255 foreground; nothing is learnt."""
+        """(rows, cols) uint8: 0 background, 127 shadow, 255 foreground; without an update."""
 
     def learn(self, image: np.ndarray, share: float) -> None:
         """Let the image be this share of the background."""
@@ -42,7 +42,7 @@ class Mog2:
     def __init__(self) -> None:
         """With 8 standard deviations: around people, compression changes more than OpenCV's 4.
 
-        What is seen for less than 30 percent of the time may be a person, in place of OpenCV's 10.
+        What is visible for less than 30 percent of the time may be a person, in place of OpenCV's 10.
         """
         self._model = cv2.createBackgroundSubtractorMOG2(varThreshold=64, detectShadows=True)
         self._model.setBackgroundRatio(0.7)
@@ -61,7 +61,7 @@ class Mog2:
 
 
 class Knn:
-    """The last 21 colours that were learnt, of which four must be near (Zivkovic & van der Heijden 2006)."""
+    """The last 21 colours, of which four must be near (Zivkovic & van der Heijden 2006)."""
 
     steps = 21
 
@@ -121,7 +121,7 @@ class MixtureBackground:
     def prime(self, images: Iterable[np.ndarray]) -> None:
         """Learn from up to `SAMPLES` of the images, evenly spread, but for what differs from their median.
 
-        A colour that is seen in every fifth image is background to these models, and people are seen as often.
+        A colour that is visible in every fifth image is background to these models, and people are observed as often.
         """
         median = MedianBackground(shadow_probability=1.0)
         found = evenly(images)
@@ -147,7 +147,7 @@ class MixtureBackground:
         return probability
 
     def state(self) -> dict[str, np.ndarray]:
-        """The likeliest background; the other colours of the mixture cannot be read and are learnt again."""
+        """The likeliest background; the other colours of the mixture cannot be read and are estimated again."""
         if not self._samples:
             return {}
         return {"background": self._model.image(), "counts": np.array([self._frames, self._samples])}
@@ -168,7 +168,7 @@ class MixtureBackground:
             raise ValueError(f"image must be uint8 {self._shape} like the background; got {image.dtype} {image.shape}.")
 
     def _settled(self, image: np.ndarray) -> np.ndarray:
-        """Of a camera that was not primed: nearer to one half the less was learnt."""
+        """Of a camera that was not primed: nearer to one half the fewer images there were."""
         if self._frames % self._sample_every == 0:
             self._samples += 1
             self._model.learn(image, 1 / self._samples)

@@ -1,4 +1,4 @@
-"""Which detected tip is which finger (sections 2.3 and 5.1 of the specification of fingertips and gestures)."""
+"""Which detected tip is which finger."""
 
 import jax
 import jax.numpy as jnp

@@ -58,7 +58,7 @@ def track(options: argparse.Namespace) -> str:
     try:
         user = _user(source, options.mask)
         if not user.has_open_hand:
-            warn(f"{source.name}: no open hand in the first images; thumbs are told by the usual angles")
+            warn(f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles")
         session = FingertipSession(
             angles_of(user),
             handedness=user.parameters.handedness,
@@ -101,7 +101,7 @@ def recogniser_of(file: SymbolsFile) -> Recogniser:
 def _symbols(path: str) -> SymbolsFile:
     file = default_symbols() if path == "default" else read_symbols(path)
     if file.dimensions == 3:
-        raise InputError(f"--gestures: {path} is of strokes in space; fingertips are seen in a plane.")
+        raise InputError(f"--gestures: {path} is of strokes in space; fingertips move in a plane.")
     return file
 
 
@@ -118,14 +118,14 @@ def _follow(
 ) -> Followed:
     pictures, video = FingertipPictures(), None
     names, counts, errors, ends = Counter[str](), list[int](), list[float](), list[float]()
-    interrupted, failure, told = False, None, 0
+    interrupted, failure, reported = False, None, 0
     total = getattr(source, "frames", 0) or None
     try:
         with ProgressLine("tracking", total) as line:
             for time_s, image in _images(source, options.seconds):
                 found = session.process(hands_in(image, user, options.hands), np.array([time_s]))
                 report = HandReport(*(field[0] for field in found))
-                events, told = session.events[told:], len(session.events)
+                events, reported = session.events[reported:], len(session.events)
                 files.append(len(counts), time_s, report, events)
                 if options.video:
                     picture = pictures.drawn(shown(image), len(counts), time_s, report, events)
@@ -146,8 +146,8 @@ def _follow(
     if video is not None:
         video.check()
     session.finish()
-    if session.events[told:]:
-        files.append(len(counts), 0.0, _NOTHING, session.events[told:])
+    if session.events[reported:]:
+        files.append(len(counts), 0.0, _NOTHING, session.events[reported:])
     rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else math.nan
     return Followed(len(counts), rate, names, counts, errors, interrupted, failure)
 

@@ -14,11 +14,11 @@ from jaxfilters.trackers.fingertips.state import NEVER, FingertipConfig, HandRep
 from jaxfilters.trackers.fingertips.tracker import MODERN
 
 _FAR, _IMPOSSIBLE = 1e3, 1e4
-"""Squared gates: a hand that was seen takes the nearest component, one that was not what is left."""
+"""Squared gates: a hand that was observed takes the nearest component, one that was not what is left."""
 
 
 def start_hands(config: FingertipConfig, angles: ThumbAngles, num_hands: int, *, method: Method = MODERN) -> HandState:
-    """Hands of which nothing was seen yet, hands first."""
+    """Hands of which nothing was observed yet, hands first."""
     return repeated(tracker.start(config, angles, method=method), num_hands)
 
 
@@ -28,8 +28,8 @@ def component_of(
     """Which component of the image each hand is: by the least sum of squared distances from where the palms go.
 
     Two hands that touch are one component; it is the hand that is nearer, and the other one coasts. Hands that cross
-    are told apart by their ways. Of two that appear together, the one with the thumb counter-clockwise is to the
-    right: the right hand of somebody who is seen from above, with crossed arms excluded.
+    are distinguished by their ways. Of two that appear together, the one with the thumb counter-clockwise is to the
+    right: the right hand of a person who is viewed from above, with crossed arms excluded.
 
     Args:
         config: Constants.

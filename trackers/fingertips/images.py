@@ -21,7 +21,7 @@ from jaxfilters.trackers.fingertips.state import HandReport
 OPEN_HAND_IMAGES = 60
 """Images in which an open hand is looked for before a recording is followed."""
 USUAL_TIP_RADIUS = 13.0
-"""Pixels of an image with 480 rows, of somebody who showed no open hand."""
+"""Pixels of an image with 480 rows, of a person who showed no open hand."""
 Segment = Callable[[np.ndarray], np.ndarray]
 """`image -> mask` (rows, cols) bool."""
 
@@ -32,7 +32,7 @@ class User(NamedTuple):
     parameters: HandParameters
     segment: Segment
     has_open_hand: bool
-    """Whether an open hand was seen; otherwise the parameters are the usual ones."""
+    """Whether an open hand was observed; otherwise the parameters are the usual ones."""
 
 
 def track(
@@ -99,7 +99,7 @@ def estimate_user(images: Sequence[np.ndarray], mask: str) -> User:
             return user
         usual_user = usual_user or user
     if usual_user is None:
-        raise ValueError(f"no image in which a hand can be told from the desk; of the last one: {why}")
+        raise ValueError(f"no image in which a hand differs from the desk; of the last one: {why}")
     return usual_user
 
 

@@ -1,4 +1,4 @@
-"""Where images of hands over a desk come from, and what is learnt of the user before they are followed."""
+"""Where images of hands over a desk come from."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -101,7 +101,7 @@ def open_hands(place: str | None, mask: str, *, fps: float | None, seed: int) ->
     """
     if place is None:
         if mask != "infrared":
-            raise InputError(f"--mask {mask}: of no use without a video; the synthetic hand is seen in infrared.")
+            raise InputError(f"--mask {mask}: of no use without a video; the synthetic hand is an infrared image.")
         return DemoHand(seed)
     if mask == "depth":
         if place.isdecimal():

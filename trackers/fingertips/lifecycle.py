@@ -59,7 +59,7 @@ def anywhere(
 def away_from_others(
     config: FingertipConfig, tracks: Tracks, positions: Float[Array, "slots 2"], observed: HandObservation
 ) -> Bool[Array, " tips"]:
-    """What lies on a fingertip that has a track is that one, seen twice."""
+    """What lies on a fingertip that has a track is that one, detected twice."""
     apart = jnp.sum(jnp.square(observed.tips[:, None] - positions), axis=-1)
     taken = jnp.any((apart < config.apart**2) & (tracks.mode == CONFIRMED), axis=1)
     return observed.is_tip & ~taken

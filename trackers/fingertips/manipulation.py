@@ -52,7 +52,7 @@ class Handling(NamedTuple):
 
     is_pinching: bool = False
     unseen: int = 0
-    """Frames since thumb and forefinger were both seen."""
+    """Frames since thumb and forefinger were both observed."""
     partner: int = -1
     """Identity of the forefinger."""
     activities: dict[str, Activity] = {}  # noqa: RUF012 - never changed in place
@@ -96,7 +96,7 @@ class _Grip(NamedTuple):
     middle: np.ndarray
     gap: float
     angle: float
-    """Of the line from the thumb to the forefinger, counter-clockwise as seen, radians."""
+    """Of the line from the thumb to the forefinger, counter-clockwise in the image, radians."""
     partner: int
 
 

@@ -18,7 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--mask",
         choices=("infrared", "depth", "colour"),
         default="infrared",
-        help="how hands are told from the desk: they are the brightest (infrared, or a dark desk; default), they lie "
+        help="how hands differ from the desk: they are the brightest (infrared, or a dark desk; default), they lie "
         "above it (depth: 16-bit PNGs with camera.json, or .npz), or they have the colour of skin",
     )
     parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="how many at most (default: %(default)s)")

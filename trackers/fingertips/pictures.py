@@ -40,7 +40,7 @@ class FingertipPictures:
         modes = ", ".join(MODE_NAMES[int(mode)] for mode in report.mode)
         caption(picture, f"{time_s:.1f} s  {modes}", 0)
         self._events.extend((frame, in_words(event)) for event in events)
-        for line, (_, text) in enumerate([told for told in self._events if frame - told[0] < EVENT_FRAMES], 1):
+        for line, (_, text) in enumerate([told for reported in self._events if frame - reported[0] < EVENT_FRAMES], 1):
             caption(picture, text, line)
         return picture
 
@@ -66,8 +66,8 @@ def in_words(event: Event) -> str:
     numbers = {name: value for name, value in event.quantities.items() if isinstance(value, float)}
     if event.name == SYMBOL:
         return f"symbol: {event.quantities['label'] or 'unknown'}"
-    told = ", ".join(f"{name.rsplit('_', 1)[0]} {value:.4g}" for name, value in numbers.items())
-    return f"{event.name} {event.phase}s" + (f": {told}" if told else "")
+    reported = ", ".join(f"{name.rsplit('_', 1)[0]} {value:.4g}" for name, value in numbers.items())
+    return f"{event.name} {event.phase}s" + (f": {reported}" if reported else "")
 
 
 def _draw_palm(picture: np.ndarray, report: HandReport, hand: int) -> None:

@@ -47,12 +47,12 @@ class FingertipSession:
         recogniser: Recogniser | None = None,
         method: Method = MODERN,
     ):
-        """Hands of which nothing was seen yet.
+        """Hands of which nothing was observed yet.
 
         Args:
             angles: Of the person's open hand.
-            handedness: 1 if the thumb of the first hand is counter-clockwise of its arm as seen, else -1; the second
-                hand is the other one.
+            handedness: 1 if the thumb of the first hand is counter-clockwise of its arm in the image, else -1; the
+                second hand is the other one.
             num_hands: At most.
             height: Of the images, pixels.
             fps: Frames a second.

@@ -1,4 +1,4 @@
-"""What the fingertip tracker is told, what it remembers of a hand from frame to frame, and what it says of each tip."""
+"""The options of the fingertip tracker, its state between two frames, and its report of each tip."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -27,7 +27,7 @@ NEVER = 10**6
 class FingertipConfig:
     """Constants of the tracker; Python values that are read when it is compiled. Pixels are those of a 640x480 image.
 
-    The defaults are for the modern method; `tracker.PUBLISHED_CONFIG` has the specification's.
+    The defaults are for the modern method; `tracker.PUBLISHED_CONFIG` has the published ones.
 
     Raises:
         ValueError: naming the field, what was expected and what came.
@@ -42,16 +42,16 @@ class FingertipConfig:
     drive_sd: float = 3.0
     """Of the change of a velocity in a frame of 1/30 s, pixels a frame (sigma_w)."""
     max_speed: float = 60.0
-    """Of a finger that was seen once, pixels a frame."""
+    """Of a finger that was observed once, pixels a frame."""
     lost: float = 75.0
-    """Uncertainty U of a prediction from which on a finger is gone (theta): after six misses while the palm is seen; of
-    predictions without the palm, 300 is after four."""
+    """Uncertainty U of a prediction from which on a finger is gone (theta): after six misses while the palm is visible;
+    of predictions without the palm, 300 is after four."""
     min_hits: int = 3
     """Detections in a row that make a fingertip."""
     gate: float = 40.0
     """Farthest from its prediction that a fingertip is looked for, pixels."""
     tentative_gate: float = 80.0
-    """The same of what was seen once or twice."""
+    """The same of what was observed once or twice."""
     surprise: float = 13.8
     """Squared distance in standard deviations from which on a detection is not that finger's: chi-square, 99.9 %."""
     apart: float = 16.0
@@ -65,7 +65,7 @@ class FingertipConfig:
     empty_frames: int = 15
     """Frames without a tip after which the hand is forgotten."""
     axis_frames: int = 10
-    """Frames for which the arm's last axis stands in for one that cannot be seen."""
+    """Frames for which the arm's last axis stands in for one that is not visible."""
     posture: Posture = POSTURE
 
     def __post_init__(self) -> None:
@@ -115,13 +115,13 @@ class HandState(NamedTuple):
 
     tracks: Tracks
     palm: Float[Array, "2"]
-    """Where it was seen last, pixels."""
+    """Where it was observed last, pixels."""
     palm_velocity: Float[Array, "2"]
-    """Between the last two frames in which it was seen, pixels a frame."""
+    """Between the last two frames in which it was observed, pixels a frame."""
     unseen: Int32[Array, ""]
-    """Frames since it was seen."""
+    """Frames since it was observed."""
     axis: Float[Array, "2"]
-    """Of the forearm, when it was seen last."""
+    """Of the forearm, when it was observed last."""
     axis_unseen: Int32[Array, ""]
     """Frames since then."""
     empty: Int32[Array, ""]
@@ -149,10 +149,10 @@ class HandReport(NamedTuple):
     thumb_probability: Float[Array, " slots"]
     palm: Float[Array, "2"]
     has_palm: Bool[Array, ""]
-    """Whether it was seen in this frame."""
+    """Whether it was observed in this frame."""
     axis: Float[Array, "2"]
     has_axis: Bool[Array, ""]
-    """Whether it was seen, now or a few frames ago; without it nothing new is learnt about the thumb."""
+    """Whether it was observed, now or a few frames ago; without it the estimate of the thumb does not change."""
     mode: Int32[Array, ""]
     """Place in `MODE_NAMES`."""
     num_tips: Int32[Array, ""]
@@ -164,7 +164,8 @@ class ThumbTest(NamedTuple):
     start: Callable[..., Any]
     """`(config, angles) -> memory` of a track that begins."""
     observe: Callable[..., Any]
-    """`(config, angles, memory, angle, seen) -> memory` with the angle of one more frame, where it was `seen`."""
+    """`(config, angles, memory, angle, observed) -> memory` with the angle of one more frame, where it was
+    `observed`."""
     judge: Callable[..., tuple[Array, Array]]
     """`(memories, was_thumb, there) -> (probability, is_thumb)` over the fingers of a hand that are `there`."""
 

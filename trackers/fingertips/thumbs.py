@@ -58,6 +58,6 @@ def _by_posterior(
 
 
 MEAN_SCORE = ThumbTest(_no_score, _scored, _by_score)
-"""[P12, P13]: the mean of all increments since the track began, a thumb from 0.5 on."""
+"""Oka and Sato 2006, equations 12 and 13: the mean of all increments since the track began, a thumb from 0.5 on."""
 POSTERIOR = ThumbTest(_unknown, _observed, _by_posterior)
 """Section 5.4: class models with a drift of their own, forgetting, one thumb a hand, hysteresis."""

@@ -34,11 +34,11 @@ from jaxfilters.trackers.fingertips.thumbs import MEAN_SCORE, POSTERIOR
 MODERN = Method(lifecycle.carried, likeliest, lifecycle.away_from_others, lifecycle.filtered, POSTERIOR)
 PUBLISHED = Method(lifecycle.no_hint, nearest_in_order, lifecycle.anywhere, lifecycle.detected, MEAN_SCORE)
 PUBLISHED_CONFIG = FingertipConfig(lost=300.0)
-"""The numbers of the specification's section 3."""
+"""The published constants."""
 
 
 def start(config: FingertipConfig, angles: ThumbAngles, *, method: Method = MODERN) -> HandState:
-    """A hand of which nothing was seen yet."""
+    """A hand of which nothing was observed yet."""
     never = jnp.asarray(NEVER, jnp.int32)
     return HandState(
         no_tracks(config, method.thumb.start(config, angles)),
@@ -121,7 +121,9 @@ def run(
 
 
 def predicted(config: FingertipConfig, state: HandState, frames: int = 1) -> Gaussian:
-    """Belief in every slot so many frames after the last one seen [P10, P11]; covariances by that of a measurement.
+    """Belief in every slot so many frames after the last observed one; covariances by that of a measurement.
+
+    Oka and Sato 2006, equations 10 and 11.
 
     Raises:
         ValueError: If `frames` is not at least 1.
@@ -162,7 +164,7 @@ def _usable(observed: HandObservation) -> HandObservation:
 
 
 def _placed(config: FingertipConfig, state: HandState, observed: HandObservation) -> HandState:
-    """With palm and axis of this frame, or the last ones that were seen."""
+    """With palm and axis of this frame, or the last ones that were observed."""
     follows = observed.is_hand & (state.unseen == 0)
     return state._replace(
         palm_velocity=jnp.where(follows, observed.palm - state.palm, 0.0),

@@ -138,7 +138,7 @@ class TrackState(NamedTuple):
     time: Float[Array, ""]
     """Of the last frame, seconds."""
     misses: Array
-    """Frames in a row in which the hand was not seen."""
+    """Frames in a row in which the hand was not visible."""
     key: Array
 
 

@@ -1,4 +1,4 @@
-"""People on a floor, seen by cameras that stand still: where everybody is, in metres."""
+"""People on a floor, observed by cameras that stand still: where everybody is, in metres."""
 
 import lazy_loader
 

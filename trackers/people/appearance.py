@@ -18,7 +18,7 @@ LEAST_PIXELS = 12.0
 def appearances(
     scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
 ) -> tuple[Float[Array, "slots 48"], Bool[Array, " slots"]]:
-    """Histograms of everybody, and whose are worth something; of the first camera that sees enough of somebody."""
+    """Histograms of everybody, and whose are worth something; of the first camera that sees enough of a person."""
     histograms, good = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)
     for camera, depth, frame in zip(scene.cameras, scene.furniture, frames, strict=True):
         found, enough = _in_camera(scene, camera, depth, frame, places, active)

@@ -47,7 +47,7 @@ def _draw_one(image, center, shape, color, identity):
 
 
 def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
-    """The floor from above, X to the right and Y up, with cameras and ways; a dot where somebody was last.
+    """The floor from above, X to the right and Y up, with cameras and ways; a dot where a person was last.
 
     Raises:
         OutputError: it cannot be written.

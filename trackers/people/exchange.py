@@ -1,4 +1,4 @@
-"""Identities that were exchanged while two people were close: told by what they wear, once they are apart again."""
+"""Identities that were exchanged while two people were close, put right by what they wear once they are apart."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -16,11 +16,11 @@ LONGEST_S = 4.0
 
 
 def is_meeting(meetings: Meetings) -> Bool[Array, " slots"]:
-    """Who may be somebody else, so that nothing should be learnt of their clothes."""
+    """Who may be another person, so that the model of their clothes should not be updated."""
     return jnp.any(meetings.is_open, axis=1)
 
 
-def after_meetings(
+def identity_switch_correction(
     people: People,
     histograms: Float[Array, "slots 48"],
     good: Bool[Array, " slots"],

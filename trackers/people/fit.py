@@ -21,7 +21,7 @@ from jaxfilters.trackers.people.silhouettes import (
 from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleScene
 
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
-"""How far from the prediction somebody is searched for, along each axis."""
+"""How far from the prediction a person is searched for, along each axis."""
 HEIGHT_STEP_M = 0.03
 """First step of the search for the height."""
 CURVATURE_PX = 1.85
@@ -33,7 +33,7 @@ STEP_SHARES = (2.0, 1.0, 1.0, 0.9)
 PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
-"""Inverse square metres: below it a direction counts as not seen at all."""
+"""Inverse square metres: below it a direction counts as not observed at all."""
 PASSES = 2
 NEAR_M = 1.5
 """Two who are nearer may be one."""
@@ -59,7 +59,7 @@ class Fit(NamedTuple):
     share_seen: Float[Array, " slots"]
     flatness: Float[Array, " slots"]
     surplus: Float[Array, " slots"]
-    """Mean log likelihood ratio a pixel that somebody explains which the nearest senior could not explain alone, in
+    """Mean log likelihood ratio a pixel that a person explains which the nearest senior could not explain alone, in
     the best place for that; `inf` without a senior near by."""
 
 
@@ -75,7 +75,7 @@ def fit_people(
     Args:
         scene: Cameras, furniture, floor.
         predicted: Beliefs of all slots.
-        active: Which of them hold somebody.
+        active: Which of them hold a person.
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
     """
@@ -231,7 +231,7 @@ def _reach(predicted, axes):
 def _nearest_first(scene, views, places, active) -> Int32[Array, " slots"]:
     """By the distance from the nearest camera that sees each: who is in front hides others, and is searched for first.
 
-    Whoever no camera sees comes after all who are seen.
+    Whoever no camera sees comes after all who are visible.
     """
     distance = jnp.linalg.norm(places[:, None, :2] - scene.centers(), axis=-1)
     seen = jnp.any(views.visible > 0, axis=-1)

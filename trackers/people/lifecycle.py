@@ -7,9 +7,9 @@ from jaxtyping import Array, Bool, Float
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.scene import walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity
+from jaxfilters.trackers.people.births import Birth
 from jaxfilters.trackers.people.exchange import is_meeting
 from jaxfilters.trackers.people.fit import Fit
-from jaxfilters.trackers.people.newcomers import Newcomer
 from jaxfilters.trackers.people.state import (
     DORMANT,
     FREE,
@@ -24,17 +24,17 @@ from jaxfilters.trackers.people.state import (
 
 MOST_LOG_ODDS = 8.0
 HIDDEN_SHARE = 0.2
-"""Below this share of the silhouette there is nothing to see of somebody."""
+"""Below this share of the silhouette there is nothing to see of a person."""
 HIDDEN_COST = 0.5
-"""Log odds per second lost by a person of whom nothing is to be seen: people can be hidden, but not for ever."""
+"""Log odds per second lost by a person of whom nothing is visible: people can be hidden, but not for ever."""
 LEAST_SURPLUS = 0.5
 """Mean log likelihood ratio a pixel that two people explain beyond what one of them explains alone."""
 SUPERFLUOUS_COST = 2.0
-"""Log odds per second lost by somebody who explains less than that."""
+"""Log odds per second lost by a person who explains less than that."""
 LOST_SD_M = 1.2
 """A place known no better than this is no place."""
 LIKENESS = 0.3
-"""Dissimilarity up to which somebody who comes is somebody who left."""
+"""Dissimilarity up to which a person who comes is a person who left."""
 WALKING_M_PER_S = 2.0
 LEARNING_RATE = 0.1
 """Share of a new appearance in the remembered one."""
@@ -47,7 +47,7 @@ def judged(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], l
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
-    # Somebody whom one other person explains as well is hidden behind that person, or nobody.
+    # A person whom one other person explains as well is hidden behind that person, or nobody.
     superfluous = fit.surplus < LEAST_SURPLUS
     cost = jnp.where(people.mode == TRACKED, SUPERFLUOUS_COST * dt, LEAST_SURPLUS - fit.surplus)
     change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
@@ -80,7 +80,7 @@ def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[
 
 
 def named(people: People) -> People:
-    """Identities for the confirmed: that of somebody who left, where place and clothes agree, or a new one."""
+    """Identities for the confirmed: that of a person who left, where place and clothes agree, or a new one."""
 
     def one(k, people):
         reach = 1.0 + WALKING_M_PER_S * people.unseen_s
@@ -102,8 +102,8 @@ def named(people: People) -> People:
     return people._replace(identity=jnp.where(people.mode == FREE, -1, people.identity))
 
 
-def admitted(config: PeopleConfig, people: People, found: Newcomer) -> People:
-    """The newcomer in a free slot; without one, nobody comes in."""
+def admitted(config: PeopleConfig, people: People, found: Birth) -> People:
+    """With the birth in a free slot; without a free one, nobody is added."""
     free = people.mode == FREE
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
     n = len(free)

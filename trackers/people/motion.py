@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from jaxfilters.trackers.people.state import HEIGHT, STATE, WIDTH, PeopleConfig
 
 HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
-"""Metres per root second: posture; arms, stride and which side is seen."""
+"""Metres per root second: posture; arms, stride and which side is visible."""
 
 
 def motion(config: PeopleConfig, dt: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:

@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--background",
         choices=("median", "mog2", "knn"),
         default="median",
-        help="how people are told from the room (default: %(default)s)",
+        help="background subtraction (default: %(default)s)",
     )
     parser.add_argument(
         "--capacity", type=positive_integer, metavar="N", help="people at a time, at most (default: 32)"

@@ -29,7 +29,7 @@ class Sighting(NamedTuple):
     slot: int
     """Where the tracker kept this person: another one after a change of identities."""
     mode: str
-    """`tentative`, `tracked`, `hidden` (nothing to be seen) or `no_depth` (not measurable along the line of sight)."""
+    """`tentative`, `tracked`, `hidden` (occluded) or `no_depth` (not measurable along the line of sight)."""
 
 
 MODES = ("tentative", "tracked", "hidden", "no_depth")
@@ -53,7 +53,7 @@ class Recorder:
                 continue
             seen = _sighting(frame, time_s, slot, people, report)
             if mode == TENTATIVE:
-                # A slot that was given up and taken again within one frame holds somebody else.
+                # A slot that was given up and taken again within one frame holds another person.
                 if people.log_odds[slot] == 0:
                     self.unconfirmed.pop(slot, None)
                 self.unconfirmed.setdefault(slot, []).append(seen)
@@ -115,18 +115,18 @@ def _sighting(frame, time_s, slot, people, report) -> Sighting:
     )
 
 
-def spreads(centers: np.ndarray, seen: Sighting) -> tuple[float, float]:
+def spreads(centers: np.ndarray, sighting: Sighting) -> tuple[float, float]:
     """Standard deviations along and across the line of sight of the nearest camera, metres.
 
     Args:
         centers: (cameras, 2) where the cameras are above the floor, metres.
-        seen: Of whom.
+        sighting: Of whom.
     """
-    away = seen.mean[:2] - centers[np.argmin(np.sum((seen.mean[:2] - centers) ** 2, axis=1))]
+    away = sighting.mean[:2] - centers[np.argmin(np.sum((sighting.mean[:2] - centers) ** 2, axis=1))]
     distance = np.linalg.norm(away)
     x, y = away / distance if distance > 0.1 else np.array([0.0, 1.0])
     axes = np.array([[x, y], [y, -x]])
-    radial, lateral = np.einsum("ai,ij,aj->a", axes, seen.covariance[:2, :2], axes)
+    radial, lateral = np.einsum("ai,ij,aj->a", axes, sighting.covariance[:2, :2], axes)
     return float(np.sqrt(max(radial, 0.0))), float(np.sqrt(max(lateral, 0.0)))
 
 

@@ -1,4 +1,4 @@
-"""What each camera says of somebody at a place: a window of the image, less what others explain."""
+"""What each camera says of a person at a place: a window of the image, less what others explain."""
 
 from typing import NamedTuple
 
@@ -30,13 +30,13 @@ class View(NamedTuple):
     depth: Float[Array, " samples"]
     """Of furniture, metres."""
     visible: Float[Array, " samples"]
-    """1 where the person would be seen in the image and before the furniture, else 0."""
+    """1 where the person would be visible in the image and before the furniture, else 0."""
     area: Float[Array, ""]
     """Of the predicted outline, square pixels."""
 
 
 def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
-    """X, Y, height and width of what a state looks like: somebody who walks is lower than the same one at rest."""
+    """X, Y, height and width of what a state looks like: a person who walks is lower than the same one at rest."""
     return mean[..., jnp.array(PLACE)].at[..., 2].multiply(stature(mean))
 
 
@@ -79,7 +79,7 @@ def view_of(
     axes: Float[Array, "4 4"],
     reach: Float[Array, " 2"],
 ) -> View:
-    """The window in which somebody is searched for: as far as `reach` along the first two `axes`, and a margin."""
+    """The window in which a person is searched for: as far as `reach` along the first two `axes`, and a margin."""
     corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
     bodies = jax.vmap(body_of)(place + corners @ axes)
     seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
@@ -103,7 +103,7 @@ def views_of(
     axes: Float[Array, "4 4"],
     reach: Float[Array, " 2"],
 ) -> View:
-    """The windows of somebody in all cameras, one row a camera."""
+    """The windows of a person in all cameras, one row a camera."""
     views = [
         view_of(scene.config, camera, furniture, frame, place, axes, reach)
         for camera, furniture, frame in zip(scene.cameras, scene.furniture, frames, strict=True)
@@ -136,14 +136,14 @@ def unexplained_of(
 
 
 def contrasts_of(views: View, unexplained: Float[Array, "cameras samples"]) -> Float[Array, "cameras samples"]:
-    """What candidates are compared with in each camera; 0 where the person would not be seen."""
+    """What candidates are compared with in each camera; 0 where the person would not be visible."""
     return contrast(views.foreground, unexplained) * views.visible
 
 
 def log_likelihood(
     scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
 ) -> Float[Array, ""]:
-    """Log likelihood of somebody at a place over that of nobody, over all cameras, as of independent looks."""
+    """Log likelihood of a person at a place over that of nobody, over all cameras, as of independent looks."""
 
     def in_camera(P, view, b):
         ratio = log_likelihood_ratio(presence_of(scene.config, P, place, view.window.uv), b)

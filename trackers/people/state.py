@@ -1,4 +1,4 @@
-"""What the people tracker is told, what it remembers from frame to frame, and what it says of each."""
+"""The scene and the options of the people tracker, its state from frame to frame, and its report."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from jaxfilters.models.floor_camera import FloorCamera
 
 FREE, TENTATIVE, TRACKED, DORMANT = range(4)
 MODE_NAMES = ("free", "tentative", "tracked", "dormant")
-"""Slots: unused; somebody who may be a mistake; somebody; somebody who was lost sight of and may come back."""
+"""Slots: unused; a person who may be a mistake; a person; a person who was lost sight of and may come back."""
 APPEARANCE = 48
 """Numbers that describe clothes: histograms of eight bins of three colours, of the upper and the lower half."""
 STATE = 6
@@ -44,7 +44,7 @@ class PeopleConfig:
     acceleration_sd: float = 0.5
     """Metres per second squared per root second: how walking varies."""
     speed_sd: float = 1.0
-    """Metres per second, of somebody new, along each axis."""
+    """Metres per second, of a new person, along each axis."""
     independent_patches: float = 40.0
     """How many independent looks one silhouette is worth, whatever its size in pixels."""
     silhouette_sd_m: float = 0.05
@@ -55,17 +55,17 @@ class PeopleConfig:
     grid: tuple[int, int] = (32, 16)
     """Samples of a person's window, rows and columns."""
     cell_m: float = 0.3
-    """Between floor points at which newcomers are looked for."""
-    newcomer_evidence: float = 0.5
-    """Mean log likelihood ratio a pixel from which on unexplained foreground is a newcomer."""
+    """Between floor points at which births are looked for."""
+    birth_evidence: float = 0.5
+    """Mean log likelihood ratio a pixel from which on unexplained foreground is a new person."""
     confirmed: float = 4.0
-    """Log odds of being somebody, to count as tracked."""
+    """Log odds of being a person, to count as tracked."""
     dropped: float = -1.0
     """Log odds below which a slot is given up."""
     memory_s: float = 5.0
-    """How long somebody who was lost is remembered."""
+    """How long a person who was lost is remembered."""
     hidden_s: float = 3.0
-    """How long somebody who is hidden is believed to be there."""
+    """How long a person who is hidden is believed to be there."""
 
     def __post_init__(self) -> None:
         for name in [
@@ -105,7 +105,7 @@ class PeopleScene:
 
 
 class Cells(NamedTuple):
-    """Floor points at which newcomers are looked for, and the pixels to look at for each camera."""
+    """Floor points at which births are looked for, and the pixels to look at for each camera."""
 
     xy: Float[Array, "cells 2"]
     """Metres."""
@@ -131,13 +131,13 @@ class CameraFrame(NamedTuple):
 
 
 class Meetings(NamedTuple):
-    """Pairs of slots that were close and have not been told apart since; symmetric matrices."""
+    """Pairs of slots that were close and have not been distinguished since; symmetric matrices."""
 
     is_open: Bool[Array, "slots slots"]
     evidence: Float[Array, "slots slots"]
     """For an exchange; positive says that identities changed hands."""
     clear_s: Float[Array, "slots slots"]
-    """Seconds during which both were seen well."""
+    """Seconds during which both were observed well."""
 
 
 def no_meetings(slots: int) -> Meetings:
@@ -155,7 +155,7 @@ class People(NamedTuple):
     identity: Int32[Array, " slots"]
     """-1 where there is none yet."""
     log_odds: Float[Array, " slots"]
-    """Of being somebody."""
+    """Of being a person."""
     unseen_s: Float[Array, " slots"]
     """Seconds since there was anything to see."""
     appearance: Float[Array, "slots 48"]
@@ -181,7 +181,8 @@ class Report(NamedTuple):
     share_seen: Float[Array, " slots"]
     """Of the silhouette, in an image, not behind furniture, and not shared with anybody before or behind."""
     flatness: Float[Array, " slots"]
-    """How much the score drops 0.3 m nearer or farther along the line of sight: small where depth cannot be seen."""
+    """How much the score drops 0.3 m nearer or farther along the line of sight: small where depth cannot be
+    measured."""
     has_depth: Bool[Array, " slots"]
     """False where the distance from the camera cannot be measured, as with head and feet hidden (section 4, E2)."""
     nis: Float[Array, " slots"]

@@ -15,10 +15,10 @@ from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.appearance import appearances
-from jaxfilters.trackers.people.exchange import after_meetings
+from jaxfilters.trackers.people.births import birth, cells_of, padded
+from jaxfilters.trackers.people.exchange import identity_switch_correction
 from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.newcomers import cells_of, newcomer, padded
 from jaxfilters.trackers.people.silhouettes import body_of, place_of, stature
 from jaxfilters.trackers.people.state import (
     HEIGHT,
@@ -43,7 +43,7 @@ pair of a desk that hides the feet and a border that hides the head gives as muc
 CLEAR = 0.5
 """Share of the silhouette from which on clothes are looked at."""
 WHOLE = 0.9
-"""Share of the silhouette from which on somebody's height is measured."""
+"""Share of the silhouette from which on a person's height is measured."""
 
 
 def people_scene(
@@ -93,7 +93,7 @@ def start(scene: PeopleScene) -> People:
 def step(
     scene: PeopleScene, people: People, frames: tuple[CameraFrame, ...], dt: Float[ArrayLike, ""]
 ) -> tuple[People, Report]:
-    """One time further: everybody predicted, searched for together, corrected, and newcomers let in.
+    """One time further: everybody predicted, searched for together, corrected, and new people added.
 
     Args:
         scene: What is known of the place.
@@ -114,9 +114,9 @@ def step(
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
-    people = after_meetings(people, histograms, good, dt)
+    people = identity_switch_correction(people, histograms, good, dt)
     people = lifecycle.named(lifecycle.remembered(people, histograms, good))
-    people = lifecycle.admitted(scene.config, people, newcomer(scene, places, active, frames))
+    people = lifecycle.admitted(scene.config, people, birth(scene, places, active, frames))
     return people, _report(scene, people, fit, nis)
 
 

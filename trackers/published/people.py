@@ -27,7 +27,7 @@ HEIGHT_M, WIDTH_M = 1.65, 0.40
 PROFILE_M, CURVATURE_STEP_M = 0.3, 0.1
 """Along the line of sight, for the flatness; in both directions, for the curvature."""
 LEAST_CURVATURE = 0.1
-"""Inverse square metres of the score: below it a direction counts as hardly seen."""
+"""Inverse square metres of the score: below it a direction counts as hardly observed."""
 
 
 class PaperState(NamedTuple):
@@ -63,7 +63,7 @@ def paper_start(config: PaperConfig) -> PaperState:
 def with_person(
     state: PaperState, xy: ArrayLike | Sequence, *, height_m: float = HEIGHT_M, width_m: float = WIDTH_M
 ) -> PaperState:
-    """Somebody new, as from another sensor, in the first free slot; in mode `ACQUIRE`.
+    """A new person, as from another sensor, in the first free slot; in mode `ACQUIRE`.
 
     Raises:
         ValueError: a position that is not two finite numbers, a size that is not positive, or no free slot.
@@ -138,7 +138,7 @@ def paper_step(scene: PaperScene, state: PaperState, mask: Bool[Array, "rows col
 
 
 class Profile(NamedTuple):
-    """How well the score says where somebody is, one row a slot; meaningless for those who are not searched for."""
+    """How well the score says where a person is, one row a slot; meaningless for those who are not searched for."""
 
     flatness: Float[Array, " slots"]
     """How much the score drops 0.3 m nearer or farther along the line of sight (section 4, E2)."""

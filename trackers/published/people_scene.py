@@ -1,4 +1,4 @@
-"""What the paper's tracker is told, and what the paper leaves open: occlusion, who is in view, which pixels count.
+"""The scene of the published tracker, and what the paper leaves open: occlusion, who is in view, which pixels count.
 
 Section numbers are those of Kato, Nakazawa, Inokuchi, "Realtime human tracking using ellipsoid model", 1999.
 """
@@ -28,7 +28,7 @@ from jaxfilters.models.person.scene import patch_depth, patch_floor_distance
 from jaxfilters.models.person.score import RING
 
 STEP_HALVING = (0.05, 0.05, 0.025, 0.025, 0.0125, 0.0125)
-"""Steps in metres that end finer than the paper's (section 5 of the specification, improvement 3)."""
+"""Steps in metres that end finer than the paper's."""
 
 
 class Occlusion(NamedTuple):
@@ -113,15 +113,15 @@ class PaperConfig:
     ring_px: int = RING
     """Pixels around a silhouette that count against it."""
     acquired: float = 0.7
-    """Binary score above which somebody counts as found."""
+    """Binary score above which a person counts as found."""
     lost: float = 0.3
-    """Score below which somebody is not seen."""
+    """Score below which a person is not visible."""
     lost_frames: int = 10
-    """Frames in turn, after which somebody who is not seen is lost."""
+    """Frames in turn, after which a person who is not visible is lost."""
     occlusion: Occlusion = FLOOR_AXIS
     """What hides people: `FLOOR_AXIS` or `PER_PIXEL`."""
     in_view: Callable[[FloorCamera, Ellipsoid], Array] = endpoints_in_view
-    """Who can be seen: `endpoints_in_view` or `box_in_view`."""
+    """Who is visible: `endpoints_in_view` or `box_in_view`."""
     region: Callable[[FloorCamera, Ellipsoid, int], Array] = whole_image
     """Which pixels count in the score of nine candidates: `whole_image` or `around_candidates`."""
     turns: Callable[[Array, int, Array], tuple[Array, Array]] = passes_outside

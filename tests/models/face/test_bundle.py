@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, all_residuals, box, projected
 from jaxfilters.models.face.multilinear import learn
-from jaxfilters.models.face.past import of_measurements
 from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, parameters, posed_shape
 from jaxfilters.models.face.rig import monocular
+from jaxfilters.models.face.square_root_prior import of_measurements
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
 pytestmark = pytest.mark.system

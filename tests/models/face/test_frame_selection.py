@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Views, all_residuals, projected
-from jaxfilters.models.face.frame_selection import by_angles, by_information, told
+from jaxfilters.models.face.frame_selection import by_angles, by_information, frame_information
 from jaxfilters.models.face.multilinear import expression_basis, learn, shape
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import monocular
@@ -108,7 +108,7 @@ def held(face):
 @pytest.mark.system
 def test_what_a_frame_tells_is_the_schur_complement(x64, scene):
     face, rig, view, frame = scene
-    found = told(face, rig, view, frame, Prior(1.0, 0.8))
+    found = frame_information(face, rig, view, frame, Prior(1.0, 0.8))
     J, _ = whole_jacobian(scene, 0.8)
     N = J.T @ J + np.pad(held(face), (0, 40))
     own, cross = N[:11, :11], N[:11, 11:]
@@ -118,7 +118,7 @@ def test_what_a_frame_tells_is_the_schur_complement(x64, scene):
 @pytest.mark.system
 def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, scene):
     face, rig, view, frame = scene
-    found = told(face, rig, view, frame, Prior(1.0, 0.8))
+    found = frame_information(face, rig, view, frame, Prior(1.0, 0.8))
     J, units = whole_jacobian(scene, 0.8)
     own = J[:, :11].T @ J[:, :11] + held(face)
     expected = -units[:11, None] * np.linalg.solve(own, J[:, :11].T @ J[:, 11:])
@@ -129,7 +129,7 @@ def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, sc
 def test_hidden_landmarks_tell_less(x64, scene):
     face, rig, view, frame = scene
     some = view._replace(seen=view.seen.at[0, :4].set(False))
-    more, less = (told(face, rig, v, frame, Prior(1.0, 1.0)).information for v in (view, some))
+    more, less = (frame_information(face, rig, v, frame, Prior(1.0, 1.0)).information for v in (view, some))
     assert np.linalg.eigvalsh(np.asarray(more - less)).min() > -1e-8
     assert np.trace(more) > np.trace(less)
 
@@ -171,7 +171,7 @@ def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scen
     at = frame._replace(
         poses=frame.poses + POSE_UNITS * own[:6], expressions=frame.expressions + face.expression_std * own[6:]
     )
-    found = told(face, rig, noisy, at, prior)
+    found = frame_information(face, rig, noisy, at, prior)
     h = 1e-4
     for i in (0, 3, 9, 11, 25, 39):
         along = h * np.eye(40)[i]

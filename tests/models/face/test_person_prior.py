@@ -33,7 +33,7 @@ def rig():
     return monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
 
 
-def stranger(seed):
+def unknown(seed):
     """A person of the model with an offset, in five frames."""
     rng = np.random.default_rng(seed)
     normal = lambda covariance, *n: rng.normal(size=(*n, len(covariance))) @ np.linalg.cholesky(covariance).T
@@ -58,7 +58,7 @@ def test_strangers_are_not_taken_for_smaller_than_they_are(x64):
     """
     errors = []
     for seed in range(NUM_PEOPLE):
-        true, noise = stranger(seed)
+        true, noise = unknown(seed)
         covariance = 0.25 * jnp.tile(jnp.eye(2), (NUM, 10, 1, 1))
         views = Views(projected(face(), rig(), true) + noise, covariance, jnp.ones((NUM, 10), bool))
         start = true._replace(person=Person(face().identity_mean, jnp.zeros((10, 3))))

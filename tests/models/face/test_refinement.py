@@ -49,7 +49,7 @@ class Face:
         self.model = FaceModel(
             jnp.asarray(MEAN_SHAPE), jnp.asarray(basis), jnp.array([3.0, 2.0]), jnp.zeros((2, 10, 16, 16))
         )
-        self.looseness = jnp.tile(LOOSE_STD**2 * jnp.eye(3), (10, 1, 1))
+        self.model_variance = jnp.tile(LOOSE_STD**2 * jnp.eye(3), (10, 1, 1))
         self.slopes = Slopes(jnp.zeros((10, 2)), jnp.tile(SLOPE_STD**2 * jnp.eye(2), (10, 1, 1)))
         self.by_slope = jnp.asarray(rng.normal(0, 0.3, (2, 10, 2, 2)))
         self.prior = Gaussian(jnp.asarray([*POSE, 0.0, 0.0]), jnp.diag(jnp.asarray(PRIOR_STD**2)))
@@ -68,7 +68,7 @@ class Face:
 
     def refine(self, found, prior=None):
         prior = self.prior if prior is None else prior
-        return refine(prior, found, self.slopes, self.model, self.looseness, self.rig, prior.mean)
+        return refine(prior, found, self.slopes, self.model, self.model_variance, self.rig, prior.mean)
 
     def project(self, x, moved=0.0):
         return projected(self.rig, self.model, jnp.asarray(x), jnp.asarray(moved))
@@ -197,23 +197,23 @@ def test_covariances_are_true_over_many_draws(face):
     def one(key):
         x, uv = face.draw(key)
         found = module.refine(
-            face.prior, face.found(uv), face.slopes, face.model, face.looseness, face.rig, face.prior.mean
+            face.prior, face.found(uv), face.slopes, face.model, face.model_variance, face.rig, face.prior.mean
         )
         error = found.belief.mean - x
         square = error @ jnp.linalg.solve(found.belief.covariance, error)
-        return error, square, jnp.diagonal(found.belief.covariance), found.misfit, found.excess
+        return error, square, jnp.diagonal(found.belief.covariance), found.residual_scale, found.excess
 
     # One by one: batches of factorisations can stand still on two cores.
     keys = jax.random.split(jax.random.key(4), 2000)
-    error, square, variance, misfit, excess = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
+    error, square, variance, residual_scale, excess = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
     # Standard error of the mean: sqrt(16 / 2000) = 0.09.
     assert 7 < square.mean() < 11
     assert np.all(np.abs(error.mean(axis=0)) < 4 * error.std(axis=0) / np.sqrt(2000) + 0.01 * error.std(axis=0))
     np.testing.assert_allclose(error.std(axis=0), np.sqrt(variance.mean(axis=0)), rtol=0.15)
     within = (np.abs(error) < 2 * np.sqrt(variance)).mean(axis=0)
     assert np.all((within > 0.89) & (within < 0.985))
-    assert np.asarray(misfit).mean() == pytest.approx(1, abs=0.1)
-    # Excess is the looseness, and what unknown slopes add to it.
+    assert np.asarray(residual_scale).mean() == pytest.approx(1, abs=0.1)
+    # Excess is the model_variance, and what unknown slopes add to it.
     assert 0.7 * LOOSE_STD**2 < np.asarray(excess).mean() < 2 * LOOSE_STD**2
 
 
@@ -234,31 +234,31 @@ def test_covariances_are_true_under_the_noise_of_student(face):
             face.found(still + root[:, None] * (uv - still)),
             face.slopes,
             face.model,
-            face.looseness,
+            face.model_variance,
             face.rig,
             x,
         )
         error = found.belief.mean - x
-        return error, jnp.diagonal(found.belief.covariance), found.misfit
+        return error, jnp.diagonal(found.belief.covariance), found.residual_scale
 
     keys = jax.random.split(jax.random.key(5), 2000)
-    error, variance, misfit = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
+    error, variance, residual_scale = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
     ratio = (error**2).mean(axis=0) / variance.mean(axis=0)
     assert 0.87 < ratio.mean() < 1.3
-    assert np.asarray(misfit).mean() == pytest.approx(1, abs=0.15)
+    assert np.asarray(residual_scale).mean() == pytest.approx(1, abs=0.15)
 
 
 def test_only_alignments_tell_their_misfit(face):
-    """Errors of landmarks twice as large as claimed; a looseness hides them but across the epipolar lines."""
+    """Errors of landmarks twice as large as claimed; a model_variance hides them but across the epipolar lines."""
 
     def one(key):
         x, uv = face.draw(key)
         narrow = face.found(uv)._replace(covariance=0.25 * face.found(uv).covariance)
         found = [
-            module.refine(face.prior, narrow, face.slopes, face.model, s * face.looseness, face.rig, x, own)
+            module.refine(face.prior, narrow, face.slopes, face.model, s * face.model_variance, face.rig, x, own)
             for s, own in ((1.0, None), (1e4, None), (1.0, jnp.zeros((2, 10), bool)))
         ]
-        return [(f.misfit, f.misfit_share) for f in found]
+        return [(f.residual_scale, f.misfit_share) for f in found]
 
     keys = jax.random.split(jax.random.key(6), 300)
     (usual, hidden, none) = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
@@ -288,10 +288,10 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
     per_camera = {"uv", "covariance", "score", "seen", "by_slope"}
     mixed = found._replace(**{name: getattr(found, name)[:, order] for name in per_camera})
     model = replace(face.model, mean=face.model.mean[order], basis=face.model.basis[rows])
-    landmarks = refine(face.prior, mixed, face.slopes, model, face.looseness, face.rig, face.prior.mean)
+    landmarks = refine(face.prior, mixed, face.slopes, model, face.model_variance, face.rig, face.prior.mean)
     swapped = found._replace(**{name: getattr(found, name)[::-1] for name in per_camera})
     rig = jax.tree.map(lambda leaf: leaf[::-1], face.rig)
-    cameras = refine(face.prior, swapped, face.slopes, face.model, face.looseness, rig, face.prior.mean)
+    cameras = refine(face.prior, swapped, face.slopes, face.model, face.model_variance, rig, face.prior.mean)
     for again in (landmarks, cameras):
         np.testing.assert_allclose(again.belief.mean, expected.belief.mean, atol=1e-9)
         np.testing.assert_allclose(again.belief.covariance, expected.belief.covariance, rtol=1e-7, atol=1e-12)
@@ -340,7 +340,7 @@ def test_displaced_landmarks_stay_where_they_are_tight_or_unseen(face):
     found = face.found(face.project(x, 2.0), some_seen())
     still = displaced(x, found, face.slopes, face.model, jnp.zeros((10, 3, 3)), face.rig)
     np.testing.assert_allclose(still, shape(face.model, x[6:]), atol=1e-12)
-    loose = displaced(x, found, face.slopes, face.model, 100.0 * face.looseness, face.rig)
+    loose = displaced(x, found, face.slopes, face.model, 100.0 * face.model_variance, face.rig)
     np.testing.assert_allclose(loose[7], still[7], atol=1e-12)
     # A landmark that one camera sees moves across its line of sight only.
     sight = jnp.cross(*jacobian(face.rig, still, x[:6])[0][1, 3])
@@ -350,11 +350,11 @@ def test_displaced_landmarks_stay_where_they_are_tight_or_unseen(face):
 
 
 def test_displaced_is_the_posterior_mean_of_each_place(face):
-    """Linear-Gaussian: the prior `looseness` about the model, seen through the derivative."""
+    """Linear-Gaussian: the prior `model_variance` about the model, seen through the derivative."""
     x = face.prior.mean
     M = np.asarray(shape(face.model, x[6:]))
     uv = face.project(x) + jnp.asarray(np.random.default_rng(2).normal(0, 0.2, (2, 10, 2)))
-    result = displaced(x, face.found(uv), face.slopes, face.model, face.looseness, face.rig)
+    result = displaced(x, face.found(uv), face.slopes, face.model, face.model_variance, face.rig)
     by_shape = np.asarray(jacobian(face.rig, jnp.asarray(M), x[:6])[0])
     for k in range(10):
         J, bend = (np.concatenate([a[c, k] for c in range(2)]) for a in (by_shape, np.asarray(face.by_slope)))

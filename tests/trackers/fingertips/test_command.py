@@ -133,7 +133,7 @@ def test_wrong_input_is_named(recording, tmp_path, capsys):
     assert "model.npz" in capsys.readouterr().err
     grey = str(recording[0])
     assert main(["track", "fingertips", grey, "--mask", "colour", *out]) == 2
-    assert "hand can be told from the desk" in capsys.readouterr().err
+    assert "hand differs from the desk" in capsys.readouterr().err
 
 
 class Camera:

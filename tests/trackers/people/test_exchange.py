@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.exchange import CLOSE_M, LONGEST_S, after_meetings, is_meeting
+from jaxfilters.trackers.people.exchange import CLOSE_M, LONGEST_S, identity_switch_correction, is_meeting
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, WIDTH, PeopleConfig, nobody
 
 DT = jnp.asarray(0.1)
 RED, BLUE, GREY = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3, 6))
 CLEARLY = jnp.array([True, True, True])
-settle = jax.jit(after_meetings)
+settle = jax.jit(identity_switch_correction)
 
 
 def three(*, apart, first=RED, second=BLUE, mode=(TRACKED,) * 3):

@@ -8,8 +8,8 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people.births import Birth
 from jaxfilters.trackers.people.fit import Fit
-from jaxfilters.trackers.people.newcomers import Newcomer
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, PeopleConfig, nobody
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -163,7 +163,7 @@ def test_clothes_are_taken_at_first_and_then_followed_slowly():
 def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
     people = people_of(TRACKED, FREE, TRACKED, FREE, identity=[4, -1, 5, -1], log_odds=[8.0, 3.0, 8.0, 0.0])
     people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
-    found = Newcomer(jnp.array([1.5, 2.5]), jnp.array(True))
+    found = Birth(jnp.array([1.5, 2.5]), jnp.array(True))
     after = lifecycle.admitted(CONFIG, people, found)
     assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
     np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m])
@@ -176,5 +176,5 @@ def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
 
 def test_a_full_house_admits_nobody():
     full = people_of(TRACKED, TENTATIVE, DORMANT, TRACKED)
-    after = lifecycle.admitted(CONFIG, full, Newcomer(jnp.array([1.5, 2.5]), jnp.array(True)))
+    after = lifecycle.admitted(CONFIG, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))

@@ -50,7 +50,7 @@ class Detection(NamedTuple):
 
 
 def detect(image: UInt8[np.ndarray, "rows cols"], *, near: np.ndarray | None = None) -> Detection | None:
-    """Corners of the eyes and of the mouth of one face; `None` without a face whose eyes and lips are seen.
+    """Corners of the eyes and of the mouth of one face; `None` without a face whose eyes and lips are visible.
 
     Of several faces the largest is taken.
 
@@ -70,7 +70,7 @@ def complete(image: UInt8[np.ndarray, "rows cols"], six: Float[np.ndarray, "6 2"
 
     The average face is laid over the six by an affine map, which takes up most of a turn of the head. Each of the
     others is the point of largest minimum eigenvalue of the structure tensor [S3.2], weighted by its distance from
-    where it is due; `None` if none is strong enough, or two landmarks coincide (specification, section 2.3).
+    where it is due; `None` if none is strong enough, or two landmarks coincide.
 
     Raises:
         ValueError: if the image is not grey with 8 bits, or `six` not (6, 2) and finite.

@@ -1,8 +1,8 @@
 """From particles to an estimate: the mean around their mode, or the best fit near it.
 
-The fit is made for a face at rest (the registered shape, held tightly) and for one that may deform (the learnt model,
-each landmark as loose as it has proved to be, or as expressions of several strengths make it). Their evidences say how
-far each is to be believed; a face that rests keeps the accuracy of a rigid one.
+The fit is made for a face at rest (the registered shape, held tightly) and for one that may deform (the estimated
+model, each landmark as loose as it has proved to be, or as expressions of several strengths make it). Their evidences
+say how far each is to be believed; a face that rests keeps the accuracy of a rigid one.
 """
 
 from typing import NamedTuple
@@ -31,13 +31,13 @@ RESTING_STD = 0.012
 """Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
 MEMORY = 0.95
 """Of the running variances, a frame."""
-LOOSENESS = (0.02**2, 10.0**2)
-MISFIT = (0.05, 20.0)
+MODEL_VARIANCE = (0.02**2, 10.0**2)
+RESIDUAL_SCALE = (0.05, 20.0)
 STRENGTHS = (0.0, 1.0, 3.0)
 """Of expressions that no mode describes, in those of `EXPRESSION_STD`."""
 ALIKE, ALIKE_ANEW = 4.0, 2.0
 """The landmarks of a face move together in an expression: ten of them say no more than some three would; and as much
-again that the next frame, with another expression, is not told."""
+again that the next frame, with another expression, does not profit."""
 ORDINARY_EXPRESSION = float(np.linalg.norm(EXPRESSION_STD))
 """Millimetres, root of the sum over all landmarks."""
 MEASURED_STD = 10.0
@@ -60,19 +60,24 @@ class Estimate(NamedTuple):
     """Landmarks that look as registered, and are where the model has them."""
     recent: Recent
     slopes: Slopes
-    looseness: Float[Array, " K"]
-    misfit: Float[Array, ""]
+    model_variance: Float[Array, " K"]
+    residual_scale: Float[Array, ""]
 
 
 def around_mode(search: AdaptiveDiffusionState, state: HeadState, model: FaceModel) -> Estimate:
-    """The paper's estimate ([P18], [P19]), which the search has made, with the spread of the particles."""
+    """The published estimate, which the search has made, with the spread of the particles.
+
+    Oka and Sato 2006, equations 18 and 19.
+    """
     belief = spread(search)
     x = belief.mean
     M = shape(model, x[POSE:])
     found = jnp.ones((), bool)
     all_of_them = jnp.full((), float(len(M)), x.dtype)
     doubt = jnp.zeros((POSE, POSE), x.dtype)
-    return Estimate(belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
+    return Estimate(
+        belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.model_variance, state.residual_scale
+    )
 
 
 def refined(
@@ -117,8 +122,8 @@ def refined(
     measured = displaced(free.mean, found, state.slopes, model, wide, rig)
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
     is_found = sound & (rest.num_seen >= FEWEST_SEEN)
-    lacking = lambda fit: fit.misfit_share * (fit.misfit - 1)
-    misfit = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
+    lacking = lambda fit: fit.misfit_share * (fit.residual_scale - 1)
+    residual_scale = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
     drift = recent.drifted(state.recent, is_followed)
     seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
     return Estimate(
@@ -130,8 +135,8 @@ def refined(
         jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
         seen,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
-        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * average(fits.excess), *LOOSENESS),
-        jnp.clip(state.misfit * (1 + (1 - MEMORY) * misfit), *MISFIT),
+        jnp.clip(MEMORY * state.model_variance + (1 - MEMORY) * average(fits.excess), *MODEL_VARIANCE),
+        jnp.clip(state.residual_scale * (1 + (1 - MEMORY) * residual_scale), *RESIDUAL_SCALE),
     )
 
 
@@ -146,8 +151,8 @@ def _shares(rest: Refined, fits: Refined) -> tuple[Array, Array]:
 
 def _looseness(state: HeadState, strength: Array | float) -> Array:
     """Covariance of each landmark about the model of a face whose expression is so strong, mm^2."""
-    expression = jnp.asarray(EXPRESSION_STD**2, state.looseness.dtype)
-    learnt = jnp.minimum(state.looseness[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
+    expression = jnp.asarray(EXPRESSION_STD**2, state.model_variance.dtype)
+    learnt = jnp.minimum(state.model_variance[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
     return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learnt, strength**2 * expression))
 
 

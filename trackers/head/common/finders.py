@@ -45,7 +45,7 @@ class CascadeFinder:
         points = complete(image, found.points)
         self.complaints = [f"{found.num_faces} faces; the largest is taken"] if found.num_faces > 1 else []
         if points is None:
-            self.complaints.append("nostrils or brows are not seen")
+            self.complaints.append("nostrils or brows are not visible")
         return points
 
     def reset(self) -> None:

@@ -17,8 +17,8 @@ from jaxfilters.trackers.head.common.state import INITIALISING, LOST
 LOOK_EVERY_S = 1.0
 """Seconds between looks for faces while one is followed."""
 SAME_PLACE, MOST_CONTRADICTIONS = 0.5, 3
-"""How far, in distances between the eyes, a face that is seen may be from the one that is followed; how many looks in a
-row may contradict the track before it is given up."""
+"""How far, in distances between the eyes, a detected face may be from the tracked one; how many detections in a row may
+contradict the track before it is given up."""
 
 
 class Beginning(NamedTuple):
@@ -140,7 +140,7 @@ class Following:
         return track
 
     def _look_at(self, image: np.ndarray, points: np.ndarray) -> None:
-        """Give the track up if a face is seen elsewhere time after time; that none is seen says nothing."""
+        """Give the track up if a face is detected elsewhere time after time; that none is detected says nothing."""
         seen = detect(image, near=points.mean(axis=0))
         if seen is None:
             return
@@ -150,7 +150,7 @@ class Following:
         self._contradictions = self._contradictions + 1 if is_elsewhere else 0
         if self._contradictions == MOST_CONTRADICTIONS:
             self._is_lost = self._is_refuted = True
-            self._say(-1, "lost: the face is seen elsewhere")
+            self._say(-1, "lost: the face is detected elsewhere")
 
     def _look_for_face(self, images: np.ndarray, times: np.ndarray, start: int) -> Any:
         """Rows up to the frame in which a track begins, or all; a lost face may also turn up where it was lost."""

@@ -26,7 +26,7 @@ LEAST_CHANGE = 6.0
 
 
 def without_weighted_motion(change: Float[Array, "K 3"], mean: Float[Array, "K 3"]) -> Float[Array, "K 3"]:
-    """The specification's way: least squares with weights for landmarks that keep still (section 2.10)."""
+    """Least squares with weights for landmarks that keep still."""
     return remove_rigid(change, mean, jnp.asarray(RIGID_WEIGHTS, change.dtype))
 
 
@@ -38,7 +38,7 @@ def nothing_learnt(shape: Float[Array, "K 3"], windows: Float[Array, "C K T T"])
 
 
 def measurable(pose: Float[Array, " 6"], score: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether the face is seen well enough to measure its shape (specification, section 2.12)."""
+    """Whether the face is visible well enough to measure its shape."""
     return (jnp.abs(pose[4]) <= MOST_YAW) & (jnp.abs(pose[5]) <= MOST_PITCH) & (score >= LEAST_SCORE)
 
 
@@ -50,7 +50,10 @@ def recalculated(
     pose: Float[Array, " 6"],
     rig: CameraRig,
 ) -> tuple[Float[Array, "K 3"], Float[Array, "C K T T"]]:
-    """Shape by the paper's recalculation from grey levels ([P25]-[P28]), and the windows about its images."""
+    """Shape by recalculation from grey levels, and the windows about its images.
+
+    Oka and Sato 2006, equations 25 to 28.
+    """
     start = jnp.where(learner.is_fresh, learner.shape, estimated)
     previous = jnp.where(learner.is_fresh, learner.windows, templates)
     shape, _ = recalculate(start, estimated, images, previous, templates, pose, rig)
@@ -66,7 +69,7 @@ def learnt(
     follow: float,
     still: Still,
 ) -> tuple[Learner, FaceModel]:
-    """Learner and model after a shape, if it was measured at all (specification, sections 2.10 to 2.12).
+    """Learner and model after a shape, if it was measured at all.
 
     What the skull's own motion may have left in the shape is taken out; shapes far from the mean change the modes.
 

@@ -18,7 +18,7 @@ from jaxfilters.trackers.head.common.search import KAPPA
 from jaxfilters.trackers.head.common.state import POSE, Recent
 
 UNLEARNT_STD = 0.01
-"""Millimetres: of the coefficient of a mode that is not learnt, or not used."""
+"""Millimetres: of the coefficient of a mode that is not estimated yet, or not used."""
 
 
 @runtime_checkable
@@ -37,7 +37,7 @@ class Looks(Protocol):
     def recent(self) -> Recent: ...
 
     @property
-    def misfit(self) -> Array: ...
+    def residual_scale(self) -> Array: ...
 
 
 def spread(search: AdaptiveDiffusionState) -> Gaussian:
@@ -97,4 +97,4 @@ def looked_for(
     anchored = recent.is_anchored(found)
     found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
     drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
-    return found._replace(covariance=state.misfit * found.covariance + drift), anchored, is_followed
+    return found._replace(covariance=state.residual_scale * found.covariance + drift), anchored, is_followed

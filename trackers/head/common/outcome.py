@@ -30,7 +30,7 @@ def run_report(run: HeadRun, followed: Followed) -> dict[str, Any]:
     }
 
 
-def told(report: dict[str, Any], options: argparse.Namespace) -> str:
+def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
     """The report in a few lines for a person."""
     speed, share = report["frames_per_second"], report["share_tracked"]
     lines = [

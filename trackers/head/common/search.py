@@ -38,7 +38,7 @@ MODE_SCALE = 5.0
 
 @pytree_dataclass
 class FaceLikelihood:
-    """How well particles of pose and mode coefficients explain images ([P16], [P17])."""
+    """How well particles of pose and mode coefficients explain images (Oka and Sato 2006, equations 16 and 17)."""
 
     model: FaceModel
     templates: Float[Array, "C K T T"]
@@ -83,13 +83,13 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
         steady_std=jnp.zeros(NUM_MODES),
         low=jnp.asarray(LOW, float),
         high=jnp.asarray(HIGH, float),
-        update_fit=diffusion.update if options.diffusion == "learnt" else diffusion.fixed,
+        update_fit=diffusion.update if options.diffusion == "online" else diffusion.fixed,
     )
     return Searches(build(), build(partitions=Partitions(consecutive(POSE, NUM_MODES))))
 
 
 def first_diffusion(options: HeadOptions) -> DiffusionFit:
-    """`A = I` and a unit of each coordinate a frame (specification, section 2.5); no `A` if it is fixed."""
+    """`A = I` and a unit of each coordinate a frame; no `A` if it is fixed."""
     # Its arguments are checked by value, also where a caller is being traced.
     with jax.ensure_compile_time_eval():
         scale = jnp.asarray(UNITS, float)

@@ -1,4 +1,4 @@
-"""What the head tracker is told, what it knows, and what it says."""
+"""The options of the head tracker, its state, and its track."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ UNITS = np.array([1.0, 1.0, 1.0, DEGREE, DEGREE, DEGREE])
 """Of pose, in which the paper counts velocity and diffusion: a millimetre, a degree."""
 CHOICES = {
     "mode": ("modern", "paper"),
-    "diffusion": ("proportional", "learnt", "fixed"),
+    "diffusion": ("proportional", "online", "fixed"),
     "detector": ("cascades", "mediapipe"),
 }
 
@@ -41,14 +41,14 @@ class HeadOptions:
     num_particles: int = 1000
     seed: int = 0
     diffusion: str = "proportional"
-    """`proportional`: speed plus one unit, as in the paper's experiments; `learnt`: that regression goes on learning;
-    `fixed`: `fixed_diffusion`, whatever the speed."""
+    """`proportional`: speed plus one unit, as in the paper's experiments; `online`: that regression is updated while
+    tracking; `fixed`: `fixed_diffusion`, whatever the speed."""
     fixed_diffusion: float = 5.0
     """Millimetres and degrees a frame."""
     learn: bool = True
     """Whether the face may deform; with one camera it never does."""
     rigid_frames: int = 120
-    """Frames after registration in which deformations are learnt but not yet used."""
+    """Frames after registration in which deformations are estimated but not yet used."""
     detector: str = "cascades"
     """What finds the landmarks at the start: OpenCV's `cascades` and corners, or the face mesh of `mediapipe`."""
     chunk: int = 8
@@ -72,16 +72,16 @@ class HeadOptions:
 def compiled(options: HeadOptions) -> HeadOptions:
     """What of the options a compiled program knows: those that differ only in numbers share one.
 
-    The diffusion is among the filters and in the state, but for whether it is learnt.
+    The diffusion is among the filters and in the state, but for whether it is estimated.
     """
-    learns = "learnt" if options.diffusion == "learnt" else "proportional"
+    learns = "online" if options.diffusion == "online" else "proportional"
     return HeadOptions(
         options.mode, options.num_particles, diffusion=learns, learn=options.learn, rigid_frames=options.rigid_frames
     )
 
 
 class Learner(NamedTuple):
-    """The deformation model while it is learnt."""
+    """The deformation model while it is estimated."""
 
     subspace: IncrementalPCA
     num_shapes: Int[Array, ""]
@@ -137,20 +137,20 @@ class HeadState(NamedTuple):
     belief: Gaussian
     """Of the last estimate."""
     model: FaceModel
-    """As learnt so far."""
+    """As estimated so far."""
     registered: Registered
     recent: Recent
     slopes: Slopes
-    looseness: Float[Array, " K"]
+    model_variance: Float[Array, " K"]
     """Variance of each landmark about the model on every axis, mm^2."""
-    misfit: Float[Array, ""]
+    residual_scale: Float[Array, ""]
     """Squared error of the alignments over what they claim."""
     learner: Learner
     last_good: Float[Array, " d"]
     """The estimate of the last frame in which the face was found."""
     misses: Int[Array, ""]
     """Frames in a row in which the face was not found."""
-    strange: Int[Array, ""]
+    num_outliers: Int[Array, ""]
     """Frames in which hardly any landmark looked as registered, two less for each in which some did."""
     age: Int[Array, ""]
     """Frames since registration."""

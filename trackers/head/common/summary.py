@@ -1,4 +1,4 @@
-"""One picture of a whole run of a head: pose, deformation and score over time, and what was learnt of the face."""
+"""One picture of a whole run of a head: pose, deformation and score over time, and the face model."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Labels(NamedTuple):
     """Of the coefficients in this picture."""
     curve: str = "a"
     mode: str = "a"
-    modes: str = "deformation learnt"
+    modes: str = "deformation estimated"
 
 
 DEFORMATION = Labels()
@@ -45,7 +45,7 @@ DEFORMATION = Labels()
 def draw_summary(
     track: HeadRows, model: FaceModel | None, truth: np.ndarray | None, labels: Labels = DEFORMATION
 ) -> np.ndarray:
-    """(rows, cols, 3) uint8: charts with 2-sigma bands over paper in the colours of the statuses, and the modes learnt.
+    """(rows, cols, 3) uint8: charts with 2-sigma bands over paper in the colours of the statuses, and the modes.
 
     `truth` are poses (frames, 6) in metres and radians, drawn in grey; None where they are not known.
     """
@@ -97,12 +97,12 @@ def status_shades(times_s: np.ndarray, status: np.ndarray) -> list[Shade]:
 
 
 def draw_modes(model: FaceModel | None, labels: Labels = DEFORMATION) -> np.ndarray:
-    """(rows, cols, 3) uint8: for each mode learnt the mean face and those beside it, from the front and the side."""
+    """(rows, cols, 3) uint8: for each mode estimated the mean face and those beside it, from the front and the side."""
     sheet = np.full((_MODE_ROWS, _WIDTH, 3), 255, np.uint8)
     deviation = np.zeros(0) if model is None else np.asarray(model.deviation, float)
     learnt = np.flatnonzero(deviation > 0)[:NUM_MODES]
     if model is None or not learnt.size:
-        what = "no face was registered" if model is None else "a rigid face: no deformation was learnt"
+        what = "no face was registered" if model is None else "a rigid face: no deformation was estimated"
         _text(sheet, what, (_LEFT, 24))
         return sheet
     width = _WIDTH // NUM_MODES

@@ -10,22 +10,22 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face import person_prior
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Views, adjust, square
-from jaxfilters.models.face.frame_selection import Told, by_angles, by_information, told
+from jaxfilters.models.face.frame_selection import FrameInformation, by_angles, by_information, frame_information
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.past import joined
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.square_root_prior import joined
 from jaxfilters.optimize.least_squares import cauchy, huber
 from jaxfilters.trackers.head.common.state import POSE
-from jaxfilters.trackers.head.mono.past import left_behind, seen_by, units
+from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame, units
 from jaxfilters.trackers.head.mono.person import Modes, model_of
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, Window
 
 STEPS = (5, 5)
-"""Of both stages (specification, section 3)."""
+"""Of both stages."""
 MOST_YAW, MOST_PITCH, LEAST_SCORE = np.radians(25.0), np.radians(20.0), 0.7
-"""Of a face that may be adjusted (specification, section 2.8)."""
+"""Of a face that may be adjusted."""
 FURTHER = 1.6
 """How much farther it may be turned where landmarks are aligned by patches that turn with it."""
 LEAST_GAIN = 0.02
@@ -40,7 +40,7 @@ class Frame(NamedTuple):
     view: Views
     pose: Float[Array, " 6"]
     expression: Float[Array, " A"]
-    told: Told
+    about_person: FrameInformation
 
 
 def frame_of(
@@ -55,7 +55,7 @@ def frame_of(
     """The frame in which the face was estimated at `x`, and what it tells of the person."""
     expression = modes.expression(face, x[POSE:])
     here = Bundle(x[None, :POSE], expression[None], person)
-    return Frame(view, x[:POSE], expression, told(face, rig, view, here, prior))
+    return Frame(view, x[:POSE], expression, frame_information(face, rig, view, here, prior))
 
 
 def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Person, prior: Prior) -> Window:
@@ -64,7 +64,7 @@ def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Pers
     def one(inputs: tuple) -> tuple[Array, Array]:
         view, pose, expression = inputs
         alone = jax.tree.map(lambda leaf: leaf[None], view)
-        found = told(face, rig, alone, Bundle(pose[None], expression[None], person), prior)
+        found = frame_information(face, rig, alone, Bundle(pose[None], expression[None], person), prior)
         return found.information, found.gradient
 
     # One by one: batches of factorisations can stand still on two cores.
@@ -93,7 +93,7 @@ def choose(
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
         beside = known(face, prior, person)
-        place, gain = by_information(window.information, frame.told.information, beside, may_go)
+        place, gain = by_information(window.information, frame.about_person.information, beside, may_go)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
@@ -102,7 +102,7 @@ def choose(
 
 
 def adjusted(
-    stranger: MultilinearFace,
+    unknown: MultilinearFace,
     face: MultilinearFace,
     rig: CameraRig,
     state: MonoState,
@@ -113,8 +113,8 @@ def adjusted(
     """The state after an adjustment to the window with a new frame; not finite if that came to nothing.
 
     Args:
-        stranger: The model.
-        face: Whom the state is about: the same, or somebody who is remembered.
+        unknown: The model, which is the face of an unknown person.
+        face: Whom the state is about: the same, or a person who is remembered.
         rig: One camera.
         state: Before.
         frame: The new one.
@@ -123,13 +123,13 @@ def adjusted(
     """
     prior = state.prior
     if prior.past is not None and options.past == "marginalised":
-        gone = left_behind(stranger, face, state.window, state.person, place, prior)
+        gone = marginalize_frame(unknown, face, state.window, state.person, place, prior)
         prior = prior._replace(past=joined(prior.past, gone))
     start = state.person
     if options.is_published:
         start = start._replace(identity=_average(state))
     state = state._replace(window=_with(state.window, frame, place), prior=prior, num_adjusted=state.num_adjusted + 1)
-    bundle, info = fitted(stranger, face, rig, state, state.window.bundle(start), options)
+    bundle, info = fitted(unknown, face, rig, state, state.window.bundle(start), options)
     identity = jnp.where(jnp.isfinite(info.energy), bundle.person.identity, jnp.nan)
     bundle = bundle._replace(person=bundle.person._replace(identity=identity))
     state = state._replace(identities=jnp.concatenate([identity[None], state.identities[:-1]]))
@@ -137,7 +137,7 @@ def adjusted(
 
 
 def fitted(
-    stranger: MultilinearFace,
+    unknown: MultilinearFace,
     face: MultilinearFace,
     rig: CameraRig,
     state: MonoState,
@@ -148,7 +148,7 @@ def fitted(
     """The window adjusted to one of the faces that it may be of; arguments are those of `adjusted` and `adjust`."""
     prior = state.prior
     if prior.past is not None:
-        prior = prior._replace(past=seen_by(prior.past, stranger, face))
+        prior = prior._replace(past=about_face(prior.past, unknown, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
     return adjust(face, rig, state.window.views, start, prior, options.reach, steps=steps, losses=losses)
 
@@ -215,8 +215,8 @@ def _with(window: Window, frame: Frame, place: Array) -> Window:
         put(window.poses, frame.pose),
         put(window.expressions, frame.expression),
         put(window.ages, jnp.zeros((), window.ages.dtype)),
-        put(window.information, frame.told.information),
-        put(window.gradient, frame.told.gradient),
+        put(window.information, frame.about_person.information),
+        put(window.gradient, frame.about_person.gradient),
     )
 
 
@@ -236,7 +236,7 @@ def known(face: MultilinearFace, prior: Prior, person: Person) -> Float[Array, "
 
 
 def prior_information(face: MultilinearFace, person: Person, prior: Prior) -> Float[Array, "d d"]:
-    """Information about identity and offset before anything is seen, in standard deviations.
+    """Prior information about identity and offset, in standard deviations.
 
     Args:
         face: Model.

@@ -14,7 +14,7 @@ from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.head.common.input import place_of_one
-from jaxfilters.trackers.head.common.outcome import finite, run_report, told
+from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
 from jaxfilters.trackers.head.common.table import STATUS_WORDS
@@ -95,7 +95,7 @@ def _tracked(
     truth = None if place.truth is None else place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
     run.conclude(followed)
-    return told(report, options) if focal is None else f"{told(report, options)}\n{_in_words(focal)}"
+    return format_report(report, options) if focal is None else f"{format_report(report, options)}\n{_in_words(focal)}"
 
 
 def _model(options: argparse.Namespace) -> FaceModelFile:

@@ -1,8 +1,8 @@
 """A start from the 68 landmarks of iBUG, of which the tracker goes on with ten.
 
 Many landmarks tell more of a face than the ten that can be followed: who it is, and so how large. What they tell of the
-face of the ten is kept as a Gaussian (`Past`), in which nothing else is left of them: the frames that the face is
-adjusted to later must not count the same detections again.
+face of the ten is kept as a Gaussian (`SquareRootPrior`), in which nothing else is left of them: the frames that the
+face is adjusted to later must not count the same detections again.
 """
 
 from typing import NamedTuple
@@ -17,9 +17,9 @@ from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adju
 from jaxfilters.models.face.frame_selection import reduced
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, restricted
-from jaxfilters.models.face.past import Past, of_energy
 from jaxfilters.models.face.person_prior import Person, Prior, parameters, seen_size
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.square_root_prior import SquareRootPrior, of_energy
 from jaxfilters.trackers.head.mono.adjustment import UNKNOWN
 from jaxfilters.trackers.head.mono.past import units as person_units
 from jaxfilters.trackers.head.mono.start import WIDE, Start
@@ -30,7 +30,7 @@ STEPS = (5, 30)
 REACH = WIDE._replace(deviations=4.0)
 """Of the adjustment."""
 UNMODELLED_MM = 0.55
-"""Of each coordinate of a landmark from frame to frame, what a model leaves of people whom it has not learnt from.
+"""Of each coordinate of a landmark from frame to frame, what a model leaves of people outside of its training set.
 
 Measured as that of the ten (`estimate.UNMODELLED_MM`), with the same people and speech: .54 to .61 mm, .65 at the brows
 and the mouth, .24 at the eyes.
@@ -55,7 +55,7 @@ class DenseStart(NamedTuple):
 
     start: Start
     """Of the ten."""
-    past: Past
+    past: SquareRootPrior
     """What they tell of the face of the ten."""
 
 
@@ -119,7 +119,7 @@ def told_of_ten(
     person: Person,
     prior: Prior,
     misplaced: Float[ArrayLike, ""],
-) -> Past:
+) -> SquareRootPrior:
     """What views of the 68 tell of identity and offset of the ten, the rest integrated out.
 
     Args:
@@ -170,7 +170,7 @@ def told_of_ten(
 
 
 class _Parts:
-    """All that the 68 landmarks of somebody have in common in all frames, in one vector.
+    """All that the 68 landmarks of a person have in common in all frames, in one vector.
 
     Identity, the offsets of the ten, those of the others, and what the detector misplaces the ten by, in its standard
     deviations.

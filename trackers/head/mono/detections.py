@@ -32,7 +32,7 @@ class Detections(NamedTuple):
     dense: Dense | None = None
     """The 68 landmarks, if they are known."""
     iris_px: Float[np.ndarray, "n 2"] | None = None
-    """Widths of the irises, if they are seen."""
+    """Widths of the irises, if they are visible."""
 
 
 class Collector:

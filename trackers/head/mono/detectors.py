@@ -23,7 +23,7 @@ MESH_68: tuple[tuple[int, ...], ...] = (
 )
 """Vertices of MediaPipe's mesh whose mean is each of iBUG's 68 landmarks. Along lips and lids they are those that
 divide the mesh's contour as the landmarks of the ICT face model divide its own (within 5 % of the contour's length);
-nose and brows are those next to that model's landmarks, seen from the front. Of the jaw only the chin is taken: the
+nose and brows are those next to that model's landmarks, viewed from the front. Of the jaw only the chin is taken: the
 others slide along the cheeks as a head turns."""
 CHIN = 8
 IRISES = ((469, 471), (474, 476))
@@ -63,10 +63,10 @@ class CascadeDetector:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
         found = detect(image, near=near)
         if found is None:
-            return "no face whose eyes and lips are seen"
+            return "no face whose eyes and lips are visible"
         points = complete(image, found.points)
         if points is None:
-            return "nostrils or brows are not seen"
+            return "nostrils or brows are not visible"
         return Seen(points, found.num_faces)
 
 

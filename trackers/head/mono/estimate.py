@@ -15,7 +15,7 @@ from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common import recent
-from jaxfilters.trackers.head.common.estimate import FEWEST_SEEN, LOOSENESS, MEMORY, MISFIT
+from jaxfilters.trackers.head.common.estimate import FEWEST_SEEN, MEMORY, MODEL_VARIANCE, RESIDUAL_SCALE
 from jaxfilters.trackers.head.common.near_mode import anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.common.state import POSE, Recent
 from jaxfilters.trackers.head.mono.state import MonoState
@@ -23,11 +23,11 @@ from jaxfilters.trackers.head.mono.state import MonoState
 RECALCULATED_PX = 1.0
 """Standard deviation of a recalculated landmark."""
 UNMODELLED_MM = 0.35
-"""Of each coordinate of a landmark from frame to frame, what a model leaves of people whom it has not learnt from.
+"""Of each coordinate of a landmark from frame to frame, what a model leaves of people outside of its training set.
 
 Measured in three dimensions, once identity, offset and expressions are the likeliest: models of 200 people leave .36 mm
 of people of the ICT face model with recorded speech, .07 mm of the generator's, whose expressions are but two. A person
-must not be adjusted to what no person of the model does, however precisely it is seen.
+must not be adjusted to what no person of the model does, however precisely it is measured.
 """
 
 
@@ -45,8 +45,8 @@ class Estimate(NamedTuple):
     windows: Float[Array, "1 K T T"]
     """Grey levels about the landmarks."""
     slopes: Slopes
-    looseness: Float[Array, " K"]
-    misfit: Float[Array, ""]
+    model_variance: Float[Array, " K"]
+    residual_scale: Float[Array, ""]
 
 
 def aligned(
@@ -66,7 +66,7 @@ def aligned(
         moved: What the head was predicted to move since the last estimate, millimetres and radians.
     """
     prior = predicted(search, state.belief, state.model, moved)
-    loose = state.looseness[:, None, None] * jnp.eye(3)
+    loose = state.model_variance[:, None, None] * jnp.eye(3)
     x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
     found, _, _ = looked_for(align, state, state.model, images, rig, x)
     x = refine(prior, found, state.slopes, state.model, loose, rig, x).belief.mean
@@ -78,7 +78,7 @@ def aligned(
     seen = recent.as_seen(found, anchored, M, pose, images, rig, drift)
     by_shape = jnp.where(found.seen[..., None, None], jacobian(rig, M, pose)[0], 0.0)
     by_slope = jnp.einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
-    variance = state.looseness + UNMODELLED_MM**2
+    variance = state.model_variance + UNMODELLED_MM**2
     spread = jnp.einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
     covariance = found.covariance + by_slope + spread + PIXEL_FLOOR**2 * jnp.eye(2)
     return Estimate(
@@ -90,8 +90,10 @@ def aligned(
         seen,
         state.windows,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
-        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * fit.excess, *LOOSENESS),
-        jnp.clip(state.misfit * (1 + (1 - MEMORY) * fit.misfit_share * (fit.misfit - 1)), *MISFIT),
+        jnp.clip(MEMORY * state.model_variance + (1 - MEMORY) * fit.excess, *MODEL_VARIANCE),
+        jnp.clip(
+            state.residual_scale * (1 + (1 - MEMORY) * fit.misfit_share * (fit.residual_scale - 1)), *RESIDUAL_SCALE
+        ),
     )
 
 
@@ -136,6 +138,6 @@ def projected(
         state.recent,
         state.windows,
         state.slopes,
-        state.looseness,
-        state.misfit,
+        state.model_variance,
+        state.residual_scale,
     )

@@ -44,13 +44,13 @@ class FocalLength(NamedTuple):
 
 @partial(jax.jit, static_argnames="options")
 def focal_length(
-    stranger: MultilinearFace, face: MultilinearFace, rig: CameraRig, state: MonoState, options: MonoOptions
+    unknown: MultilinearFace, face: MultilinearFace, rig: CameraRig, state: MonoState, options: MonoOptions
 ) -> FocalLength:
     """The focal length by the evidence of the window's frames, of which each is tried with all others anew.
 
     Args:
-        stranger: The model.
-        face: Whom the state is about: the same, or somebody who is remembered.
+        unknown: The model, which is the face of an unknown person.
+        face: Whom the state is about: the same, or a person who is remembered.
         rig: One camera, with the assumed focal length.
         state: Its window holds heads turned several ways; what they tell of the focal length grows with that.
         options: Constants.
@@ -60,7 +60,7 @@ def focal_length(
     def log_evidence(factor: Array) -> Array:
         start = Bundle(window.poses.at[:, 2].multiply(factor), window.expressions, state.person)
         camera = replace(rig, focal=rig.focal * factor)
-        return weighed(stranger, face, camera, state, start, options)[1]
+        return weighed(unknown, face, camera, state, start, options)[1]
 
     logs = jnp.log(jnp.asarray(FACTORS, window.poses.dtype))
     # One by one: batches of factorisations can stand still on two cores.

@@ -13,10 +13,10 @@ from jaxfilters.models.face.bundle import Bundle, Views, projected
 from jaxfilters.models.face.frame_selection import told
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.past import Past, joined, of_measurements
 from jaxfilters.models.face.person_prior import Person, Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.square_root_prior import SquareRootPrior, joined, of_measurements
 from jaxfilters.trackers.head.mono.adjustment import prior_information
 from jaxfilters.trackers.head.mono.past import units
 from jaxfilters.trackers.head.mono.start import Start
@@ -34,10 +34,10 @@ def with_irises(
     rig: CameraRig,
     start: Start,
     views: Views,
-    past: Past | None,
+    past: SquareRootPrior | None,
     iris_px: Float[np.ndarray, "n 2"],
     prior: Prior,
-) -> tuple[Start, Past]:
+) -> tuple[Start, SquareRootPrior]:
     """The start as large as the irises say, weighed against what else tells the size; and what is known beside `views`.
 
     Args:
@@ -56,8 +56,14 @@ def with_irises(
 
 @jax.jit
 def _resized(
-    face: MultilinearFace, rig: CameraRig, start: Start, views: Views, past: Past, iris_px: Array, prior: Prior
-) -> tuple[Start, Past]:
+    face: MultilinearFace,
+    rig: CameraRig,
+    start: Start,
+    views: Views,
+    past: SquareRootPrior,
+    iris_px: Array,
+    prior: Prior,
+) -> tuple[Start, SquareRootPrior]:
     bundle, count = start.bundle, face.num_identities
     person = bundle.person
     larger, std = measured(face, rig, start, iris_px)

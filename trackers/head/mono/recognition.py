@@ -1,4 +1,4 @@
-"""Who is before the camera: a stranger, or one of the people who are remembered.
+"""Who is before the camera: an unknown person, or one of the people who are remembered.
 
 Each is a model of the face of its own (`jaxfilters.models.face.remembered`). The window is adjusted to each, and the
 one of most evidence is believed: the density of the window's landmarks with everything else integrated out, by
@@ -26,24 +26,24 @@ from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState
 STEPS = (10, 20)
 """Of both stages of an adjustment: from one person's face to another's is farther than from frame to frame."""
 FAMILIAR = 0.5
-"""Probability, before anything is seen, that a face is one of those who are remembered."""
+"""Prior probability that a face is one of those who are remembered."""
 
 
 class People(NamedTuple):
     """Whom a face may be taken for."""
 
     faces: MultilinearFace
-    """Of a stranger and of P people, stacked: leaves (1 + P, ...)."""
+    """Of an unknown person and of P people, stacked: leaves (1 + P, ...)."""
     log_prior: Float[Array, " n"]
 
 
 def one_of(people: People, who: Int[ArrayLike, ""]) -> MultilinearFace:
-    """The face of one of them, 0 for a stranger."""
+    """The face of one of them, 0 for an unknown person."""
     return jax.tree.map(lambda leaf: leaf[who], people.faces)
 
 
 def people(face: MultilinearFace, remembered: Remembered | None) -> People:
-    """A stranger, and everybody who is remembered."""
+    """An unknown person, and everybody who is remembered."""
     if remembered is None or not len(remembered.identity):
         return People(jax.tree.map(lambda leaf: leaf[None], face), jnp.zeros(1, face.mean.dtype))
     count = len(remembered.identity)
@@ -89,7 +89,7 @@ def tried(people: People, rig: CameraRig, state: MonoState, options: MonoOptions
 
 
 def weighed(
-    stranger: MultilinearFace,
+    unknown: MultilinearFace,
     face: MultilinearFace,
     rig: CameraRig,
     state: MonoState,
@@ -102,34 +102,34 @@ def weighed(
     proportion to the distance, of which no value is likelier than another.
 
     Args:
-        stranger: The model.
-        face: The same, or somebody who is remembered.
+        unknown: The model, which is the face of an unknown person.
+        face: The same, or a person who is remembered.
         rig: One camera.
         state: With the window.
         start: Of all frames.
         options: Constants.
     """
-    bundle, info = fitted(stranger, face, rig, state, start, options, STEPS)
+    bundle, info = fitted(unknown, face, rig, state, start, options, STEPS)
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    told = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
+    gained = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
     people = Prior(state.prior.weight, state.prior.offset_std)
     before = prior_information(face, bundle.person, people)
-    after = known(face, state.prior, bundle.person) + told
+    after = known(face, state.prior, bundle.person) + gained
     return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
 
 
-def as_remembered(stranger: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
+def as_remembered(unknown: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
     """The person who is followed, as one to remember: identity with what is not known of it, and offset.
 
     Args:
-        stranger: The model.
-        face: Whom the state is about: the same, or somebody who is remembered.
+        unknown: The model, which is the face of an unknown person.
+        face: Whom the state is about: the same, or a person who is remembered.
         state: With a window that has been informed of that person.
     """
     total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
     unit, count = units(face, state.prior), face.num_identities
     covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
-    offset = state.person.offset + face.mean - stranger.mean
+    offset = state.person.offset + face.mean - unknown.mean
     return Remembered(state.person.identity[None], covariance[None], offset[None])
 
 

@@ -13,11 +13,11 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.past import Past
 from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.models.face.square_root_prior import SquareRootPrior
 from jaxfilters.trackers.head.common.following import Beginning, Following
 from jaxfilters.trackers.head.common.state import INITIALISING, POSE
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
@@ -43,7 +43,7 @@ _begun = jax.jit(begin, static_argnames="options")
 class _Found:
     """What a track begins with."""
 
-    def __init__(self, detections: Detections, start: Start, views: Views, past: Past | None) -> None:
+    def __init__(self, detections: Detections, start: Start, views: Views, past: SquareRootPrior | None) -> None:
         self.detections, self.start, self.views, self.past = detections, start, views, past
         turned = np.abs(np.asarray(start.bundle.poses[:, 4:])).sum(axis=1)
         self.frame = int(turned.argmin())
@@ -75,7 +75,7 @@ class MonoSession:
                 given.
             detections: Landmarks that were found otherwise in several images, the last of which is still to come.
             detector: What finds landmarks; OpenCV's cascades if none.
-            remembered: People of the same model who may be before the camera, beside strangers.
+            remembered: People of the same model who may be before the camera, beside unknown people.
 
         Raises:
             ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
@@ -248,13 +248,13 @@ class _MonoTracker:
         return self._recognised(state), track
 
     def remembered(self, state: MonoState) -> Remembered:
-        return as_remembered(self._system.stranger, self._system.face, state)
+        return as_remembered(self._system.unknown, self._system.face, state)
 
     def focal_length(self, state: MonoState) -> FocalLength:
-        return focal_length(self._system.stranger, self._system.face, self.rig, state, self._compiled)
+        return focal_length(self._system.unknown, self._system.face, self.rig, state, self._compiled)
 
     def _recognised(self, state: MonoState) -> MonoState:
-        """Asked again whenever the face has been adjusted twice as often: what is learnt of it grows ever slower."""
+        """Asked again whenever the face has been adjusted twice as often: the estimate improves ever slower."""
         if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_told:
             self._num_told = int(state.num_adjusted)
             state = recognised(self._people, self.rig, state, self._compiled)
@@ -267,7 +267,7 @@ class _MonoTracker:
             self._people = self._people_with(self._system, old)
 
     def _people_with(self, system: System, state: MonoState) -> People:
-        last = as_remembered(system.stranger, system.face, state)
+        last = as_remembered(system.unknown, system.face, state)
         return people(self._face, last if self._remembered is None else joined(self._remembered, last))
 
     def _asked_who(self, system: System, state: MonoState) -> MonoState:

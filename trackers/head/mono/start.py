@@ -27,7 +27,7 @@ from jaxfilters.trackers.head.mono.state import AVERAGED, MonoOptions, MonoState
 from jaxfilters.typing import AnyKey
 
 STEPS = (10, 10)
-"""Of both stages of the first adjustment (specification, section 3)."""
+"""Of both stages of the first adjustment."""
 MOST_TURNED = np.radians(60.0)
 WIDE = Reach(pose=np.array([300.0, 300.0, 400.0, *[MOST_TURNED] * 3]), expression=4.0, identity=4.0, deviations=2.0)
 """Of the first adjustment."""
@@ -39,7 +39,7 @@ MOST_UNEVEN = np.radians(6.0)
 """Standard deviation of the directions of left-right pairs from which on a detection is a mistake (section 1)."""
 PUBLISHED_SIGMA = 1.0
 """Of the sum of the scores ([4.41])."""
-FIRST_LOOSENESS = 0.5**2
+FIRST_MODEL_VARIANCE = 0.5**2
 """mm^2."""
 FIRST_STD = np.array([1.0, 1.0, 3.0, 0.02, 0.05, 0.05])
 """Of the pose at the start, millimetres and radians, if the person is as believed."""
@@ -56,7 +56,7 @@ class Start(NamedTuple):
 
 
 def is_symmetric(points: Float[np.ndarray, "K 2"], most: float = MOST_UNEVEN) -> bool:
-    """Whether the segments between left and right landmarks have about one direction (specification, section 1)."""
+    """Whether the segments between left and right landmarks have about one direction."""
     right, left = points[_PAIRS[:, 0]], points[_PAIRS[:, 1]]
     across = left - right
     return bool(np.std(np.arctan2(across[:, 1], across[:, 0])) <= most)
@@ -123,7 +123,7 @@ def begin(
         face: Model.
         rig: One camera.
         start: From `initialise`.
-        views: Landmarks in its frames; not seen where what they tell is known otherwise (`past`).
+        views: Landmarks in its frames; not visible where what they tell is known otherwise (`past`).
         frame: Which of its frames the templates are taken from: the one most turned to the camera.
         images: That frame, and the last one.
         time: Of the last frame, seconds.
@@ -156,11 +156,11 @@ def begin(
         windows=registered.templates,
         is_fresh=jnp.zeros((), bool),
         slopes=unknown_slopes(face.num_landmarks),
-        looseness=jnp.full(face.num_landmarks, FIRST_LOOSENESS, x.dtype),
-        misfit=jnp.ones((), x.dtype),
+        model_variance=jnp.full(face.num_landmarks, FIRST_MODEL_VARIANCE, x.dtype),
+        residual_scale=jnp.ones((), x.dtype),
         last_good=x,
         misses=jnp.zeros((), jnp.int32),
-        strange=jnp.zeros((), jnp.int32),
+        num_outliers=jnp.zeros((), jnp.int32),
         time=jnp.asarray(time, x.dtype),
         key=key,
     )

@@ -1,4 +1,4 @@
-"""What the one-camera head tracker is told, what it knows, and what it says."""
+"""The options of the one-camera head tracker, its state, and its track."""
 
 import math
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from jaxfilters.trackers.head.common.state import Recent
 from jaxfilters.trackers.head.mono.person import Modes
 
 NUM_FRAMES = 5
-"""That the face is adjusted to (n of the specification)."""
+"""That the face is adjusted to."""
 AVERAGED = 15
 """Identities in the running mean of the published tracker (N_s)."""
 REACH = Reach(
     pose=np.array([15.0, 15.0, 30.0, *np.radians([5.0, 5.0, 5.0])]), expression=0.5, identity=0.1, deviations=2.0
 )
-"""Of one adjustment, as published or, where the thesis is silent, as the specification decides (section 3)."""
+"""Of one adjustment, as published or, where the thesis is silent, as chosen here."""
 WIDE_REACH = Reach(pose=REACH.pose, expression=2.0, identity=1.0, deviations=4.0)
 """Of one adjustment that a prior holds."""
 EYES_APART_MM, EYES_APART_STD_MM = (40.0, 80.0), 1.0
@@ -49,7 +49,7 @@ class MonoOptions:
     """Which frames are adjusted to: those of most `information` about the person, of the largest variance of `angles`,
     as published, or the `latest`."""
     past: str = "dropped"
-    """What frames that are replaced leave behind: nothing, or, `marginalised`, what they told of the person. The
+    """What frames that are replaced leave behind: nothing, or, `marginalised`, their information about the person. The
     latter forgets nothing, neither the errors that landmarks have in common over many frames."""
     adjust: bool = True
     """Whether the face is adjusted while it is followed; otherwise at the start alone."""
@@ -143,11 +143,11 @@ class MonoState(NamedTuple):
     belief: Gaussian
     """Of the last estimate, for the person as believed."""
     who: Int[Array, ""]
-    """0 for a stranger, else one of those who are remembered."""
+    """0 for an unknown person, else one of those who are remembered."""
     person: Person
     """About that face."""
     prior: Prior
-    """What holds every adjustment; its past, if there ever is one, is about the model's face, that of a stranger."""
+    """Of every adjustment; its past, if there ever is one, is about the model's face, that of an unknown person."""
     model: FaceModel
     """Of the person: the expressions as orthonormal modes."""
     modes: Modes
@@ -166,14 +166,14 @@ class MonoState(NamedTuple):
     is_fresh: Bool[Array, ""]
     """Whether they are of the frame before."""
     slopes: Slopes
-    looseness: Float[Array, " K"]
+    model_variance: Float[Array, " K"]
     """Variance of each landmark about the model on every axis, mm^2."""
-    misfit: Float[Array, ""]
+    residual_scale: Float[Array, ""]
     last_good: Float[Array, " n"]
     """Pose and mode coefficients when the face was last found."""
     misses: Int[Array, ""]
     """Frames in a row in which the face was not found."""
-    strange: Int[Array, ""]
+    num_outliers: Int[Array, ""]
     """Frames in which hardly any landmark looked as registered, two less for each in which some did."""
     time: Float[Array, ""]
     """Of the last frame, seconds."""
@@ -204,7 +204,7 @@ class MonoTrack(NamedTuple):
     offset: Float[Array | np.ndarray, "b K 3"]
     """What the model lacks of this face, millimetres."""
     who: Int[Array | np.ndarray, " b"]
-    """Whom of the people who are remembered this is taken for, from 0 on; -1 for a stranger."""
+    """Whom of the people who are remembered this is taken for, from 0 on; -1 for an unknown person."""
     is_adjusted: Bool[Array | np.ndarray, " b"]
     """Whether the face was adjusted in this frame."""
     status: Int[Array | np.ndarray, " b"]

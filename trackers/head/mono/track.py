@@ -44,10 +44,10 @@ LEAST_STEPS = 0.1
 class System(NamedTuple):
     """What does not change while a head is followed."""
 
-    stranger: MultilinearFace
+    unknown: MultilinearFace
     """The model."""
     face: MultilinearFace
-    """Whom the state is about: the same, or somebody who is remembered."""
+    """Whom the state is about: the same, or a person who is remembered."""
     rig: CameraRig
     searches: Searches
 
@@ -91,14 +91,15 @@ def _step(
     belief = jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, spread(search))
     score = score_at(state.model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(state.model, looks, rig, belief.mean, images))
-    strange = jnp.where(estimate.num_anchored < FEWEST_ANCHORED, state.strange + 1, jnp.maximum(state.strange - 2, 0))
-    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (strange > MOST_STRANGE)
+    fewer = jnp.maximum(state.num_outliers - 2, 0)
+    num_outliers = jnp.where(estimate.num_anchored < FEWEST_ANCHORED, state.num_outliers + 1, fewer)
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     state = _after(state, search, belief, estimate, missed)
     state, is_adjusted = _adjusted(system, state, estimate, score, missed, options)
     state = state._replace(
         misses=jnp.where(missed, state.misses + 1, 0),
-        strange=strange,
+        num_outliers=num_outliers,
         time=jnp.maximum(time, state.time),
         key=key,
         last_good=jnp.where(missed, state.last_good, state.belief.mean),
@@ -171,8 +172,8 @@ def _after(
         recent=keep(estimate.recent, state.recent),
         windows=keep(estimate.windows, state.windows),
         slopes=keep(estimate.slopes, state.slopes),
-        looseness=keep(estimate.looseness, state.looseness),
-        misfit=keep(estimate.misfit, state.misfit),
+        model_variance=keep(estimate.model_variance, state.model_variance),
+        residual_scale=keep(estimate.residual_scale, state.residual_scale),
     )
 
 
@@ -180,9 +181,9 @@ def _adjusted(
     system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoOptions
 ) -> tuple[MonoState, Array]:
     """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
-    stranger, face, rig, _ = system
+    unknown, face, rig, _ = system
     frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, state.prior)
-    response = jnp.where(missed, state.response, frame.told.response)
+    response = jnp.where(missed, state.response, frame.about_person.response)
     state = state._replace(response=jnp.where(jnp.all(jnp.isfinite(response)), response, state.response))
     if not options.adjust:
         return state, jnp.zeros((), bool)
@@ -192,7 +193,7 @@ def _adjusted(
     allowed &= jnp.abs(frame.pose[5]) <= further * adjustment.MOST_PITCH
     place, deserves = adjustment.choose(face, state.window, state.prior, state.person, frame, options)
     tried = allowed & deserves
-    anew = lambda: adjustment.adjusted(stranger, face, rig, state, frame, place, options)
+    anew = lambda: adjustment.adjusted(unknown, face, rig, state, frame, place, options)
     after = jax.lax.cond(tried, anew, lambda: state)
     parts = ("person", "prior", "belief", "model", "modes", "window", "registered")
     believed = lambda state: [getattr(state, part) for part in parts]
@@ -201,7 +202,7 @@ def _adjusted(
 
 
 def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array) -> MonoTrack:
-    stranger, face, rig, _ = system
+    unknown, face, rig, _ = system
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
     x = state.belief.mean
@@ -213,13 +214,13 @@ def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjust
     return MonoTrack(
         pose=known(x[:POSE]),
         pose_std=known(jnp.sqrt(variance)),
-        deformation=known((expression - stranger.expression_mean) / stranger.expression_std),
+        deformation=known((expression - unknown.expression_mean) / unknown.expression_std),
         shape=known(M),
         image_points=known(uv),
         score=score,
         effective_sample_size=ess,
-        identity=known((state.person.identity - stranger.identity_mean) / stranger.identity_std),
-        offset=known(state.person.offset + face.mean - stranger.mean),
+        identity=known((state.person.identity - unknown.identity_mean) / unknown.identity_std),
+        offset=known(state.person.offset + face.mean - unknown.mean),
         who=jnp.where(lost, -1, state.who - 1).astype(jnp.int32),
         is_adjusted=is_adjusted,
         status=jnp.where(lost, LOST, DEFORMABLE).astype(jnp.int32),

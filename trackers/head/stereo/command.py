@@ -11,7 +11,7 @@ from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.head.common.input import Place, place_of
-from jaxfilters.trackers.head.common.outcome import finite, run_report, told
+from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.state import HeadOptions
 from jaxfilters.trackers.head.common.summary import write_summary
@@ -44,7 +44,7 @@ def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, s
         warn(run.place.note)
     followed = run.follow()
     report = run_report(run, followed) | {
-        "learnt_contribution": finite(float(session.contribution)),
+        "explained_contribution": finite(float(session.contribution)),
         "config": dataclasses.asdict(settings),
         "options": {
             name: str(value) if value is not None else None
@@ -55,7 +55,7 @@ def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, s
     truth = None if run.place.truth is None else run.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
     run.conclude(followed)
-    return told(report, options)
+    return format_report(report, options)
 
 
 def _session(place: Place, settings: HeadOptions) -> HeadSession:

@@ -49,8 +49,8 @@ def why_unmatched(
     seen = found >= LEAST_SCORE
     if seen.sum() < FEWEST:
         return (
-            f"only {seen.sum()} of {len(points)} landmarks are seen in image {c}, by a correlation of {LEAST_SCORE:g}: "
-            "it shows another moment or another scene, or the face is hidden."
+            f"only {seen.sum()} of {len(points)} landmarks are found in image {c}, by a correlation of "
+            f"{LEAST_SCORE:g}: it shows another moment or another scene, or the face is hidden."
         )
     inverse = np.linspace(-1 / _CLOSEST, 1 / _CLOSEST, 4001)
     away = np.linalg.norm(epipolar.seen_at(rig, points, inverse, source=0, target=c) - at[:, None], axis=-1)

@@ -69,12 +69,12 @@ class HeadSession:
 
     @property
     def model(self) -> FaceModel | None:
-        """The face as learnt so far; `None` before registration."""
+        """The face as estimated so far; `None` before registration."""
         return None if self._following.state is None else self._following.state.model
 
     @property
     def contribution(self) -> float:
-        """Share of the deformation seen so far that the modes explain, 0 to 1; 0 before there was any."""
+        """Share of the deformation observed so far that the modes explain, 0 to 1; 0 before there was any."""
         state = self._following.state
         return 0.0 if state is None else float(learning.contribution(state.learner))
 
@@ -194,7 +194,7 @@ class _HeadTracker:
 
 
 def _with_known_face(state: HeadState, old: HeadState) -> tuple[HeadState, bool]:
-    """The new state with what was learnt of deformations, if the face is that of before (specification, section 1)."""
+    """The new state with the deformations of before, if the face is that of before."""
     R, t = align(old.registered.shape, state.registered.shape)
     moved = old.registered.shape @ R.T + t
     apart = float(jnp.sqrt(jnp.mean(jnp.sum((moved - state.registered.shape) ** 2, axis=-1))))

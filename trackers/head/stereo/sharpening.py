@@ -47,7 +47,7 @@ def sharpened(
     slopes: Slopes,
     rig: CameraRig,
 ) -> Sharpened:
-    """The shape with depths found anew, with the skin inclined as has been learnt.
+    """The shape with depths found anew, with the skin inclined as estimated.
 
     A window of the second camera shows a patch of skin from another side than that of the first: matched as it is,
     it is found where the two pictures are most alike, not where the landmark is. Here it is stretched as the skin

@@ -37,7 +37,7 @@ from jaxfilters.trackers.head.common.state import (
     Registered,
 )
 from jaxfilters.trackers.head.stereo.sharpening import first_slopes, sharpened
-from jaxfilters.trackers.head.stereo.ways import WAYS, Way
+from jaxfilters.trackers.head.stereo.variants import VARIANTS, Variant
 from jaxfilters.typing import AnyKey
 
 FEWEST_ANCHORED, MOST_STRANGE = 2, 35
@@ -49,7 +49,7 @@ MOST_ASTRAY = 10.0
 """Millimetres and degrees to which particles spread about the place where a face was lost, by one more every frame."""
 SHARPENING = (15, 300)
 """Frames: how often, and how long after registration, the registered shape is triangulated anew."""
-FIRST_LOOSENESS = 0.3**2
+FIRST_MODEL_VARIANCE = 0.3**2
 """mm^2."""
 MOST_STEPS = 30.0
 """Frame times: a longer gap is treated as one of this length."""
@@ -75,12 +75,12 @@ def begin(
         time: Of these, seconds.
         rig: Cameras.
         options: Constants.
-        diffusion: Of the particles before anything was learnt; that of the options if none.
+        diffusion: Of the particles before anything was estimated; that of the options if none.
     """
     images = jnp.asarray(images, pose.dtype)
     slopes = unknown_slopes(len(model.mean))
     registered = _registered(images, model.mean, pose, slopes, rig)
-    if WAYS[options.mode].sharpens:
+    if VARIANTS[options.mode].sharpens:
         slopes = first_slopes(images, model.mean, pose, rig)
         registered = _sharper(images, model.mean, pose, slopes, rig)
     x = jnp.concatenate([registered.pose, jnp.zeros(NUM_MODES, pose.dtype)])
@@ -93,12 +93,12 @@ def begin(
         registered=registered,
         recent=nothing_changed(images, registered.shape, registered.pose, rig),
         slopes=slopes,
-        looseness=jnp.full(len(face.mean), FIRST_LOOSENESS, x.dtype),
-        misfit=jnp.ones((), x.dtype),
+        model_variance=jnp.full(len(face.mean), FIRST_MODEL_VARIANCE, x.dtype),
+        residual_scale=jnp.ones((), x.dtype),
         learner=learning.nothing_learnt(face.mean, face.templates),
         last_good=x,
         misses=jnp.zeros((), jnp.int32),
-        strange=jnp.zeros((), jnp.int32),
+        num_outliers=jnp.zeros((), jnp.int32),
         age=jnp.zeros((), jnp.int32),
         time=jnp.asarray(time, x.dtype),
         key=key,
@@ -131,7 +131,7 @@ def advance(
 def _step(
     rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadOptions
 ) -> tuple[HeadState, HeadTrack]:
-    way = WAYS[options.mode]
+    way = VARIANTS[options.mode]
     images = images.astype(state.belief.mean.dtype)
     key, search_key, lost_key = jax.random.split(state.key, 3)
     state = at_last_good(lost_key, state)
@@ -153,8 +153,8 @@ def _step(
     score = score_at(model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(model, looks, rig, belief.mean, images))
     is_strange = estimate.num_anchored < FEWEST_ANCHORED
-    strange = jnp.where(is_strange, state.strange + 1, jnp.maximum(state.strange - 2, 0))
-    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (strange > MOST_STRANGE)
+    num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     state = _learnt(way, state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
@@ -163,7 +163,7 @@ def _step(
     state = state._replace(
         last_good=jnp.where(missed, state.last_good, state.belief.mean),
         misses=jnp.where(missed, state.misses + 1, 0),
-        strange=strange,
+        num_outliers=num_outliers,
         age=state.age + 1,
         time=jnp.maximum(time, state.time),
         key=key,
@@ -172,7 +172,7 @@ def _step(
 
 
 def at_last_good(key: Array, state: Any) -> Any:
-    """A lost face is searched for where it was last seen, ever farther around: particles would wander in noise.
+    """A lost face is searched for where it was last observed, ever farther around: particles would wander in noise.
 
     Args:
         key: Random key.
@@ -208,7 +208,7 @@ def _held(estimate: Estimate, search: AdaptiveDiffusionState, model: FaceModel, 
 
 
 def _learnt(
-    way: Way,
+    way: Variant,
     state: HeadState,
     usable: FaceModel,
     search: AdaptiveDiffusionState,
@@ -237,8 +237,8 @@ def _learnt(
         model=model,
         recent=keep(estimate.recent, state.recent),
         slopes=keep(estimate.slopes, state.slopes),
-        looseness=keep(estimate.looseness, state.looseness),
-        misfit=keep(estimate.misfit, state.misfit),
+        model_variance=keep(estimate.model_variance, state.model_variance),
+        residual_scale=keep(estimate.residual_scale, state.residual_scale),
         learner=learner,
     )
 

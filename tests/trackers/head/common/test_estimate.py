@@ -9,7 +9,7 @@ from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.head.common import estimate as module
-from jaxfilters.trackers.head.common.estimate import LOOSENESS, MISFIT, around_mode
+from jaxfilters.trackers.head.common.estimate import MODEL_VARIANCE, RESIDUAL_SCALE, around_mode
 from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS, HeadOptions
 from jaxfilters.trackers.head.stereo.registration import register
@@ -84,9 +84,9 @@ def test_a_face_that_deforms_is_measured(face):
 @pytest.mark.system
 def test_landmarks_that_moved_become_loose(face):
     found = face.refined(2)
-    change = np.sqrt(np.asarray(found.looseness)) - np.sqrt(np.asarray(face.state.looseness))
+    change = np.sqrt(np.asarray(found.model_variance)) - np.sqrt(np.asarray(face.state.model_variance))
     assert change[list(MOUTH)].min() > change[list(EYES)].max()
-    for values, (low, high) in ((found.looseness, LOOSENESS), (found.misfit, MISFIT)):
+    for values, (low, high) in ((found.model_variance, MODEL_VARIANCE), (found.residual_scale, RESIDUAL_SCALE)):
         assert np.all((np.asarray(values) >= low * (1 - 1e-5)) & (np.asarray(values) <= high))
 
 

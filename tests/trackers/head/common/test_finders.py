@@ -14,11 +14,11 @@ def mesh(monkeypatch):
     """A finder whose mesh gives the answers of a list, one after another."""
     answers = []
 
-    class Told:
+    class FrameInformation:
         def detect(self, image):
             return answers.pop(0)
 
-    monkeypatch.setattr(module, "MeshDetector", Told)
+    monkeypatch.setattr(module, "MeshDetector", FrameInformation)
     return MeshFinder(), answers
 
 

@@ -182,7 +182,7 @@ def test_options_that_differ_in_numbers_share_a_program():
     """The diffusion is a leaf of filters and state, not a constant of what is compiled."""
     fixed = [HeadOptions(diffusion="fixed", fixed_diffusion=value, seed=i) for i, value in enumerate((1.0, 5.0))]
     assert compiled(fixed[0]) == compiled(fixed[1]) == compiled(HeadOptions())
-    assert compiled(HeadOptions(diffusion="learnt")) != compiled(HeadOptions())
+    assert compiled(HeadOptions(diffusion="online")) != compiled(HeadOptions())
     assert compiled(HeadOptions(mode="paper")) != compiled(HeadOptions())
     one, two = (jax.tree.structure(first_diffusion(options)) for options in fixed)
     assert one == two

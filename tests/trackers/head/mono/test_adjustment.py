@@ -63,7 +63,7 @@ def window_of(rig, face, seen, options):
 def told_by(window, information):
     """A frame that looks as the window's last one, and tells something else."""
     view = jax.tree.map(lambda leaf: leaf[-1:], window.views)
-    told = type("Told", (), {"information": information})
+    told = type("FrameInformation", (), {"information": information})
     return Frame(view, window.poses[-1], window.expressions[-1], told)
 
 
@@ -190,7 +190,8 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     state = state_of(rig, face, seen, USUAL)
     x = x.at[6:].set(state.modes.coefficients(face, true.expressions[2]))
     frame = jax.jit(frame_of)(face, rig, alone, true.person, x, state.modes, USUAL.prior)
-    found = np.asarray(jax.jit(uncertainty)(face, window, USUAL.prior, mean_person(face), frame.told.response), float)
+    response = frame.about_person.response
+    found = np.asarray(jax.jit(uncertainty)(face, window, USUAL.prior, mean_person(face), response), float)
 
     units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std)])
     root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T

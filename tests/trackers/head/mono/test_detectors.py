@@ -18,14 +18,14 @@ IMAGE = np.zeros((480, 640), np.uint8)
 def test_vertices_become_landmarks(monkeypatch):
     mesh = np.random.default_rng(0).uniform(0, 400, (478, 2))
 
-    class Told:
+    class FrameInformation:
         def __init__(self, *, refined):
             assert refined
 
         def mesh(self, image):
             return mesh if image.any() else None
 
-    monkeypatch.setattr(module, "MeshDetector", Told)
+    monkeypatch.setattr(module, "MeshDetector", FrameInformation)
     detector = DETECTORS["mediapipe"]()
     assert detector.detect(IMAGE, None) == "no face"
     seen = detector.detect(IMAGE + np.uint8(1), None)

@@ -7,12 +7,12 @@ import pytest
 
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.multilinear import learn
-from jaxfilters.models.face.past import joined
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.remembered import hypotheses, remember
+from jaxfilters.models.face.square_root_prior import joined
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head.mono.adjustment import informed
-from jaxfilters.trackers.head.mono.past import left_behind, seen_by
+from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame
 from jaxfilters.trackers.head.mono.state import MonoOptions, Window
 
 NUM, KEPT = 8, 5
@@ -50,27 +50,26 @@ def window_of(face, rig, views, bundle, prior):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("who", ["stranger", "remembered"])
+@pytest.mark.parametrize("who", ["unknown", "remembered"])
 def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     """The past's Gaussian has the gradient of the frames that it replaces: nothing moves, but for rounding.
 
     And but for the size in proportion to which an offset is held: that of the expressions in the frames at hand, here
     about one per cent more or less, and so are offsets of half a millimetre.
     """
-    stranger, known, views, truth = scene
-    face = stranger if who == "stranger" else known
+    unknown, known, views, truth = scene
+    face = unknown if who == "unknown" else known
     prior = OPTIONS.prior
     together = best(face, rig, views, truth, prior)
     window = window_of(face, rig, views, together, prior)
-    gone = [
-        left_behind(stranger, face, window, together.person, jnp.asarray(i), OPTIONS.prior) for i in range(KEPT, NUM)
-    ]
-    past = seen_by(joined(joined(*gone[:2]), gone[2]), stranger, face)
+    left = partial(marginalize_frame, unknown, face, window, together.person)
+    gone = [left(jnp.asarray(i), OPTIONS.prior) for i in range(KEPT, NUM)]
+    past = about_face(joined(joined(*gone[:2]), gone[2]), unknown, face)
     few = jax.tree.map(lambda leaf: leaf[:KEPT], views)
     start = together._replace(poses=together.poses[:KEPT], expressions=together.expressions[:KEPT])
     with_past = best(face, rig, few, start, prior._replace(past=past))
     without = best(face, rig, few, start, prior)
-    unit = np.asarray(stranger.identity_std)
+    unit = np.asarray(unknown.identity_std)
     moved = lambda bundle: np.abs(np.asarray(bundle.person.identity - together.person.identity)) / unit
     assert moved(with_past).max() < 5e-3
     assert moved(without).max() > 0.02
@@ -80,14 +79,14 @@ def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
 
 @pytest.mark.system
 def test_a_past_is_about_the_same_faces_whoever_it_is_told_to(x64, rig, scene):
-    """Differences of its energy, for two faces written once about the stranger and once about the other."""
-    stranger, known, views, truth = scene
-    window = window_of(stranger, rig, views, truth, Prior(1.0, 0.7))
-    past = left_behind(stranger, stranger, window, truth.person, jnp.asarray(2), OPTIONS.prior)
-    other = seen_by(past, stranger, known)
+    """Differences of its energy, for two faces written once about the unknown and once about the other."""
+    unknown, known, views, truth = scene
+    window = window_of(unknown, rig, views, truth, Prior(1.0, 0.7))
+    past = marginalize_frame(unknown, unknown, window, truth.person, jnp.asarray(2), OPTIONS.prior)
+    other = about_face(past, unknown, known)
     rng = np.random.default_rng(1)
     about_stranger = rng.normal(0, 0.3, (2, 40))
-    apart = np.concatenate([np.zeros(10), np.asarray(known.mean - stranger.mean).ravel()])
+    apart = np.concatenate([np.zeros(10), np.asarray(known.mean - unknown.mean).ravel()])
 
     def energy(past, p):
         return 0.5 * p @ np.asarray(past.information) @ p - p @ np.asarray(past.root.T @ past.towards)

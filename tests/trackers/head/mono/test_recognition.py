@@ -44,7 +44,7 @@ def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, 
     assert np.all(track.who[-20:] == 3)
     assert np.all(track.who[:START] == -1)
     errors = track.pose[-20:] - made.poses[-20:]
-    # A hundredth of 650 mm, where a stranger's size is known to 3 %.
+    # A hundredth of 650 mm, where a unknown's size is known to 3 %.
     assert np.abs(errors[:, 2]).mean() < 6.5
     assert np.all(np.abs(errors) < 3 * track.pose_std[-20:] + 1e-3)
     centred = lambda shapes: shapes - shapes.mean(axis=1, keepdims=True)

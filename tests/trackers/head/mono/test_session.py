@@ -47,7 +47,7 @@ def test_a_face_is_followed_from_detections_on(followed, talking):
     assert said(session) == ["registered"]
     assert np.isnan(track.pose[:START]).all()
     errors = np.abs(track.pose[START:] - made.poses[START:]) * DEGREES
-    # The size of a stranger's face is known to 3 %: of 650 mm some 20, and as much of the way aside. Turns are better
+    # The size of a unknown's face is known to 3 %: of 650 mm some 20, and as much of the way aside. Turns are better
     # than the thesis's means (0.43, 2.33, 2.45 degrees) at once.
     assert errors[:, :2].mean() < 3.0
     assert errors[:, 2].max() < 60.0

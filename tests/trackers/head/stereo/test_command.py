@@ -91,7 +91,7 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     assert report["status"] == {"initialising": 2, "rigid": 4, "deformable": 12, "lost": 2, "skipped": 0}
     assert report["longest_stretch_frames"] == 8
     assert report["events"] == [{"frame": 2, "what": "registered"}, {"frame": 12, "what": "learnt"}]
-    assert report["learnt_contribution"] == 0.75
+    assert report["explained_contribution"] == 0.75
     assert report["errors"] == {}
     assert report["trouble"] == []
     assert report["frames_per_second"] > 0

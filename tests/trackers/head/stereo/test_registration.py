@@ -221,10 +221,10 @@ def test_an_average_face_is_posed_exactly():
 def test_one_camera_refuses_what_is_no_face(scene):
     images, points, face = scene
     rig = monocular(CAMERA)
-    strange = points.copy()
-    strange[6:8, 1] += 80
+    num_outliers = points.copy()
+    num_outliers[6:8, 1] += 80
     with pytest.raises(RegistrationError, match="no face"):
-        register_monocular(images[0], strange, rig)
+        register_monocular(images[0], num_outliers, rig)
     with pytest.raises(ValueError, match="one camera"):
         register_monocular(images[0], points, face.rig)
     with pytest.raises(ValueError, match="eyes_apart_mm"):

@@ -217,7 +217,7 @@ def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
         statuses.append(session.process(images[i % 9][None], np.array([0.5 * i])).status[0])
     assert statuses[:17] == [INITIALISING] + [RIGID] * 16
     np.testing.assert_allclose(asked, np.tile(points.mean(axis=0), (8, 1)), atol=1)
-    assert session.events[-1] == (16, "lost: the face is seen elsewhere")
+    assert session.events[-1] == (16, "lost: the face is detected elsewhere")
     # It is not the old place that counts now, but what the detector sees.
     again = [session.process(images[i][None], np.array([9.0 + i])).status[0] for i in range(6)]
     assert again == [LOST] * STABLE_FRAMES + [RIGID]

@@ -204,5 +204,5 @@ def test_a_face_behind_noise_is_missed_and_then_lost(videos):
     np.testing.assert_allclose(found.pose[-1], video.video.poses[37], atol=0.5)
     assert int(back.misses) == 0
     # What was learnt of the face stays as it was.
-    for name in ("slopes", "looseness", "misfit", "registered"):
+    for name in ("slopes", "model_variance", "residual_scale", "registered"):
         jax.tree.map(np.testing.assert_array_equal, getattr(after, name), getattr(state, name))

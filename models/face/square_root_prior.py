@@ -1,8 +1,8 @@
-"""What was told earlier of parameters that are still sought: a Gaussian, perhaps of some directions only.
+"""Earlier information about parameters that are still estimated: a Gaussian, perhaps of some directions only.
 
 It is kept by a root of its information and not by the information (G. J. Bierman, "Factorization Methods for Discrete
 Sequential Estimation", 1977, chapter V). Frames leave many directions open: a head that is longer and farther away
-looks the same. In single precision the sum of what many frames told is then not positive, and has no root any more.
+looks the same. In single precision the sum of the information of many frames is then not positive, and has no root.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxfilters.math.linalg import tria
 
 
-class Past(NamedTuple):
+class SquareRootPrior(NamedTuple):
     """Minus its logarithm is `|root p - towards|^2 / 2` for the parameters p."""
 
     root: Float[Array, "d d"]
@@ -26,15 +26,15 @@ class Past(NamedTuple):
         return _product(self.root.T, self.root)
 
 
-def nothing(num_parameters: int, dtype: DTypeLike) -> Past:
-    """Of parameters of which nothing was told."""
-    return Past(jnp.zeros((num_parameters, num_parameters), dtype), jnp.zeros(num_parameters, dtype))
+def nothing(num_parameters: int, dtype: DTypeLike) -> SquareRootPrior:
+    """Of parameters about which there is no information."""
+    return SquareRootPrior(jnp.zeros((num_parameters, num_parameters), dtype), jnp.zeros(num_parameters, dtype))
 
 
-def of_measurements(J: Float[Array, "m d"], values: Float[Array, " m"]) -> Past:
+def of_measurements(J: Float[Array, "m d"], values: Float[Array, " m"]) -> SquareRootPrior:
     """Of at most d measurements of standard deviation one: `J p` was measured to be `values`."""
     rows = J.shape[1] - len(values)
-    return Past(jnp.pad(J, ((0, rows), (0, 0))), jnp.pad(values, (0, rows)))
+    return SquareRootPrior(jnp.pad(J, ((0, rows), (0, 0))), jnp.pad(values, (0, rows)))
 
 
 def of_energy(
@@ -42,7 +42,7 @@ def of_energy(
     gradient: Float[Array, " d"],
     at: Float[Array, " d"],
     unit: Float[Array, " d"],
-) -> Past:
+) -> SquareRootPrior:
     """Of an energy with that gradient at some parameters, and that second derivative.
 
     Args:
@@ -50,7 +50,7 @@ def of_energy(
             which it tells less than such an error says nothing.
         gradient: In the same units.
         at: The parameters.
-        unit: Of each; of a parameter whose unit is 0 nothing is told.
+        unit: Of each; there is no information about a parameter whose unit is 0.
     """
     values, vectors = jnp.linalg.eigh((information + information.T) / 2)
     rounding = values.size * jnp.finfo(values.dtype).eps * values[-1]
@@ -59,22 +59,22 @@ def of_energy(
     inverse = jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
     root = jnp.where(is_told[:, None], deviation[:, None] * vectors.T, 0.0) * inverse
     downhill = jnp.where(is_told, _product(vectors.T, gradient) / deviation, 0.0)
-    return Past(root, _product(root, at) - downhill)
+    return SquareRootPrior(root, _product(root, at) - downhill)
 
 
-def joined(past: Past, more: Past) -> Past:
-    """Both, which were told independently."""
+def joined(past: SquareRootPrior, more: SquareRootPrior) -> SquareRootPrior:
+    """The product of both, which are independent."""
     rows = jnp.concatenate([jnp.column_stack(past), jnp.column_stack(more)])
     root = tria(rows.T).T[:-1]
-    return Past(root[:, :-1], root[:, -1])
+    return SquareRootPrior(root[:, :-1], root[:, -1])
 
 
-def seen_from(past: Past, shift: Float[Array, " d"]) -> Past:
+def shifted(past: SquareRootPrior, shift: Float[Array, " d"]) -> SquareRootPrior:
     """The same about what parameters are beyond a shift."""
     return past._replace(towards=past.towards - _product(past.root, shift))
 
 
-def residuals(past: Past, parameters: Float[Array, " d"]) -> Float[Array, " d"]:
+def residuals(past: SquareRootPrior, parameters: Float[Array, " d"]) -> Float[Array, " d"]:
     """In standard deviations."""
     return _product(past.root, parameters) - past.towards
 

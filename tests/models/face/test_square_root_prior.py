@@ -5,14 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.past import Past, joined, nothing, of_energy, of_measurements, residuals, seen_from
+from jaxfilters.models.face.square_root_prior import (
+    SquareRootPrior,
+    joined,
+    nothing,
+    of_energy,
+    of_measurements,
+    residuals,
+    shifted,
+)
 
 SIZE = 12
 STD = np.logspace(-3, 1, SIZE)
 """Of the parameters, whose units differ."""
 
 
-def energy(past: Past, p: np.ndarray) -> float:
+def energy(past: SquareRootPrior, p: np.ndarray) -> float:
     return 0.5 * float(np.sum(np.square(residuals(past, jnp.asarray(p)))))
 
 
@@ -58,7 +66,7 @@ def test_a_shift_moves_the_energy(x64):
     rng = np.random.default_rng(3)
     past = of_energy(*map(jnp.asarray, (*told_of_few(rng), STD)))
     p, shift = STD * rng.normal(size=(2, SIZE))
-    assert energy(seen_from(past, jnp.asarray(shift)), p) == pytest.approx(energy(past, p + shift), rel=1e-9)
+    assert energy(shifted(past, jnp.asarray(shift)), p) == pytest.approx(energy(past, p + shift), rel=1e-9)
 
 
 def test_measurements_are_least_squares(x64):

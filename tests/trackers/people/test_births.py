@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people.newcomers import LEAST_CELLS, LEAST_SHARE, cells_of, newcomer, padded, stride
+from jaxfilters.trackers.people.births import LEAST_CELLS, LEAST_SHARE, births, cells_of, padded, stride
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -17,9 +17,9 @@ SOMEBODY = (0.7, 1.1, 1.75, 0.45)
 
 @pytest.fixture(scope="module")
 def found(camera, floor):
-    """Looks for a newcomer where somebody is drawn, given one person who is known or nobody."""
+    """Looks for a births where somebody is drawn, given one person who is known or nobody."""
     scene = people_scene([camera], floor, config=CONFIG)
-    search = jax.jit(newcomer)
+    search = jax.jit(births)
 
     def run(mask, known=None, present=True):
         places = jnp.array([known or (0.0, 0.0, 1.7, 0.45), (1.0, 1.0, 1.7, 0.45)])
@@ -81,14 +81,14 @@ def test_cells_are_those_of_the_floor_that_a_camera_sees(camera):
 
 @pytest.mark.system
 def test_cells_that_only_fill_up_change_nothing(camera, draw, floor):
-    """A scene finds the same newcomers as with its own number of cells."""
+    """A scene finds the same births as with its own number of cells."""
     scene = people_scene([camera], floor, config=CONFIG)
     own = cells_of(scene.cameras, scene.furniture, np.asarray(floor, float), CONFIG)
     assert 0 < len(own.xy) < LEAST_CELLS == len(scene.cells.xy)
     places, nobody = jnp.tile(jnp.array([0.0, 0.0, 1.7, 0.45]), (2, 1)), jnp.zeros(2, bool)
     both = draw(camera, [SOMEBODY, (-1.0, 0.2, 1.7, 0.45)])[0]
     shown = [both, draw(camera, [SOMEBODY])[0], np.zeros_like(both)]
-    search = jax.jit(newcomer)
+    search = jax.jit(births)
     frames = [(CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True)),) for mask in shown]
     filled, plain = (
         [search(replace(scene, cells=cells), places, nobody, frame) for frame in frames] for cells in (scene.cells, own)

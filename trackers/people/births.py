@@ -17,19 +17,19 @@ from jaxfilters.trackers.people.silhouettes import area_of, body_of, presence_of
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
 
 REDUCED_COLS = 160
-"""Columns of the images in which newcomers are looked for, at most."""
+"""Columns of the images in which births are looked for, at most."""
 SAMPLES = (12, 6)
 """Over the box of an ellipse half as wide and high again: rows and columns."""
 MARGIN = 1.25
 LEAST_SHARE = 0.5
-"""Of the samples that an image must show for somebody to be found there."""
+"""Of the samples that an image must show for a person to be found there."""
 
 LEAST_CELLS = 1024
 """A room of 90 square metres."""
 
 
-class Newcomer(NamedTuple):
-    """Where somebody may have come in this frame."""
+class Birth(NamedTuple):
+    """Where a person may have come in this frame."""
 
     xy: Float[Array, " 2"]
     """Metres."""
@@ -78,7 +78,7 @@ def _offsets():
 
 
 def stride(shape: tuple[int, int]) -> int:
-    """Every how many pixels one is looked at for newcomers."""
+    """Every how many pixels one is looked at."""
     return max(1, -(-shape[1] // REDUCED_COLS))
 
 
@@ -113,13 +113,13 @@ def _look(camera, furniture, config, xy):
     return jax.vmap(one)(xy)
 
 
-def newcomer(
+def birth(
     scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
-) -> Newcomer:
+) -> Birth:
     """The floor point whose person explains most, of those with enough evidence a pixel.
 
-    The mean over a silhouette says whether somebody is there, but not where: somebody small and far away fits into any
-    large silhouette. The sum, which is the log likelihood, says where. One newcomer a frame: whoever stands beside is
+    The mean over a silhouette says whether a person is there, but not where: a person small and far away fits into any
+    large silhouette. The sum, which is the log likelihood, says where. One birth a frame: whoever stands beside is
     found in the next, once it is known what the first explains.
     """
     config, cells = scene.config, scene.cells
@@ -134,9 +134,9 @@ def newcomer(
     # One sample stands for this share of the ellipse's area.
     per_area = (2 * MARGIN) ** 2 / (jnp.pi * SAMPLES[0] * SAMPLES[1])
     evidence = total * per_area / jnp.maximum(shares, 1e-6)
-    found = evidence > config.newcomer_evidence
+    found = evidence > config.birth_evidence
     best = jnp.argmax(jnp.where(found, explained, -jnp.inf))
-    return Newcomer(cells.xy[best], found[best])
+    return Birth(cells.xy[best], found[best])
 
 
 def _reduced_contrast(scene, camera, furniture, places, active, frame):

@@ -27,7 +27,7 @@ Templates = tuple[Array, Array]
 """(C, K, T, T) each: of the registered face, and of the face as it looked last."""
 
 
-class Way(NamedTuple):
+class Variant(NamedTuple):
     """One tracker's part of every step."""
 
     templates: Callable[[HeadState, FaceModel, CameraRig, Array], Templates]
@@ -39,7 +39,7 @@ class Way(NamedTuple):
     estimate: Callable[..., tuple[Estimate, AdaptiveDiffusionState]]
     """`(search, state, model, images, rig, predicted motion, frame times, options)`, and the search after it."""
     measured: Callable[..., Templates]
-    """`(state, estimate, images, rig, whether it is measured)`: the shape that is learnt, the windows about it."""
+    """`(state, estimate, images, rig, whether it is measured)`: the shape that is estimated, the windows about it."""
     follow: float
     """How far the mean shape goes along with those that are measured."""
     still: learning.Still
@@ -96,7 +96,7 @@ def _refined(
     before, x = state.search, estimate.belief.mean
     velocity = (x - before.estimate)[:POSE] / jnp.maximum(before.elapsed + steps, 1e-3)
     fit = before.fit
-    if options.diffusion == "learnt":
+    if options.diffusion == "online":
         fit = diffusion.update(fit, before.velocity, velocity - before.velocity)
     after = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=fit)
     return estimate, jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), after, search)
@@ -128,9 +128,9 @@ def _recalculated(state: HeadState, estimate: Estimate, images: Array, rig: Came
     return jax.lax.cond(is_measured, lambda: again(estimate.belief.mean[:POSE], rig), nothing)
 
 
-WAYS = {
-    "modern": Way(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
-    "paper": Way(
+VARIANTS = {
+    "modern": Variant(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
+    "paper": Variant(
         _flat_templates, _layered_search, _around_mode, _recalculated, 1.0, learning.without_weighted_motion, False
     ),
 }
