@@ -20,7 +20,6 @@ MODERN, PAPER = HeadOptions(), HeadOptions(mode="paper")
 FIXED = HeadOptions(mode="paper", diffusion="fixed", fixed_diffusion=1.0)
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Published errors of the adaptive tracker, millimetres and degrees (P, tables 3 and 4)."""
-begin = jax.jit(module.begin, static_argnames="options")
 
 
 class Video:
@@ -34,7 +33,7 @@ class Video:
         model, pose, _ = self.registration
         time = jnp.asarray(self.video.times[0], float)
         arguments = jax.random.key(seed), model, pose, self.images[0], time, self.video.rig
-        return begin(*arguments, options=compiled(options), diffusion=first_diffusion(options))
+        return module.begin(*arguments, options=compiled(options), diffusion=first_diffusion(options))
 
     def advance(self, state, start, stop, options, filters=None, chunk=CHUNK):
         """State after the frames `start` to `stop`, at most a chunk, and their rows."""
