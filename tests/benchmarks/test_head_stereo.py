@@ -4,8 +4,6 @@ from functools import partial
 from types import SimpleNamespace
 
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,7 +15,7 @@ from jaxfilters.benchmarks.scenarios import head_stereo
 from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
-from jaxfilters.models.face.rig import nominal, project_shape
+from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic import face_sequence
 from jaxfilters.models.synthetic.face_motion import gain_schedule, occlusion_schedule
 from jaxfilters.trackers.head.state import RIGID, HeadOptions, HeadTrack
@@ -39,8 +37,7 @@ def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
     true_shapes = np.repeat(MEAN_SHAPE[None], t + 1, axis=0)
     poses[:, 2] += 650
     rig = nominal()
-    project = jax.vmap(lambda pose: project_shape(rig, jnp.asarray(MEAN_SHAPE, float), pose)[0])
-    uv = np.asarray(project(jnp.asarray(poses, float)), float)
+    uv = np.asarray(runs._projected(rig, true_shapes, np.asarray(poses, np.float32)), float)
     truth = SimpleNamespace(poses=poses, shapes=true_shapes, uv=uv, rig=rig)
     track = HeadTrack(
         pose=poses[1:] + errors / DISPLAY,
