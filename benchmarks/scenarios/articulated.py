@@ -21,7 +21,7 @@ from jaxfilters.benchmarks.scenarios import _articulated_paper as paper
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.filter import run as run_filter
 from jaxfilters.models.synthetic.articulated import SHAPES, simulate_paper
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 NUM_SEEDS, QUICK_NUM_SEEDS = 50, 6
 NUM_HELD_SEEDS, QUICK_NUM_HELD_SEEDS = 20, 2

@@ -18,7 +18,7 @@ from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic import face_sequence
 from jaxfilters.models.synthetic.face_motion import gain_schedule, occlusion_schedule
-from jaxfilters.trackers.head.state import RIGID, HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.state import RIGID, HeadOptions, HeadTrack
 
 K, ASTRAY = 10, 50.0
 NUM_FRAMES = 41
