@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -208,6 +209,7 @@ def _stacked_lines(points):
     return jnp.concatenate([alpha.ravel(), rho.ravel()])
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def _direction(delta):
     """Angle, unit vector and length of vectors in the image; those without length are taken for that of x."""
     without = jnp.sum(delta * delta, axis=-1) < _NO_LENGTH**2

@@ -8,6 +8,7 @@ programs of thousands of equations out of second derivatives.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -36,6 +37,7 @@ _CROSS = np.array(
 """`_CROSS @ v` is the matrix of the cross product with v from the left."""
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def scaled_rotation(q: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     """|q|^2 times the rotation matrix of q = (w, x, y, z): a polynomial, hence smooth even at q = 0.
 
@@ -52,6 +54,7 @@ def unit_rotation(q: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     return scaled_rotation(q) / jnp.sum(q * q)
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def turn(matrix: Float[Array, "3 3"], points: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """`matrix` times each point."""
     return jnp.sum(matrix * points[..., None, :], axis=-1)

@@ -43,8 +43,8 @@ def stacked(capsules, axis):
 @pytest.mark.system
 def test_terms_against_the_rendered_image(x64, camera, kind, random_transform):
     shape, T, observed = kind.shape(), random_transform(8), observed_image(camera.shape)
-    terms = kind.compare(camera, shape, T, observed, MAX_ERROR)
-    expected = terms_by_pixel(kind.render(camera, shape, T), observed)
+    terms = jax.jit(lambda: kind.compare(camera, shape, T, observed, MAX_ERROR))()
+    expected = terms_by_pixel(jax.jit(lambda: kind.render(camera, shape, T))(), observed)
     assert expected[1] > expected[2] > 30
     np.testing.assert_allclose(terms, expected, rtol=1e-12)
 
