@@ -35,6 +35,7 @@ def stills(shape=(48, 48), stride=4):
 
 
 @pytest.mark.system
+@pytest.mark.optimised
 def test_size_and_noise_of_a_rendered_hand_are_learnt_through_the_renderer():
     theta = HandStills(AVERAGE, jnp.float32(0.01), jnp.zeros((2, 21)))
     free = HandStills(HandProportions(fit.positive, fit.positive, fit.positive), fit.positive, fit.free)
