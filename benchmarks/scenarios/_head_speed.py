@@ -100,8 +100,8 @@ def prepared(recorded: Recording, options: HeadOptions) -> Prepared:
     pose, times = jnp.asarray(registration.pose, float), truth.times.astype(np.float32)
     first, time = jnp.asarray(images[0]), jnp.asarray(times[0], float)
     program = compiled(options)
-    start = jax.random.key(0), registration.model, pose, first, time, truth.rig
-    state = begin(*start, options=program, diffusion=first_diffusion(options))
+    registered = jax.random.key(0), registration.model, pose, first, time, truth.rig
+    state = begin(*registered, options=program, diffusion=first_diffusion(options))
     state = state._replace(age=jnp.full_like(state.age, SHARPENING[1]))
     search, is_frame = searches(truth.rig, options), np.ones(BATCH, bool)
     for start in range(1, 1 + WARM_UP * BATCH, BATCH):
