@@ -15,8 +15,8 @@ from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.estimate import refined
-from jaxfilters.trackers.head.common.search import Searches, at, searches
-from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState
+from jaxfilters.trackers.head.common.search import Searches, at, first_diffusion, searches
+from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState, compiled
 from jaxfilters.trackers.head.stereo.registration import register
 from jaxfilters.trackers.head.stereo.track import SHARPENING, advance, begin
 from jaxfilters.trackers.head.stereo.variants import VARIANTS
@@ -99,13 +99,15 @@ def prepared(recorded: Recording, options: HeadOptions) -> Prepared:
     registration = register(images[0], np.asarray(truth.uv[0, 0], float), truth.rig)
     pose, times = jnp.asarray(registration.pose, float), truth.times.astype(np.float32)
     first, time = jnp.asarray(images[0]), jnp.asarray(times[0], float)
-    state = begin(jax.random.key(0), registration.model, pose, first, time, truth.rig, options)
+    program = compiled(options)
+    registered = jax.random.key(0), registration.model, pose, first, time, truth.rig
+    state = begin(*registered, options=program, diffusion=first_diffusion(options))
     state = state._replace(age=jnp.full_like(state.age, SHARPENING[1]))
     search, is_frame = searches(truth.rig, options), np.ones(BATCH, bool)
     for start in range(1, 1 + WARM_UP * BATCH, BATCH):
         batch = slice(start, start + BATCH)
-        state, _ = advance(truth.rig, search, state, images[batch], times[batch], is_frame, options)
-    return Prepared(truth, options, search, jax.block_until_ready(state), images[-BATCH:], times[-BATCH:])
+        state, _ = advance(truth.rig, search, state, images[batch], times[batch], is_frame, program)
+    return Prepared(truth, program, search, jax.block_until_ready(state), images[-BATCH:], times[-BATCH:])
 
 
 def modern_stages(one: Prepared) -> dict[str, Callable]:

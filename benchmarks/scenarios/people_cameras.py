@@ -124,22 +124,23 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
 
 def truth(room: DemoRoom, setup: Setup) -> FloorTracks:
     """Who is on the floor and observed whole by a camera that is still running."""
-    frames = len(room)
+    frames, xy = len(room), room.routes.xy
+    seen = {c: sees_whole(room.cameras[c], xy, setup.width) for c in setup.cameras}
+    on_floor = np.asarray(walkable(jnp.asarray(room.floor), jnp.asarray(xy)))
     rows = []
     for i in range(frames):
         running = [c for c in setup.cameras if any(setup.delivers(c, j, frames) for j in range(i, frames))]
-        seen = np.any([sees_whole(room.cameras[c], room.routes.xy[i], setup.width) for c in running], axis=0)
-        there = seen & room.present(i) & np.asarray(walkable(jnp.asarray(room.floor), jnp.asarray(room.routes.xy[i])))
-        rows += [(i, who, *room.routes.xy[i, who]) for who in np.flatnonzero(there)]
+        there = np.any([seen[c][i] for c in running], axis=0) & room.present(i) & on_floor[i]
+        rows += [(i, who, *xy[i, who]) for who in np.flatnonzero(there)]
     return _tracks(rows)
 
 
 def sees_whole(camera: FloorCamera, xy: np.ndarray, width: float = 1.0) -> np.ndarray:
-    """(people,) who at places (people, 2) is in this share of the columns, in the middle, from the feet to the head."""
+    """(..., people) who at places (..., people, 2) is whole, feet to head, in the middle columns of this share."""
     rows, cols = camera.shape
-    inside = np.ones(len(xy), bool)
+    inside = np.ones(xy.shape[:-1], bool)
     for height in WHOLE_M:
-        uv, depth = (np.asarray(a) for a in camera.project(jnp.asarray(np.insert(xy, 2, height, axis=1))))
+        uv, depth = (np.asarray(a) for a in camera.project(jnp.asarray(np.insert(xy, 2, height, axis=-1))))
         away = np.abs(uv - (np.array([cols, rows]) - 1) / 2)
         inside &= (depth > 0) & np.all(away < np.array([width * (cols - 1), rows - 1]) / 2, axis=-1)
     return inside
@@ -148,7 +149,7 @@ def sees_whole(camera: FloorCamera, xy: np.ndarray, width: float = 1.0) -> np.nd
 def handovers(room: DemoRoom, width: float) -> int:
     """How often the nearest camera that sees a person whole became another one."""
     centers = np.stack([np.asarray(camera.position())[:2] for camera in room.cameras])
-    seen = np.stack([[sees_whole(camera, xy, width) for camera in room.cameras] for xy in room.routes.xy])
+    seen = np.stack([sees_whole(camera, room.routes.xy, width) for camera in room.cameras], axis=1)
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)
     nearest = np.argmin(np.where(seen, distance, np.inf), axis=1)
     somewhere = np.asarray(seen.any(axis=1))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -208,11 +209,12 @@ def _stacked_lines(points):
     return jnp.concatenate([alpha.ravel(), rho.ravel()])
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def _direction(delta):
     """Angle, unit vector and length of vectors in the image; those without length are taken for that of x."""
-    x, y = delta[..., 0], delta[..., 1]
-    square = x * x + y * y
-    without = square < _NO_LENGTH**2
-    x, y = jnp.where(without, 1.0, x), jnp.where(without, 0.0, y)
-    length = jnp.sqrt(x * x + y * y)
-    return jnp.arctan2(y, x), (x / length, y / length), jnp.where(without, 0.0, length)
+    without = jnp.sum(delta * delta, axis=-1) < _NO_LENGTH**2
+    delta = jnp.where(without[..., None], jnp.array([1.0, 0.0], delta.dtype), delta)
+    length = jnp.sqrt(jnp.sum(delta * delta, axis=-1))
+    direction = delta / length[..., None]
+    angle = jnp.arctan2(delta[..., 1], delta[..., 0])
+    return angle, (direction[..., 0], direction[..., 1]), jnp.where(without, 0.0, length)

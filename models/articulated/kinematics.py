@@ -1,13 +1,16 @@
 """Where the joints of an articulated hand are: rotations with a scale, and finger chains in the palm frame.
 
-Source: Shimada et al., equations [9], [10]; frames as in `jaxfilters.models.articulated.layout`. Written by components:
-products of small matrices vectorise badly over an ensemble, and accelerators would round their inputs.
+Source: Shimada et al., equations [9], [10]; frames as in `jaxfilters.models.articulated.layout`. Written as sums of
+elementwise products: accelerators would round the inputs of matrix products, and one equation for each component makes
+programs of thousands of equations out of second derivatives.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters.models.articulated.layout import Layout
@@ -28,19 +31,22 @@ Pivot = Callable[[Float[Array, " fingers"], Float[Array, "fingers 3"], Float[Arr
 """What abduction turns the finger about: `(abduction, base, frame) -> FingerFrames`."""
 
 
+_CROSS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
+"""`_CROSS @ v` is the matrix of the cross product with v from the left."""
+
+
+@jax.jit  # traced once for each shape, though called at many places of a program
 def scaled_rotation(q: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     """|q|^2 times the rotation matrix of q = (w, x, y, z): a polynomial, hence smooth even at q = 0.
 
     `R R^T = |q|^4 I` and `det R = |q|^6`.
     """
-    w, x, y, z = q
-    return jnp.stack(
-        [
-            jnp.stack([w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]),
-        ]
-    )
+    w, v = q[0], q[1:]
+    across = jnp.sum(jnp.asarray(_CROSS, q.dtype) * v, axis=-1)
+    square = jnp.eye(3, dtype=q.dtype) * (w * w - jnp.sum(v * v))
+    return square + 2 * (v[:, None] * v + w * across)
 
 
 def unit_rotation(q: Float[Array, " 4"]) -> Float[Array, "3 3"]:
@@ -48,10 +54,10 @@ def unit_rotation(q: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     return scaled_rotation(q) / jnp.sum(q * q)
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def turn(matrix: Float[Array, "3 3"], points: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """`matrix` times each point."""
-    x, y, z = points[..., 0:1], points[..., 1:2], points[..., 2:3]
-    return matrix[:, 0] * x + matrix[:, 1] * y + matrix[:, 2] * z
+    return jnp.sum(matrix * points[..., None, :], axis=-1)
 
 
 def pivot_base(

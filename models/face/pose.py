@@ -5,10 +5,12 @@ no rotation. Positive yaw turns the nose towards the image's left. Everything is
 `vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def rotation(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Rotation matrix `Rz(roll) Ry(yaw) Rx(pitch)` of (roll, yaw, pitch) in radians."""
     (ca, cb, cc), (sa, sb, sc) = jnp.cos(angles), jnp.sin(angles)
@@ -47,6 +49,7 @@ def turning_axes(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     )
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def turn(shape: Float[Array, "K 3"], R: Float[Array, "3 3"]) -> Float[Array, "K 3"]:
     """`R X` of each point."""
     x, y, z = shape[:, 0], shape[:, 1], shape[:, 2]

@@ -130,6 +130,7 @@ def triangulate(rig: CameraRig, uv: Float[Array, "C K 2"]) -> Float[Array, "K 3"
     return jax.scipy.linalg.solve_triangular(R, projected[..., None])[..., 0]
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def _in_cameras(rig, points):
     """Points in the camera frames (C, K, 3), before the lens where they are not in front, and whether they are."""
     x, y, z = points[:, 0], points[:, 1], points[:, 2]

@@ -64,6 +64,7 @@ class Ellipse(NamedTuple):
     """Least u, least v, greatest u, greatest v, pixels."""
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def outline(P: Float[Array, "3 4"], body: Ellipsoid) -> Outline:
     """The outline from the dual conic `P Q* P^T`.
 
@@ -96,6 +97,7 @@ def _position(P):
     return -(P[:, 3] @ adjugate) / (first @ adjugate[0])
 
 
+@jax.jit  # traced once for each shape, though called at many places of a program
 def outline_radius(seen: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
     """Squared distance of pixels from the centre in units of the outline: 1 on it; 0 inside a body, inf without one."""
     (a, b), (_, c) = seen.shape

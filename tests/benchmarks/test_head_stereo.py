@@ -1,10 +1,9 @@
 """The scenario of heads before two cameras: how runs are judged, and, slowly, all of it in small."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,10 +15,14 @@ from jaxfilters.benchmarks.scenarios import head_stereo
 from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
-from jaxfilters.models.face.rig import nominal, project_shape
+from jaxfilters.models.face.rig import nominal
+from jaxfilters.models.synthetic import face_sequence
+from jaxfilters.models.synthetic.face_motion import gain_schedule, occlusion_schedule
 from jaxfilters.trackers.head.common.state import RIGID, HeadOptions, HeadTrack
 
 K, ASTRAY = 10, 50.0
+NUM_FRAMES = 41
+"""Of every video of the tiny run: one block after the first frame."""
 
 
 def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
@@ -34,8 +37,7 @@ def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
     true_shapes = np.repeat(MEAN_SHAPE[None], t + 1, axis=0)
     poses[:, 2] += 650
     rig = nominal()
-    project = jax.vmap(lambda pose: project_shape(rig, jnp.asarray(MEAN_SHAPE, float), pose)[0])
-    uv = np.asarray(project(jnp.asarray(poses, float)), float)
+    uv = np.asarray(runs._projected(rig, true_shapes, np.asarray(poses, np.float32)), float)
     truth = SimpleNamespace(poses=poses, shapes=true_shapes, uv=uv, rig=rig)
     track = HeadTrack(
         pose=poses[1:] + errors / DISPLAY,
@@ -174,17 +176,22 @@ def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
 
 
 @pytest.mark.system
-def test_a_tiny_run_has_every_metric_of_the_issue(monkeypatch, tmp_path):
+def test_a_tiny_run_has_every_metric(monkeypatch, tmp_path):
     """Few particles and frames; all parts share two trackers, frame by frame: every other one takes long to compile."""
+    covered, dark = (10, 14), (26, 34)
     usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0, chunk=1) for mode in ("modern", "paper")}
     few = dict.fromkeys(("_paper", "_paper_fixed5"), usual["paper"])
     monkeypatch.setattr(head_stereo, "PAPER", few)
     monkeypatch.setattr(head_stereo, "ALWAYS", {"": usual["modern"]})
     monkeypatch.setattr(head_stereo, "QUICK_NUM_SEEDS", 1)
-    monkeypatch.setattr(head_stereo, "QUICK_NUM_FRAMES", 31)
-    monkeypatch.setattr(head_stereo, "STILL_FRAMES", 31)
-    monkeypatch.setattr(head_stereo, "QUICK_OCCLUSION_FRAMES", 310)
-    monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 50, 60))
+    for name in ("QUICK_NUM_FRAMES", "STILL_FRAMES", "QUICK_OCCLUSION_FRAMES"):
+        monkeypatch.setattr(head_stereo, name, NUM_FRAMES)
+    monkeypatch.setattr(head_stereo, "OCCLUSION_FRAMES", covered)
+    monkeypatch.setattr(head_stereo, "DIMMING_FRAMES", dark)
+    monkeypatch.setattr(head_stereo, "RECOVERY_FRAMES", 4)
+    monkeypatch.setattr(face_sequence, "occlusion_schedule", partial(occlusion_schedule, frames=covered))
+    monkeypatch.setattr(face_sequence, "gain_schedule", partial(gain_schedule, frames=dark))
+    monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 40, NUM_FRAMES))
     monkeypatch.setattr(head_stereo, "QUICK_COUNTS", (64,))
     monkeypatch.setattr(speed, "USUAL", 64)
     monkeypatch.setattr(speed, "BATCH", 1)

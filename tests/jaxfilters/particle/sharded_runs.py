@@ -183,11 +183,13 @@ def main():
     num_devices = len(jax.devices())
     mesh = jax.make_mesh((num_devices,), ("particles",))
     ys = jnp.asarray(json.loads(sys.argv[1]))
+    alone = len(sys.argv) == 2
+    thresholds = (0.0, 0.5, 1.0) if alone else (0.5,)
     found = {
         "num_devices": num_devices,
-        **{f"islands_{t}": repeated(sharded(plain(100), mesh, island_threshold=t), ys) for t in (0.0, 0.5, 1.0)},
+        **{f"islands_{t}": repeated(sharded(plain(100), mesh, island_threshold=t), ys) for t in thresholds},
     }
-    if len(sys.argv) == 2:
+    if alone:
         found |= {
             "marginalised": repeated(sharded(marginalised(100), mesh), ys),
             "placement": by_placement(mesh, ys),

@@ -7,13 +7,15 @@ import pytest
 from scipy.optimize import least_squares
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face import frame_selection
 from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Views, all_residuals, projected
-from jaxfilters.models.face.frame_selection import by_angles, by_information, frame_information
+from jaxfilters.models.face.frame_selection import by_angles, by_information
 from jaxfilters.models.face.multilinear import expression_basis, learn, shape
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
+told, projections = jax.jit(frame_selection.frame_information), jax.jit(projected)
 AGES, ALL = jnp.array([4, 3, 2, 1, 0]), jnp.ones(5, bool)
 
 
@@ -91,7 +93,7 @@ def whole_jacobian(scene, offset_std):
     def pixels(y):
         y = jnp.asarray(units * y)
         who = Person(frame.person.identity + y[11:21], y[21:].reshape(10, 3))
-        return np.asarray(projected(face, rig, Bundle(frame.poses + y[:6], frame.expressions + y[6:11], who))).ravel()
+        return np.asarray(projections(face, rig, Bundle(frame.poses + y[:6], frame.expressions + y[6:11], who))).ravel()
 
     h = 1e-4
     columns = [(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(len(units))]
@@ -145,25 +147,27 @@ def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scen
     noisy = view._replace(uv=view.uv + 0.3 * jax.random.normal(jax.random.key(3), view.uv.shape))
     units = np.concatenate([face.identity_std, np.full(30, 0.8)])
 
+    root = np.linalg.cholesky(np.asarray(face.expression_covariance))
+
+    @jax.jit
+    def residuals(own, y):
+        who = Person(frame.person.identity + y[:10], y[10:].reshape(10, 3))
+        bundle = Bundle(frame.poses + POSE_UNITS * own[:6], frame.expressions + face.expression_std * own[6:], who)
+        seen = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
+        apart = bundle.expressions[0] - face.expression_mean
+        # What it moves in proportion to the size of the face.
+        spread = lambda who, a: jnp.linalg.norm(jnp.std(shape(face, who, a)[:, :2], axis=0))
+        moved = lambda who: jnp.linalg.norm(expression_basis(face, who) @ root)
+        ratio = spread(who.identity, bundle.expressions[0]) / spread(face.identity_mean, face.expression_mean)
+        ratio = ratio * moved(face.identity_mean) / moved(who.identity)
+        return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True) / ratio])
+
+    jacobian = jax.jit(jax.jacfwd(residuals))
+
     def best(y):
         """Pose and expression by SciPy, and their energy; without the prior of the person."""
-        y = jnp.asarray(units * y)
-        who = Person(frame.person.identity + y[:10], y[10:].reshape(10, 3))
-        root = np.linalg.cholesky(np.asarray(face.expression_covariance))
-
-        def residuals(own):
-            bundle = Bundle(frame.poses + POSE_UNITS * own[:6], frame.expressions + face.expression_std * own[6:], who)
-            seen = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
-            apart = bundle.expressions[0] - face.expression_mean
-            # What it moves in proportion to the size of the face.
-            spread = lambda who, a: jnp.linalg.norm(jnp.std(shape(face, who, a)[:, :2], axis=0))
-            moved = lambda who: jnp.linalg.norm(expression_basis(face, who) @ root)
-            ratio = spread(who.identity, bundle.expressions[0]) / spread(face.identity_mean, face.expression_mean)
-            ratio = ratio * moved(face.identity_mean) / moved(who.identity)
-            return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True) / ratio])
-
         found = least_squares(
-            jax.jit(residuals), np.zeros(11), jax.jit(jax.jacfwd(residuals)), xtol=1e-15, ftol=1e-15, gtol=1e-12
+            residuals, np.zeros(11), jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-12, args=(jnp.asarray(units * y),)
         )
         return found.x, found.cost
 

@@ -39,7 +39,7 @@ def stills(shape=(48, 48), stride=4):
 def test_size_and_noise_of_a_rendered_hand_are_learnt_through_the_renderer():
     theta = HandStills(AVERAGE, jnp.float32(0.01), jnp.zeros((2, 21)))
     free = HandStills(HandProportions(fit.positive, fit.positive, fit.positive), fit.positive, fit.free)
-    found = learn(stills(), theta, free, method=fit.adam(0.02, max_steps=250, patience=100)).theta
+    found = learn(stills(), theta, free, method=fit.adam(0.03, max_steps=120, patience=100)).theta
     # Palm and digits of two stills: some per cent; an average hand is 7 and up to 11 per cent off.
     np.testing.assert_allclose(found.proportions.palm, TRUE.palm, rtol=0.02)
     assert np.sqrt(np.mean((found.proportions.digits - TRUE.digits) ** 2)) < 0.03

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
 
 MAX_ERROR = 0.08
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 def observed_image(shape, seed=0):
@@ -41,8 +43,8 @@ def stacked(capsules, axis):
 @pytest.mark.system
 def test_terms_against_the_rendered_image(x64, camera, kind, random_transform):
     shape, T, observed = kind.shape(), random_transform(8), observed_image(camera.shape)
-    terms = kind.compare(camera, shape, T, observed, MAX_ERROR)
-    expected = terms_by_pixel(kind.render(camera, shape, T), observed)
+    terms = jax.jit(lambda: kind.compare(camera, shape, T, observed, MAX_ERROR))()
+    expected = terms_by_pixel(jax.jit(lambda: kind.render(camera, shape, T))(), observed)
     assert expected[1] > expected[2] > 30
     np.testing.assert_allclose(terms, expected, rtol=1e-12)
 
@@ -131,11 +133,11 @@ def test_forward_and_batched_derivatives(x64, camera, random_capsules):
     loss = lambda capsules: compare_capsules(camera, capsules, observed, MAX_ERROR).absolute_sum
     together = jax.jit(jax.vmap(jax.grad(loss), in_axes=-1, out_axes=-1))(stacked(many, -1))
     direction = jax.tree.map(jnp.cos, many[1])
-    _, forward = jax.jvp(loss, (many[1],), (direction,))
+    _, forward = jax.jit(partial(jax.jvp, loss))((many[1],), (direction,))
     mine = jax.tree.map(lambda leaf: leaf[..., 1], together)
     reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), mine, direction)))
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    alone = jax.grad(loss)(many[1])
+    alone = jax.jit(jax.grad(loss))(many[1])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), mine, alone)
 
 
@@ -198,7 +200,8 @@ for index in range(7):
 @pytest.mark.system
 def test_two_devices_share_the_poses_of_a_sequence():
     """In a process of its own, because the number of devices is fixed when JAX starts; seven poses leave one over."""
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2 {QUICK_TO_COMPILE}"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", _ON_TWO_DEVICES]
     done = subprocess.run(command, check=False, env=environment, timeout=300, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,5 +1,7 @@
 """Laws of every renderer: derivatives, regions of interest, strides, batches, and what must not be seen."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,18 @@ from jaxfilters.math.lie import RigidTransform
 from jaxfilters.models.rendering.geometry import convex_parts, mesh_from_trimesh
 
 STEP = 1e-7
+
+
+@partial(jax.jit, static_argnames="kind")
+def rendered(kind, camera, shape, T):
+    return kind.render(camera, shape, T)
+
+
+@partial(jax.jit, static_argnames="kind")
+@partial(jax.grad, argnums=3)
+def slope_of_all_depths(kind, camera, shape, T):
+    image = kind.render(camera, shape, T)
+    return jnp.sum(jnp.where(jnp.isfinite(image), image, 0.0))
 
 
 def render_at(kind, camera, shape):
@@ -67,8 +81,8 @@ def _floats(shape):
 @pytest.mark.system
 def test_a_region_with_a_stride_is_part_of_the_image(x64, camera, kind, random_transform):
     shape, T = kind.shape(), random_transform(1)
-    whole = np.asarray(kind.render(camera, shape, T))
-    part = kind.render(camera.crop(jnp.asarray([5.0, 3.0]), (20, 25), 2), shape, T)
+    whole = np.asarray(rendered(kind, camera, shape, T))
+    part = rendered(kind, camera.crop(jnp.asarray([5.0, 3.0]), (20, 25), 2), shape, T)
     np.testing.assert_allclose(part, whole[3:43:2, 5:55:2], rtol=1e-12)
 
 
@@ -77,10 +91,9 @@ def test_a_batch_is_each_in_turn(x64, camera, kind, random_transform):
     shape = kind.shape()
     poses = [random_transform(seed) for seed in range(3)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1), *poses)
-    render = lambda T: kind.render(camera, shape, T)
-    together = jax.vmap(render, in_axes=-1)(batch)
+    together = jax.jit(jax.vmap(lambda T: kind.render(camera, shape, T), in_axes=-1))(batch)
     for image, T in zip(together, poses, strict=True):
-        np.testing.assert_allclose(image, render(T), rtol=1e-9)
+        np.testing.assert_allclose(image, rendered(kind, camera, shape, T), rtol=1e-9)
 
 
 @pytest.mark.system
@@ -98,7 +111,7 @@ def test_whole_images_at_once_equal_windows_in_turn(x64, monkeypatch, camera, ki
 def test_nothing_behind_the_camera_is_seen(camera, kind, random_transform):
     T = random_transform(2)
     behind = RigidTransform(T.rotation, T.translation * jnp.asarray([1, 1, -1.0]))
-    assert np.all(np.isinf(kind.render(camera, kind.shape(), behind)))
+    assert np.all(np.isinf(rendered(kind, camera, kind.shape(), behind)))
 
 
 @pytest.mark.system
@@ -106,12 +119,7 @@ def test_nothing_behind_the_camera_is_seen(camera, kind, random_transform):
 def test_gradients_are_finite_wherever_the_object_is(camera, kind, random_transform, depth_of_center):
     shape, T = kind.shape(), random_transform(6)
     T = RigidTransform(T.rotation, T.translation.at[2].set(depth_of_center))
-
-    def loss(T):
-        image = kind.render(camera, shape, T)
-        return jnp.sum(jnp.where(jnp.isfinite(image), image, 0.0))
-
-    gradient = jax.grad(loss)(T)
+    gradient = slope_of_all_depths(kind, camera, shape, T)
     assert np.all(np.isfinite(gradient.rotation))
     assert np.all(np.isfinite(gradient.translation))
 

@@ -37,7 +37,6 @@ DEPTH_MM = (100.0, 5000.0)
 """In which a face may be."""
 _STATIC = ("num_particles", "landmarks", "selection", "past", "adjust")
 """Options that a compiled program is for; the others reach it as numbers, or do not concern it."""
-_begun = jax.jit(begin, static_argnames="options")
 
 
 class _Found:
@@ -224,7 +223,7 @@ class _MonoTracker:
         if old is not None:
             self._remember(old)
         zero = jnp.zeros((), start.uv.dtype)
-        state = _begun(
+        state = begin(
             key,
             self._face,
             self.rig,

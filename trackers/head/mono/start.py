@@ -1,6 +1,7 @@
 """The start of a track: landmarks that were detected in a few frames become a person, and where the head was."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -104,6 +105,7 @@ def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, ""]) -> Vie
     return Views(points, covariance, jnp.ones(points.shape[:2], bool))
 
 
+@partial(jax.jit, static_argnames="options")
 def begin(
     key: AnyKey,
     face: MultilinearFace,

@@ -39,9 +39,6 @@ class _Found(NamedTuple):
     time: float
 
 
-_begun = jax.jit(begin, static_argnames="options")
-
-
 class HeadSession:
     """Tracks one head through frames that are handed over in pieces."""
 
@@ -166,7 +163,7 @@ class _HeadTracker:
         face = found.registration
         pose = jnp.asarray(face.pose, float)
         start = jnp.zeros((), pose.dtype)
-        state = _begun(
+        state = begin(
             key, face.model, pose, found.images, start, self.rig, options=self._compiled, diffusion=self._diffusion
         )
         kept = False

@@ -55,6 +55,7 @@ MOST_STEPS = 30.0
 """Frame times: a longer gap is treated as one of this length."""
 
 
+@partial(jax.jit, static_argnames="options")
 def begin(
     key: AnyKey,
     model: FaceModel,

@@ -29,8 +29,7 @@ class Face:
         images = self.video.frames(0, 3)
         self.images, self.rig = jnp.asarray(images, float), self.video.rig
         model, pose, _ = register(images[0], self.video.uv[0, 0].astype(float), self.rig, num_modes=NUM_MODES)
-        start = jax.jit(begin, static_argnames="options")
-        self.state = start(
+        self.state = begin(
             jax.random.key(0), model, pose, images[0], jnp.zeros(()), self.rig, options=HeadOptions(num_particles=50)
         )
 

@@ -74,7 +74,7 @@ def state_of(rig, face, seen, options):
     bundle = true._replace(poses=true.poses + jnp.asarray(shift, jnp.float32))
     start = Start(bundle, Adjustment(*jnp.zeros(3)), views.uv)
     images = jnp.asarray(np.random.default_rng(1).uniform(0, 255, (2, 480, 640)), jnp.float32)
-    return jax.jit(begin, static_argnames="options")(
+    return begin(
         jax.random.key(0), face, rig, start, views, jnp.zeros((), int), images, jnp.zeros(()), options, options.prior
     )
 

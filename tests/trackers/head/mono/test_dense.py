@@ -30,6 +30,12 @@ NUM_PEOPLE = 8
 YAWS = np.radians([-20.0, -10, 0, 10, 20])
 
 
+@jax.jit
+def projections(face, rig, bundle):
+    one = lambda pose, a: project_shape(rig, posed_shape(face, bundle.person, a), pose)[0][0]
+    return jax.vmap(one)(bundle.poses, bundle.expressions)
+
+
 def somebody(face, rig, seed):
     """Landmarks of a person of the model in five frames, to half a pixel; and the bundle that they are of."""
     rng = np.random.default_rng(seed)
@@ -40,8 +46,7 @@ def somebody(face, rig, seed):
     poses = np.column_stack([rng.normal(0, 30, (5, 2)), np.full(5, 650.0), rng.normal(0, 0.05, 5), YAWS, 0 * YAWS])
     numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float), tree)
     bundle = numbers(Bundle(poses, expressions, Person(identity, offset)))
-    one = lambda pose, a: project_shape(rig, posed_shape(face, bundle.person, a), pose)[0][0]
-    uv = np.asarray(jax.vmap(one)(bundle.poses, bundle.expressions))
+    uv = np.asarray(projections(face, rig, bundle))
     return uv + rng.normal(0, 0.5, uv.shape), bundle
 
 
@@ -72,14 +77,18 @@ def test_faces_are_as_large_as_they_are_on_average(face68, rig):
 
 def claimed(face, many):
     """Standard deviation of the logarithm of the size, by what is known of identity and offset."""
-    person = many.start.bundle.person
+    J, slope = (np.asarray(a, float) for a in prior_and_size(face, many.start.bundle.person))
+    precision = np.asarray(many.past.information, float) + J.T @ J
+    return np.sqrt(slope @ np.linalg.solve(precision, slope))
+
+
+@jax.jit
+def prior_and_size(face, person):
+    """Jacobian of what holds the person, and the gradient of the logarithm of the size."""
     y, count = parameters(person), face.num_identities
     who = lambda y: Person(y[:count], y[count:].reshape(-1, 3))
     held = lambda y: residuals(face, who(y), face.expression_mean[None], PRIOR)
-    J = np.asarray(jax.jacfwd(held)(y), float)
-    precision = np.asarray(many.past.information, float) + J.T @ J
-    slope = np.asarray(jax.grad(lambda y: log_size(face, y[:count]))(y), float)
-    return np.sqrt(slope @ np.linalg.solve(precision, slope))
+    return jax.jacfwd(held)(y), jax.grad(lambda y: log_size(face, y[:count]))(y)
 
 
 @pytest.mark.system

@@ -36,9 +36,9 @@ def scene(rig):
         return face, known, views, truth
 
 
+@jax.jit
 def best(face, rig, views, start, prior):
-    solve = jax.jit(lambda face, views, start, prior: adjust(face, rig, views, start, prior, REACH, steps=(20, 80)))
-    return solve(face, views, start, prior)[0]
+    return adjust(face, rig, views, start, prior, REACH, steps=(20, 80))[0]
 
 
 def window_of(face, rig, views, bundle, prior):

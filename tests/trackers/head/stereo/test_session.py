@@ -266,7 +266,7 @@ def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
         begun.append(images)
         return SimpleNamespace(model=model)
 
-    monkeypatch.setattr(module, "_begun", begin)
+    monkeypatch.setattr(module, "begin", begin)
     images, _ = drawn(1)
     session = HeadSession(nominal(), HeadOptions(live=True, chunk=1))
     for i in range(1000):

@@ -20,7 +20,6 @@ MODERN, PAPER = HeadOptions(), HeadOptions(mode="paper")
 FIXED = HeadOptions(mode="paper", diffusion="fixed", fixed_diffusion=1.0)
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Published errors of the adaptive tracker, millimetres and degrees (P, tables 3 and 4)."""
-begin = jax.jit(module.begin, static_argnames="options")
 
 
 class Video:
@@ -34,7 +33,7 @@ class Video:
         model, pose, _ = self.registration
         time = jnp.asarray(self.video.times[0], float)
         arguments = jax.random.key(seed), model, pose, self.images[0], time, self.video.rig
-        return begin(*arguments, options=compiled(options), diffusion=first_diffusion(options))
+        return module.begin(*arguments, options=compiled(options), diffusion=first_diffusion(options))
 
     def advance(self, state, start, stop, options, filters=None, chunk=CHUNK):
         """State after the frames `start` to `stop`, at most a chunk, and their rows."""
@@ -88,15 +87,15 @@ def test_the_fit_is_far_within_half_of_the_published_errors(videos, kind):
 def test_the_tracker_of_the_paper_is_about_as_good_as_published(videos, kind):
     """80 frames of one face, whose registration errs in its own way: twice as much is allowed.
 
-    Over forty draws of the particles this face is never lost where it moves slowly. Where it moves fast it is in two:
-    four or more of eight are, once in 2700 times; it has 1.4 times the published errors in the median of four others,
-    and of 100,000 sets of five none is beyond. Roundings of another machine are other draws.
+    Over forty draws of the particles this face is never lost where it moves slowly: three serve. Where it moves
+    fast it is in two: four or more of eight are, once in 2700 times; it has 1.4 times the published errors in the
+    median of four others, and of 100,000 sets of five none is beyond. Roundings of another machine are other draws.
     """
-    draws = range(8)
+    draws = range({"slow": 3, "fast": 8}[kind])
     tracks = [videos[kind].track(PAPER, seed)[1] for seed in draws]
     errors = [videos[kind].errors(PAPER, seed) for seed in draws]
     followed = [np.all(track.status == RIGID) for track in tracks]
-    assert sum(followed) >= {"slow": 8, "fast": 5}[kind]
+    assert sum(followed) >= {"slow": 3, "fast": 5}[kind]
     kept = np.concatenate([error for error, is_followed in zip(errors, followed, strict=True) if is_followed])
     assert np.all(rms(kept) < 2.0 * np.array(PAPER_ADAPTIVE[kind]))
 
