@@ -9,7 +9,8 @@ import numpy as np
 Color = tuple[int, int, int]
 """Blue, green, red."""
 _INK, _GRID, _PAPER = (60, 60, 60), (228, 228, 228), (255, 255, 255)
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 26, 24
+_LEFT, _RIGHT, _TOP, _BOTTOM, _LABEL = 62, 14, 26, 24, 16
+"""Pixels around the axes; a label of the horizontal axis has its own row beneath the numbers."""
 _OVERSAMPLE = 2
 """Drawn larger and shrunk: the stroke font of OpenCV is coarse at reading size."""
 
@@ -49,7 +50,7 @@ def draw_chart(
 
     `from_zero` puts the bottom of the axis at zero. Bands may be cut; lines never are. `shades` lie under everything.
     """
-    axes = _Axes(size, (float(x[0]), float(x[-1])), _span(curves, from_zero))
+    axes = _Axes(size, (float(x[0]), float(x[-1])), _span(curves, from_zero), _BOTTOM + (_LABEL if x_label else 0))
     for shade in shades:
         axes.shade(shade)
     axes.frame(title, x_label)
@@ -87,13 +88,13 @@ def _span(curves: list[Curve], from_zero: bool) -> tuple[float, float]:
 class _Axes:
     """A sheet of paper with two scales."""
 
-    def __init__(self, size: tuple[int, int], x_span: tuple[float, float], y_span: tuple[float, float]):
+    def __init__(self, size: tuple[int, int], x_span: tuple[float, float], y_span: tuple[float, float], below: int):
         rows, cols = (_OVERSAMPLE * length for length in size)
         self._size = size
         self._sheet: np.ndarray = np.full((rows, cols, 3), _PAPER, np.uint8)
         self._x_span = x_span if x_span[1] > x_span[0] else (x_span[0] - 0.5, x_span[0] + 0.5)
         self._y_span = y_span
-        self._box = np.asarray((_LEFT, _TOP, size[1] - _RIGHT, size[0] - _BOTTOM)) * _OVERSAMPLE
+        self._box = np.asarray((_LEFT, _TOP, size[1] - _RIGHT, size[0] - below)) * _OVERSAMPLE
 
     def shade(self, shade: Shade) -> None:
         ends = np.clip(np.asarray([shade.start, shade.end]), *self._x_span)
@@ -111,7 +112,7 @@ class _Axes:
             x = int(self._points(np.asarray([value]), np.asarray(self._y_span[:1]))[0, 0])
             cv2.line(self._sheet, (x, bottom), (x, bottom + 4 * _OVERSAMPLE), _INK, 1)
             self._text(f"{value:.4g}", (x - 8 * _OVERSAMPLE, bottom + 16 * _OVERSAMPLE))
-        self._text(x_label, (right, bottom - 6 * _OVERSAMPLE), align_right=True)
+        self._text(x_label, (right, bottom + 31 * _OVERSAMPLE), align_right=True)
         self._text(title, (left, top - 9 * _OVERSAMPLE), size=0.5)
         cv2.rectangle(self._sheet, (left, top), (right, bottom), _INK, 1)
 

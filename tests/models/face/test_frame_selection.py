@@ -15,7 +15,7 @@ from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
-told, projections = jax.jit(frame_selection.frame_information), jax.jit(projected)
+frame_information, projections = jax.jit(frame_selection.frame_information), jax.jit(projected)
 AGES, ALL = jnp.array([4, 3, 2, 1, 0]), jnp.ones(5, bool)
 
 

@@ -18,9 +18,11 @@ DEVIATIONS = 2.0
 _WIDTH, _ROWS = 1200, 190
 """Pixels: of the picture, and the height of a chart."""
 _LEGEND_ROWS, _MODE_ROWS = 34, 250
+_MODE_TITLES, _MODE_CAPTION = 66, 34
+"""Rows of a drawn mode above and below its faces."""
 _LEFT, _OVERSAMPLE = 62, 2
 _SCALE = 1.35
-"""Pixels a millimetre of the drawn faces."""
+"""Pixels a millimetre of the drawn faces, at most."""
 _COLORS: tuple[Color, ...] = ((70, 70, 215), (60, 150, 60), (205, 110, 40), (160, 60, 160), (40, 140, 190))
 _INK, _TRUTH, _MEAN = (60, 60, 60), (150, 150, 150), (165, 165, 165)
 _PLUS, _MINUS = (70, 70, 215), (205, 110, 40)
@@ -120,11 +122,15 @@ def _draw_mode(size: tuple[int, int], mean: np.ndarray, offset: np.ndarray) -> n
     """The faces (10, 3) `mean` and `offset` to both sides of it."""
     rows, cols = (_OVERSAMPLE * length for length in size)
     sheet = np.full((rows, cols, 3), 255, np.uint8)
+    shapes = np.stack([mean - offset, mean + offset, mean])
+    low, high = shapes[..., 1].min(), shapes[..., 1].max()
+    room = rows - _OVERSAMPLE * (_MODE_TITLES + _MODE_CAPTION)
+    scale = min(_OVERSAMPLE * _SCALE, room / max(high - low, 1.0))
     # From the front x goes to the right; from the side z does, the nose to the left.
     for axes, middle in (((0, 1), 0.33), ((2, 1), 0.8)):
-        center = np.array([middle * cols, 0.56 * rows])
-        for shape, color in ((mean - offset, _MINUS), (mean + offset, _PLUS), (mean, _MEAN)):
-            draw_points(sheet, center + _OVERSAMPLE * _SCALE * shape[:, axes], color, color, 2.0 * _OVERSAMPLE)
+        center = np.array([middle * cols, _OVERSAMPLE * _MODE_TITLES + 0.5 * (room - scale * (low + high))])
+        for shape, color in zip(shapes, (_MINUS, _PLUS, _MEAN), strict=True):
+            draw_points(sheet, center + scale * shape[:, axes], color, color, 2.0 * _OVERSAMPLE)
     picture = cv2.resize(sheet, size[::-1], interpolation=cv2.INTER_AREA)
     for view, middle in (("front", 0.33), ("side", 0.8)):
         _text(picture, view, (int(middle * size[1]) - 16, size[0] - 12), _MEAN)
