@@ -12,8 +12,8 @@ from jaxfilters.filter import Filter
 from jaxfilters.filter import run as run_filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.articulated.filters import (
+    FeatureObservation,
     Inequalities,
-    Look,
     belief_of,
     inequalities,
     literal,
@@ -99,11 +99,11 @@ def filter_of(make, model: Model, sequence: ArticulatedSequence) -> Filter:
     return make(model.hand, Gaussian(sequence.initial_mean, sequence.initial_covariance), model.limits)
 
 
-def looks_of(sequence: ArticulatedSequence) -> tuple[Look, Float[Array, " t"]]:
+def looks_of(sequence: ArticulatedSequence) -> tuple[FeatureObservation, Float[Array, " t"]]:
     """Observations and times between frames, 0 before the first one, as `jaxfilters.run` takes them."""
     std = jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
     inputs = jnp.ones(len(sequence.features), sequence.features.dtype).at[0].set(0.0)
-    return Look(sequence.features, sequence.masks, std), inputs
+    return FeatureObservation(sequence.features, sequence.masks, std), inputs
 
 
 def _filtered(make, sequences: ArticulatedSequence) -> Runs:

@@ -69,7 +69,7 @@ def inequalities(rows: LimitRows) -> Inequalities:
     return Inequalities(linear_constraints(rows.normals, rows.lower, rows.upper, rows.names), rows.static)
 
 
-class Look(NamedTuple):
+class FeatureObservation(NamedTuple):
     """One frame's features, and where a hypothesis is made linear."""
 
     y: Float[Array, " rows"]
@@ -85,7 +85,7 @@ class Look(NamedTuple):
 
 @pytree_dataclass
 class HandBelief:
-    """Parameters of the innermost filter: predict, and condition on a `Look`."""
+    """Parameters of the innermost filter: predict, and condition on a `FeatureObservation`."""
 
     hand: ArticulatedHand
     prior: Gaussian
@@ -97,7 +97,7 @@ class HandBelief:
 
 
 def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
-    """Second-order filter, limits counted once, lengths estimated from new views; observations are `Look`s."""
+    """Second-order filter, limits counted once, lengths estimated from new views, of a `FeatureObservation` a frame."""
     inner = constrained(_belief(hand, prior, gate, second_order_covariance_only, turned), EPConstraints(*limits))
     constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
     return schmidt_kalman(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
@@ -154,7 +154,7 @@ def report_of(info: SchmidtInfo | ConstrainedInfo | KalmanInfo) -> Report:
 def hypotheses(
     inner: Filter, hand: ArticulatedHand, *, capacity: int, start: gaussian_sum.GaussianSumState | None
 ) -> Filter:
-    """A bank over the depth ambiguities of a hand (Shimada et al., section 6); observations are `Look`s.
+    """A bank over the depth ambiguities of a hand (Shimada et al., section 6); observations are `FeatureObservation`s.
 
     Every hypothesis is made linear at its mean; where the image of a link hardly depends on its angle, at both poses of
     the link that is most in doubt instead [30]; and where all fingers may be straight, also with the hand mirrored.
@@ -189,7 +189,7 @@ def _predict(model: HandBelief, key: AnyKey, belief: Gaussian, inputs: Array) ->
 
 
 def _update(
-    model: HandBelief, key: AnyKey, belief: Gaussian, look: Look, inputs: PyTree
+    model: HandBelief, key: AnyKey, belief: Gaussian, look: FeatureObservation, inputs: PyTree
 ) -> tuple[Gaussian, KalmanInfo]:
     del key, inputs
     hand = model.hand
@@ -246,7 +246,12 @@ def _within_gate(model, belief, look, H, at):
 
 
 def laplace_log_evidence(
-    hand: ArticulatedHand, prior: Gaussian, posterior: Gaussian, info: KalmanInfo, H: Float[Array, "rows n"], look: Look
+    hand: ArticulatedHand,
+    prior: Gaussian,
+    posterior: Gaussian,
+    info: KalmanInfo,
+    H: Float[Array, "rows n"],
+    look: FeatureObservation,
 ) -> Float[Array, ""]:
     r"""Log evidence by Laplace's method at the posterior mean; for a linear observation, that of the innovation.
 
@@ -264,7 +269,9 @@ def laplace_log_evidence(
     return jnp.where(jnp.isneginf(info.log_evidence), -jnp.inf, value)
 
 
-def _branches(hand: ArticulatedHand, state: _State, look: Look) -> tuple[Look, Bool[Array, " b"]]:
+def _branches(
+    hand: ArticulatedHand, state: _State, look: FeatureObservation
+) -> tuple[FeatureObservation, Bool[Array, " b"]]:
     belief = belief_of(state)
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance), 0.0))
     doubtful = mirror_trigger(belief.mean, std, hand)
@@ -278,7 +285,7 @@ def _branches(hand: ArticulatedHand, state: _State, look: Look) -> tuple[Look, B
     mirrored = jnp.array([False, False, False, True])
     any_doubt = jnp.any(doubtful)
     tried = jnp.stack([~any_doubt, any_doubt, any_doubt, reversal_trigger(belief.mean, std, hand.layout)])
-    spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BRANCHES, *leaf.shape)), Look(*look[:3]))
+    spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BRANCHES, *leaf.shape)), FeatureObservation(*look[:3]))
     return spread._replace(at=at, reversed=mirrored), tried
 
 

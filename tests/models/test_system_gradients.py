@@ -31,7 +31,7 @@ def articulated(theta):
     sequence = synthetic.simulate_paper(KEY, 1)
     rows = slice(0, 4)
     std = theta["noise"] * jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
-    looks = filters.Look(sequence.features[rows], sequence.masks[rows], std[rows])
+    looks = filters.FeatureObservation(sequence.features[rows], sequence.masks[rows], std[rows])
     prior = Gaussian(sequence.initial_mean, theta["spread"] * sequence.initial_covariance)
     limits = filters.inequalities(limit_rows(synthetic.LAYOUT, table_1()))
     filter = filters.recommended(synthetic.paper_hand(), prior, limits)

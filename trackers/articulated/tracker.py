@@ -22,8 +22,8 @@ from jaxfilters.gaussian.gaussian_sum import GaussianSumState, map_component
 from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
+    FeatureObservation,
     Inequalities,
-    Look,
     Report,
     belief_of,
     hypotheses,
@@ -270,7 +270,9 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     filter = hypotheses(_filter(setup, _first_belief(state.bank)), setup.hand, capacity=capacity, start=None)
     elapsed = (time - state.time) / FRAME_INTERVAL
     predicted = filter.predict(filter.params, predict_key, state.bank, elapsed)
-    bank, info = filter.update(filter.params, update_key, predicted, Look(frame.y, frame.mask, frame.std), elapsed)
+    bank, info = filter.update(
+        filter.params, update_key, predicted, FeatureObservation(frame.y, frame.mask, frame.std), elapsed
+    )
     measured = jnp.any(frame.mask)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components)
     reported = report_of(best)

@@ -27,7 +27,7 @@ from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, 
 from jaxfilters.trackers.people.files import write_report
 
 
-class Followed(NamedTuple):
+class RunResult(NamedTuple):
     """What came of a run."""
 
     frames: int
@@ -115,7 +115,7 @@ def _user(source: Any, mask: str) -> User:
 
 def _follow(
     source: Any, user: User, session: FingertipSession, files: FingertipFiles, options: argparse.Namespace
-) -> Followed:
+) -> RunResult:
     pictures, video = FingertipPictures(), None
     names, counts, errors, ends = Counter[str](), list[int](), list[float](), list[float]()
     interrupted, failure, reported = False, None, 0
@@ -149,7 +149,7 @@ def _follow(
     if session.events[reported:]:
         files.append(len(counts), 0.0, _NOTHING, session.events[reported:])
     rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else math.nan
-    return Followed(len(counts), rate, names, counts, errors, interrupted, failure)
+    return RunResult(len(counts), rate, names, counts, errors, interrupted, failure)
 
 
 _NOTHING: Any = HandReport(*[np.zeros((0, 0), bool)] * len(HandReport._fields))  # type: ignore[arg-type]
@@ -180,7 +180,7 @@ def _report(
     source: Any,
     user: User,
     session: FingertipSession,
-    followed: Followed,
+    followed: RunResult,
     options: argparse.Namespace,
     seconds: float,
 ) -> dict[str, Any]:

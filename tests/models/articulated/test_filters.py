@@ -38,7 +38,7 @@ def limits():
 def looks(sequence):
     std = jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
     inputs = jnp.ones(len(sequence.features)).at[0].set(0.0)
-    return filters.Look(sequence.features, sequence.masks, std), inputs
+    return filters.FeatureObservation(sequence.features, sequence.masks, std), inputs
 
 
 def keep(state, info):
@@ -239,7 +239,7 @@ def test_two_estimates_at_the_critical_pose_of_which_limits_leave_one_two_frames
     x = synthetic.critical_states()[frame].at[LAYOUT.angles.start].set(0.0)
     moving = LAYOUT.per_moving(1.0, math.radians(0.5), math.radians(2.0)).at[own].set(math.radians(15.0))
     std = jnp.concatenate([moving, LAYOUT.per_moving(0.1, 1e-3, 1e-3), jnp.full(LAYOUT.num_static, 0.2)])
-    look = filters.Look(hand.observe(x), hand.usable(x), 0.2 * hand.observation_std())
+    look = filters.FeatureObservation(hand.observe(x), hand.usable(x), 0.2 * hand.observation_std())
 
     means, info = _update_of_a_bank(hand, limits, Gaussian(x, jnp.diag(std**2)), look)
     angles = means[:, own]

@@ -150,7 +150,7 @@ def test_lengths_and_angles_are_found_from_a_silhouette(hand, states, measured):
     @jax.jit
     def follow(mean, covariance, y, mask):
         filter = filters.recommended(hand, Gaussian(mean, covariance), limits)
-        look = filters.Look(y, mask, jnp.broadcast_to(hand.observation_std(), y.shape))
+        look = filters.FeatureObservation(y, mask, jnp.broadcast_to(hand.observation_std(), y.shape))
         inputs = jnp.ones(len(y)).at[0].set(0.0)
         _, beliefs = jaxfilters.run(
             filter, jax.random.key(0), look, inputs, collect=lambda state, info: filters.belief_of(state)

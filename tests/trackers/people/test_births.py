@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people.births import LEAST_CELLS, LEAST_SHARE, births, cells_of, padded, stride
+from jaxfilters.trackers.people.births import LEAST_CELLS, LEAST_SHARE, birth, cells_of, padded, stride
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -19,7 +19,7 @@ SOMEBODY = (0.7, 1.1, 1.75, 0.45)
 def found(camera, floor):
     """Looks for a births where somebody is drawn, given one person who is known or nobody."""
     scene = people_scene([camera], floor, config=CONFIG)
-    search = jax.jit(births)
+    search = jax.jit(birth)
 
     def run(mask, known=None, present=True):
         places = jnp.array([known or (0.0, 0.0, 1.7, 0.45), (1.0, 1.0, 1.7, 0.45)])
@@ -88,7 +88,7 @@ def test_cells_that_only_fill_up_change_nothing(camera, draw, floor):
     places, nobody = jnp.tile(jnp.array([0.0, 0.0, 1.7, 0.45]), (2, 1)), jnp.zeros(2, bool)
     both = draw(camera, [SOMEBODY, (-1.0, 0.2, 1.7, 0.45)])[0]
     shown = [both, draw(camera, [SOMEBODY])[0], np.zeros_like(both)]
-    search = jax.jit(births)
+    search = jax.jit(birth)
     frames = [(CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True)),) for mask in shown]
     filled, plain = (
         [search(replace(scene, cells=cells), places, nobody, frame) for frame in frames] for cells in (scene.cells, own)

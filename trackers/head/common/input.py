@@ -30,7 +30,7 @@ _SYNTHETIC_FOCAL = 800.0
 """Pixels, of the one camera before a synthetic face."""
 
 
-class Place(NamedTuple):
+class Setup(NamedTuple):
     """What is watched, and by what."""
 
     rig: CameraRig
@@ -45,7 +45,7 @@ class Place(NamedTuple):
     """What was assumed, for a person."""
 
 
-def place_of(options: argparse.Namespace) -> Place:
+def setup_of(options: argparse.Namespace) -> Setup:
     """The cameras and sources that the command line of `track head-stereo` names.
 
     Raises:
@@ -68,12 +68,12 @@ def place_of(options: argparse.Namespace) -> Place:
     sources = [open_video(source, fps=options.fps) for source in options.sources]
     for source, camera in zip(sources, described.cameras, strict=True):
         _check_size(source, camera.image_size, f"{options.rig}: {camera.name}")
-    return Place(
+    return Setup(
         described.rig, described.undistortions, sources, _points(options, described.undistortions[0]), None, None
     )
 
 
-def place_of_one(options: argparse.Namespace) -> Place:
+def setup_of_one(options: argparse.Namespace) -> Setup:
     """The camera and source that the command line of `track head-mono` names.
 
     Raises:
@@ -89,7 +89,7 @@ def place_of_one(options: argparse.Namespace) -> Place:
     return _rendered(face_sequence(jax.random.key(seed), poses, rig=monocular(camera), expressions=talking))
 
 
-def _single(options: argparse.Namespace, name: str) -> Place:
+def _single(options: argparse.Namespace, name: str) -> Setup:
     if getattr(options, "rig", None):
         raise InputError(
             "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
@@ -106,10 +106,10 @@ def _single(options: argparse.Namespace, name: str) -> Place:
         note = f"an assumed focal length of {focal:.0f} px"
     undistortion = Undistortion((rows, cols), K, distortion)
     rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
-    return Place(rig, [undistortion], [source], _points(options, undistortion), None, note)
+    return Setup(rig, [undistortion], [source], _points(options, undistortion), None, note)
 
 
-def _synthetic(options: argparse.Namespace) -> Place:
+def _synthetic(options: argparse.Namespace) -> Setup:
     _refuse_unused({"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps})
     seed = options.seed or 0
     return _rendered(sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True))
@@ -120,12 +120,12 @@ def _refuse_unused(given: dict[str, Any]) -> None:
         raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic face has its own.")
 
 
-def _rendered(made: FaceSequence) -> Place:
+def _rendered(made: FaceSequence) -> Setup:
     image = _remembered(made)
     sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
     truth = HeadTruth(pose_in_metres(made.poses), made.uv)
     undistortions = [Undistortion(made.rig.shape) for _ in sources]
-    return Place(made.rig, undistortions, sources, np.asarray(made.uv[0, 0], float), truth, None)
+    return Setup(made.rig, undistortions, sources, np.asarray(made.uv[0, 0], float), truth, None)
 
 
 class _SyntheticSource:

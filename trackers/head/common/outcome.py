@@ -8,11 +8,11 @@ import numpy as np
 
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.head.common.report import errors, shares
-from jaxfilters.trackers.head.common.run import Followed, HeadRun
+from jaxfilters.trackers.head.common.run import HeadRun, RunResult
 from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, displayed
 
 
-def run_report(run: HeadRun, followed: Followed) -> dict[str, Any]:
+def run_report(run: HeadRun, followed: RunResult) -> dict[str, Any]:
     """What `report.json` says of any run of a head."""
     results, place = run.writer.results, run.place
     events = [{"frame": run.frame_of[min(i, len(run.frame_of) - 1)], "what": what} for i, what in run.session.events]

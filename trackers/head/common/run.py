@@ -13,7 +13,7 @@ from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import TrackTable, begin
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.head.common.drawing import draw_frame
-from jaxfilters.trackers.head.common.input import Place
+from jaxfilters.trackers.head.common.input import Setup
 from jaxfilters.trackers.head.common.table import STATUS_WORDS, HeadRows, with_gaps
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.paired_input import PairedInput
@@ -37,7 +37,7 @@ class Session(Protocol):
         ...
 
 
-class Followed(NamedTuple):
+class RunResult(NamedTuple):
     """What came of a run beside its rows."""
 
     frames_per_second: float
@@ -63,7 +63,7 @@ class RowsOf(NamedTuple):
 class HeadRun:
     """The way of images from the cameras through the session into rows and pictures."""
 
-    def __init__(self, options: argparse.Namespace, place: Place, session: Session, rows: RowsOf, *, chunk: int):
+    def __init__(self, options: argparse.Namespace, place: Setup, session: Session, rows: RowsOf, *, chunk: int):
         """A run before its first image.
 
         Raises:
@@ -80,7 +80,7 @@ class HeadRun:
         self._ends, self._costs = list[tuple[float, int]](), list[float]()
         self._chunk = chunk
 
-    def follow(self) -> Followed:
+    def follow(self) -> RunResult:
         """Track until the sources end, the time is over, or Ctrl-C.
 
         Raises:
@@ -94,7 +94,7 @@ class HeadRun:
             raise followed.failure or InputError("; ".join(followed.trouble or ["the sources hold no images"]) + ".")
         return followed
 
-    def conclude(self, followed: Followed) -> None:
+    def conclude(self, followed: RunResult) -> None:
         """Say what went wrong on the way.
 
         Raises:
@@ -109,7 +109,7 @@ class HeadRun:
         """Let other runs write into the folder."""
         self.writer.close()
 
-    def _followed(self) -> Followed:
+    def _followed(self) -> RunResult:
         paired = PairedInput(self.place.sources)
         interrupted = False
         try:
@@ -124,7 +124,7 @@ class HeadRun:
         seconds = self._ends[-1][0] - self._ends[0][0] if self._ends else 0.0
         rate = (self._ends[-1][1] - self._ends[0][1]) / seconds if seconds else math.nan
         cost = float(np.median(self._costs[1:])) if len(self._costs) > 1 else math.nan
-        return Followed(rate, 1000 * cost, interrupted, self._failure, paired.trouble())
+        return RunResult(rate, 1000 * cost, interrupted, self._failure, paired.trouble())
 
     def _take(self, paired: PairedInput) -> None:
         total = min((getattr(source, "frames", 0) for source in self.place.sources), default=0) or None

@@ -13,7 +13,7 @@ from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
-from jaxfilters.trackers.head.common.input import place_of_one
+from jaxfilters.trackers.head.common.input import setup_of_one
 from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
@@ -46,7 +46,7 @@ def track(options: argparse.Namespace) -> str:
     """
     settings = as_input_error(partial(config_from_args, MonoOptions, options))
     model = _model(options)
-    place = place_of_one(options)
+    place = setup_of_one(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     face = tracked(model.model)

@@ -107,11 +107,11 @@ def _adjusted(
     of_face = jnp.square(offset_std / jnp.where(both_std > 0, both_std, 1.0))
     person = Person(found.person.identity, of_face * found.person.offset[jnp.asarray(FROM_68)])
     bundle = Bundle(found.poses, found.expressions, person)
-    past = told_of_ten(face, rig, views, found, person, prior, misplaced)
+    past = information_of_ten(face, rig, views, found, person, prior, misplaced)
     return DenseStart(Start(bundle, info, projected(ten, rig, bundle)), past)
 
 
-def told_of_ten(
+def information_of_ten(
     face: MultilinearFace,
     rig: CameraRig,
     views: Views,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
-from jaxfilters.trackers.head.common.input import Place, place_of
+from jaxfilters.trackers.head.common.input import Setup, setup_of
 from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.state import HeadOptions
@@ -30,7 +30,7 @@ def track(options: argparse.Namespace) -> str:
         KeyboardInterrupt: before anything was tracked.
     """
     settings = as_input_error(partial(config_from_args, HeadOptions, options))
-    place = place_of(options)
+    place = setup_of(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     session = as_input_error(lambda: _session(place, settings))
@@ -58,7 +58,7 @@ def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, s
     return format_report(report, options)
 
 
-def _session(place: Place, settings: HeadOptions) -> HeadSession:
+def _session(place: Setup, settings: HeadOptions) -> HeadSession:
     points = place.points
     if points is not None and len(points) > NUM_LANDMARKS:
         points = points[list(FROM_68)]

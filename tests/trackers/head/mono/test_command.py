@@ -225,7 +225,7 @@ def mono_options(**given):
 
 def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
     monkeypatch.setattr(head_input, "_SYNTHETIC_FRAMES", 5)
-    place = head_input.place_of_one(mono_options(out=tmp_path, model=None))
+    place = head_input.setup_of_one(mono_options(out=tmp_path, model=None))
     assert place.rig.num_cameras == 1
     assert place.points.shape == (10, 2)
     assert place.truth.poses.shape == (5, 6)

@@ -22,7 +22,7 @@ from jaxfilters.models.face.person_prior import (
     seen_size,
 )
 from jaxfilters.models.face.rig import project_shape
-from jaxfilters.trackers.head.mono.dense import Dense, start_densely, told_of_ten, tracked
+from jaxfilters.trackers.head.mono.dense import Dense, information_of_ten, start_densely, tracked
 from jaxfilters.trackers.head.mono.start import initialise
 
 PRIOR = Prior(1.0, 0.7)
@@ -122,7 +122,7 @@ def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(
     both = np.hypot(PRIOR.offset_std, misplaced_mm)
     own = (PRIOR.offset_std / both) ** 2 * truth.person.offset[chosen]
     person = Person(truth.person.identity, own)
-    past = jax.jit(told_of_ten)(face, rig, views, truth, person, Prior(1.0, both), misplaced_mm)
+    past = jax.jit(information_of_ten)(face, rig, views, truth, person, Prior(1.0, both), misplaced_mm)
     kept = parameters(person)
     parts = truth.poses, truth.expressions, truth.person.offset.at[chosen].add(-own)
     flat, unravel = jax.flatten_util.ravel_pytree(parts)
