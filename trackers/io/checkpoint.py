@@ -2,7 +2,6 @@
 
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilters.trackers.io.errors import CheckpointError
+from jaxfilters.trackers.io.errors import CheckpointError, InputError, shown
+from jaxfilters.trackers.io.json_files import parse_json
+from jaxfilters.trackers.io.npz import read_npz
 
 SCHEMA = 1
 """Version of the layout below; a file of another version is refused."""
@@ -36,7 +37,8 @@ def load(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     arrays, meta = _read(path)
     leaves, treedef = jax.tree_util.tree_flatten_with_path(template)
     if (expected := {_name(place) for place, _ in leaves}) != set(arrays):
-        raise CheckpointError(f"{path}: its arrays differ from the expected ones in {sorted(expected ^ set(arrays))}.")
+        different = shown(sorted(expected ^ set(arrays)), 160)
+        raise CheckpointError(f"{path}: its arrays differ from the expected ones in {different}.")
     return jax.tree.unflatten(treedef, [_restore(path, _name(p), arrays[_name(p)], leaf) for p, leaf in leaves]), meta
 
 
@@ -60,14 +62,15 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
-        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays.pop("header")))
-        schema, meta = header["schema"], header["meta"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path}: not a complete checkpoint ({error}).") from None
-    if schema != SCHEMA:
-        raise CheckpointError(f"{path}: schema {schema}, but this version reads {SCHEMA}.")
+        arrays = read_npz(path, "expected a checkpoint")
+        header = parse_json(str(arrays.pop("header", "")), f"{path}: header", "expected a checkpoint")
+    except InputError as error:
+        raise CheckpointError(f"{error} It is not a complete checkpoint.") from None
+    meta = header.get("meta") if isinstance(header, dict) else None
+    if not isinstance(meta, dict):
+        raise CheckpointError(f"{path}: not a complete checkpoint (without schema and meta).")
+    if header.get("schema") != SCHEMA:
+        raise CheckpointError(f"{path}: schema {shown(header.get('schema'))}, but this version reads {SCHEMA}.")
     return arrays, meta
 
 

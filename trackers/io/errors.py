@@ -1,5 +1,9 @@
 """Errors that end a command in one line: what cannot be read, written or continued, and why."""
 
+from typing import Any
+
+_LONGEST = 80
+
 
 class InputError(ValueError):
     """An input that cannot be used; the message says what was found and what was expected."""
@@ -11,3 +15,24 @@ class OutputError(OSError):
 
 class CheckpointError(ValueError):
     """A saved state that cannot be continued; the message says why."""
+
+
+def shown(value: Any, longest: int = _LONGEST) -> str:
+    """A value of unknown origin for a message, in Python's notation: on one line, and no longer than a line.
+
+    Args:
+        value: What was found.
+        longest: Number of characters.
+    """
+    return shortened(repr(value[: longest + 1] if isinstance(value, str) else value), longest)
+
+
+def shortened(text: str, longest: int = _LONGEST) -> str:
+    """Text of unknown origin for a message: without its end, which nobody reads, where it is longer than a line.
+
+    Args:
+        text: What was found.
+        longest: Number of characters.
+    """
+    line = "".join(letter if letter.isprintable() else "?" for letter in text[: longest + 1])
+    return line if len(line) <= longest else line[: longest - 3] + "..."
