@@ -52,7 +52,7 @@ def calibrate(options: argparse.Namespace) -> str:
 
 
 def _from_points(options: argparse.Namespace) -> str:
-    points_m, pixels, lines = _read_points(options.file)
+    points_m, pixels, lines = read_room_points(options.file)
     size = options.image_size
     outside = ((pixels < -0.5) | (pixels > np.asarray(size) - 0.5)).any(axis=1)
     if outside.any():
@@ -85,7 +85,12 @@ def _camera_of_points(points_m: np.ndarray, pixels: np.ndarray, options: argpars
     return calibrate_points(points_m, pixels, coefficients=coefficients), how
 
 
-def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
+def read_room_points(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Places in the room (n, 3), metres, their pixels (n, 2), and the lines of the file (n,) that they are from.
+
+    Raises:
+        InputError: a file that cannot be read, another header, or entries that are no finite numbers.
+    """
     wanted = f"expected a header {','.join(_COLUMNS)} and numbers"
     table = read_table(path, wanted, exactly(path, wanted, _COLUMNS))
     values = np.stack([table.numbers[name] for name in _COLUMNS], axis=-1)

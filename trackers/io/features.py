@@ -47,7 +47,7 @@ def open_features(
     if fps is not None:
         check_rate(fps)
     shape = None if image_size is None else (image_size[1], image_size[0])
-    if path.is_file() and path.suffix == ".npz":
+    if path.suffix == ".npz" and not path.is_dir():
         return _open_npz(path, shape, noise_px, fps)
     detections = keypoint_files.read(path, hand, fps or FPS)
     points = detections.points

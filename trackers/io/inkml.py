@@ -28,7 +28,7 @@ _VALUE = re.compile(
 _LABELS, _PERSONS = ("truth", "label"), ("writer", "person")
 _ID = "{http://www.w3.org/XML/1998/namespace}id"
 _ORDER = {"!": 0, "'": 1, '"': 2}
-_MOST_PIECES = 100_000
+_MOST_PIECES, _MOST_REFERENCES = 100_000, 20
 Piece = Float[np.ndarray, "_ d"]
 
 
@@ -112,8 +112,8 @@ class _Reader:
         """Of a context, an ink source or a trace format; of X and Y where none of them says."""
         if context is None:
             return _Channels()
-        if depth > len(self.named):
-            raise InputError(f"{self.path}: {context.tag} {shown(context.get(_ID))} refers to itself.")
+        if depth > _MOST_REFERENCES:
+            raise InputError(f"{self.path}: {context.tag} {shown(context.get(_ID))} refers to itself, or too far on.")
         if context.tag == "traceFormat":
             return self._format(context)
         for tag in ("traceFormat", "inkSource"):

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.tsai import calibration_of_tsai
+from jaxfilters.trackers.calibration.command import read_room_points
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.cameras import open_camera, open_intrinsics, read_tsai
 from jaxfilters.trackers.io.depth import open_depth
@@ -34,6 +35,7 @@ from jaxfilters.trackers.io.face_models import default_face_model, load_face_mod
 from jaxfilters.trackers.io.features import open_features
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE as SYMBOLS
 from jaxfilters.trackers.io.gesture_models import read_symbols
+from jaxfilters.trackers.io.ict import open_ict
 from jaxfilters.trackers.io.images import read_image
 from jaxfilters.trackers.io.landmark_sets import read_landmark_sets
 from jaxfilters.trackers.io.landmarks import read_landmarks
@@ -77,6 +79,27 @@ UNIPEN = """.VERSION 1.0
 .PEN_UP
 .SEGMENT DIGIT 1:1-2:0 GOOD "3"
 """
+
+
+INKML = """<ink xmlns="http://www.w3.org/2003/InkML">
+<annotation type="writer">Ann</annotation>
+<context xml:id="pen"><inkSource xml:id="src"><traceFormat xml:id="fmt">
+<channel name="X" type="integer"/><channel name="Y" type="decimal" orientation="-ve"/><channel name="T" type="integer"/>
+<intermittentChannels><channel name="B1" type="boolean"/></intermittentChannels></traceFormat></inkSource></context>
+<traceGroup xml:id="a"><annotation type="truth">one</annotation>
+<trace xml:id="t1">10 0 0, 9 14 1, !8 '2 "3, * * *, 1 2 3 T</trace>
+<trace xml:id="t2" contextRef="#pen">130 155 0,144 159 1,158 160 2</trace></traceGroup>
+<trace type="penUp" xml:id="t3">1 1 1</trace>
+<traceGroup><traceView traceDataRef="#t2"/></traceGroup>
+<trace xml:id="t4" continuation="begin">1 2 3</trace>
+<trace continuation="end" priorRef="#t4">#1F -4.5e1 3</trace>
+</ink>
+"""
+DRAWINGS = [
+    {"word": "cat", "key_id": "17", "drawing": [[[1, 2, 3], [4, 5, 6]], [[7, 8], [9, 1], [0, 10]]]},
+    {"label": "dot", "person": "Ann", "fingers": 2, "points": [[0.5, 1], [2, 3.5]]},
+    {"label": "line", "pieces": [[[0, 1], [2, 3]], [[4, 5]]]},
+]
 
 
 class Format(NamedTuple):
@@ -183,6 +206,16 @@ def saved_state(folder: Path) -> list[Path]:
     return [folder / "a.npz"]
 
 
+def ict_files(folder: Path) -> list[Path]:
+    rng = np.random.default_rng(1)
+    np.savez(folder / "ict_landmarks68.npz", vertex_ids=np.arange(68))
+    arrays = {"neutral": (70, 3), "identity": (4, 70, 3), "expression": (2, 70, 3)}
+    arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in arrays.items()}
+    quads = rng.integers(70, size=(9, 4))
+    np.savez(folder / "ict_face9409.npz", quads=quads, expression_names=np.array(["a", "b"]), **arrays)
+    return [folder / "ict_face9409.npz", folder / "ict_landmarks68.npz"]
+
+
 def camera_numbers(path: Path) -> Any:
     _, camera, undistortion = open_camera(path)
     return camera.P, np.asarray(camera.P, np.float32), undistortion.K, undistortion.distortion
@@ -269,6 +302,14 @@ FORMATS = {
     ),
     "scene.json": Format(scene_files, scene_numbers, files=600),
     "tsai": Format(text_file("a.xml", TSAI), tsai_numbers),
+    "inkml": Format(text_file("a.inkml", INKML), stroke_numbers),
+    "strokes.json": Format(json_file("a.json", DRAWINGS), stroke_numbers),
+    "strokes.ndjson": Format(text_file("a.ndjson", "\n".join(map(json.dumps, DRAWINGS))), stroke_numbers),
+    "ict face": Format(ict_files, lambda path: open_ict(path.parent), files=300),
+    "room points": Format(
+        table("x_m,y_m,z_m,u,v", [(i, i % 3, 0.5, 10 * i, 20) for i in range(8)]),
+        lambda path: read_room_points(path)[:2],
+    ),
     "unipen": Format(text_file("a.unipen", UNIPEN), stroke_numbers),
     "strokes.csv": Format(
         table("stroke,label,time,x,y,fingers", [(s, "ab"[s], t, t + s, 2 * t, 1) for s in range(2) for t in range(5)]),
@@ -479,8 +520,25 @@ def mutated_png(rng: np.random.Generator, data: bytes) -> bytes:
     return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
 
 
+def mutated_sides(rng: np.random.Generator, data: bytes) -> bytes:
+    """Another number of columns or rows where the header of a JPEG, a BMP or a TIFF has it."""
+    starts = [place for side in (24, 32) for mark in (side.to_bytes(2, "big"), side.to_bytes(2, "little"))
+              for place in range(2, min(len(data), 700)) if data[place : place + 2] == mark]  # fmt: skip
+    starts += [len(data) - place for place in range(2, min(len(data), 200)) if data[-place] in (24, 32)]
+    out = bytearray(data)
+    for _ in range(2):
+        place = starts[int(rng.integers(len(starts)))]
+        out[place : place + 2] = int(rng.choice([0, 1, 33, 4000, 2**15, 2**16 - 1])).to_bytes(2, "big")
+    return bytes(out)
+
+
 MUTATIONS = {
     ".json": mutated_json,
+    ".ndjson": mutated_text,
+    ".inkml": mutated_text,
+    ".jpg": mutated_sides,
+    ".bmp": mutated_sides,
+    ".tiff": mutated_sides,
     ".npz": mutated_npz,
     ".csv": mutated_text,
     ".xml": mutated_text,
