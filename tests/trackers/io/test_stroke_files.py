@@ -10,7 +10,7 @@ from jaxfilters.trackers.io.inkml import read_inkml
 from jaxfilters.trackers.io.strokes import read_strokes
 
 DIFFERENCES = """<trace xml:id="id4525abc">1125 18432,'23'43,"7"-8,3-5,7 -3,6 2,6 8,3 6 T,2 4*T,3 6,3-6 F F</trace>"""
-"""Section 3.2.3 of the recommendation, and below the points of its table."""
+"""The example of differences in the recommendation, under the element `trace`; below, the points of its table."""
 POINTS = [
     *[(1125, 18432), (1148, 18475), (1178, 18510), (1211, 18540), (1251, 18567), (1297, 18596)],
     *[(1349, 18633), (1404, 18676), (1461, 18723), (1521, 18776), (1584, 18823)],
