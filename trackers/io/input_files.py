@@ -80,9 +80,9 @@ def check_rate(fps: float, name: str = "fps") -> float:
 def too_large(values: np.ndarray) -> np.ndarray:
     """Which numbers are infinite or beyond `LARGEST`, of the shape of `values`; NaN is not."""
     if values.dtype == np.float16:
-        return np.isinf(values)
+        return np.asarray(np.isinf(values))
     # Both signs: the smallest integer has no absolute value.
-    return (values > LARGEST) | (values < -LARGEST)
+    return np.asarray((values > LARGEST) | (values < -LARGEST))
 
 
 def are_finite(values: np.ndarray) -> bool:
