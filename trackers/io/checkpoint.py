@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilters.trackers.io.errors import CheckpointError, InputError, shown
+from jaxfilters.trackers.io.errors import CheckpointError, InputError, shortened, shown
 from jaxfilters.trackers.io.json_files import parse_json
 from jaxfilters.trackers.io.npz import read_npz
 
+_WANTED = "expected a checkpoint"
 SCHEMA = 1
 """Version of the layout below; a file of another version is refused."""
 
@@ -42,9 +43,31 @@ def load(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     return jax.tree.unflatten(treedef, [_restore(path, _name(p), arrays[_name(p)], leaf) for p, leaf in leaves]), meta
 
 
+def load_names(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays by their places in the tree, as `jax.tree_util.keystr` after "tree", and the `meta`.
+
+    Raises:
+        CheckpointError: damaged file, or other schema.
+    """
+    return _read(path)
+
+
 def load_meta(path: Path) -> dict[str, Any]:
     """The `meta` of a checkpoint, without its arrays being looked at."""
     return _read(path)[1]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file that `write_npz` wrote.
+
+    Raises:
+        CheckpointError: no such file, or a damaged one.
+    """
+    try:
+        return read_npz(path, _WANTED)
+    except InputError as error:
+        reason = shortened(str(error).removeprefix(f"{path}: "), 160)
+        raise CheckpointError(f"{path}: not a complete checkpoint ({reason})") from None
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -61,17 +84,17 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = read_arrays(path)
     try:
-        arrays = read_npz(path, "expected a checkpoint")
-        header = parse_json(str(arrays.pop("header", "")), f"{path}: header", "expected a checkpoint")
+        header = parse_json(str(arrays.pop("header", "")), f"{path}: header", _WANTED)
     except InputError as error:
-        raise CheckpointError(f"{error} It is not a complete checkpoint.") from None
-    meta = header.get("meta") if isinstance(header, dict) else None
-    if not isinstance(meta, dict):
+        reason = shortened(str(error).removeprefix(f"{path}: "), 160)
+        raise CheckpointError(f"{path}: not a complete checkpoint ({reason})") from None
+    if not isinstance(header, dict) or not isinstance(header.get("meta"), dict):
         raise CheckpointError(f"{path}: not a complete checkpoint (without schema and meta).")
     if header.get("schema") != SCHEMA:
         raise CheckpointError(f"{path}: schema {shown(header.get('schema'))}, but this version reads {SCHEMA}.")
-    return arrays, meta
+    return arrays, header["meta"]
 
 
 def _restore(path: Path, name: str, saved: np.ndarray, leaf: Any) -> Any:

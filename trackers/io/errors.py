@@ -1,7 +1,9 @@
 """Errors that end a command in one line: what cannot be read, written or continued, and why."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
+Made = TypeVar("Made")
 _LONGEST = 80
 
 
@@ -15,6 +17,18 @@ class OutputError(OSError):
 
 class CheckpointError(ValueError):
     """A saved state that cannot be continued; the message says why."""
+
+
+def as_input_error(make: Callable[[], Made]) -> Made:
+    """The result of `make`, which checks what a user passed.
+
+    Raises:
+        InputError: for a `ValueError`, with its message.
+    """
+    try:
+        return make()
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 def shown(value: Any, longest: int = _LONGEST) -> str:

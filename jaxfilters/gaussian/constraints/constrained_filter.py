@@ -19,6 +19,7 @@ from jaxfilters.gaussian.constraints import expectation_propagation
 from jaxfilters.gaussian.constraints.constant_rows import check_constant
 from jaxfilters.gaussian.constraints.info import TruncationInfo
 from jaxfilters.gaussian.constraints.linear import LinearConstraints, check_rows, check_width
+from jaxfilters.gaussian.constraints.resolution import check_resolution
 from jaxfilters.gaussian.constraints.sites import Sites, initial_sites
 from jaxfilters.typing import AnyKey
 
@@ -142,13 +143,14 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
             pytree with the methods of `Constrain`.
 
     Returns:
-        The constrained filter. It takes the observations and controls of `inner`.
+        The constrained filter. It takes the observations and inputs of `inner`.
 
     Raises:
         TypeError: `inner` or `constrain` is of the wrong kind, the state of `inner` is not Gaussian, or
             `constrain.lasting` is not Boolean.
-        ValueError: The rows do not fit the state, their numbers are not valid, or a row that is declared lasting
-            moves in time. Values are checked where they are known, that is, not under `jit` or `grad`.
+        ValueError: The rows do not fit the state, their numbers are not valid, a row that is declared lasting moves in
+            time, or one is too narrow for a covariance in float32. Values are checked where they are known, that is,
+            not under `jit` or `grad`.
 
     Example:
         A random walk that stays above 0:
@@ -193,6 +195,7 @@ def _checked(inner, constrain):
     if lasting.shape != (rows,):
         raise ValueError(f"lasting: expected shape ({rows},), one for each row; got {lasting.shape}.")
     check_constant(inner, constrain.constraints, lasting)
+    check_resolution(inner, constrain.constraints, lasting)
     return replace(constrain, lasting=lasting)
 
 
@@ -200,14 +203,14 @@ def _init(model: Constrained, key: AnyKey) -> ConstrainedState:
     return ConstrainedState(model.inner.init(model.inner.params, key), model.constrain.start())
 
 
-def _predict(model: Constrained, key: AnyKey, state: ConstrainedState, control: PyTree) -> ConstrainedState:
-    return state._replace(belief=model.inner.predict(model.inner.params, key, state.belief, control))
+def _predict(model: Constrained, key: AnyKey, state: ConstrainedState, inputs: PyTree) -> ConstrainedState:
+    return state._replace(belief=model.inner.predict(model.inner.params, key, state.belief, inputs))
 
 
 def _update(
-    model: Constrained, key: AnyKey, state: ConstrainedState, observation: PyTree
+    model: Constrained, key: AnyKey, state: ConstrainedState, observation: PyTree, inputs: PyTree
 ) -> tuple[ConstrainedState, ConstrainedInfo]:
-    belief, info = model.inner.update(model.inner.params, key, state.belief, observation)
+    belief, info = model.inner.update(model.inner.params, key, state.belief, observation, inputs)
     belief, memory, truncation = model.constrain(belief, state.memory)
     log_evidence = info.log_evidence + truncation.log_mass
     report = ConstrainedInfo(log_evidence, info, truncation, jnp.min(truncation.distances))

@@ -311,7 +311,7 @@ def test_messages_show_little_of_what_was_found():
 OPENS = re.compile(
     r"\bnp\.(load|fromfile)\(|json\.loads?\(|\.read_(text|bytes)\(|(?<!\w)open\(|imread|ElementTree\.parse\("
 )
-WRITES = re.compile(r"""open\((?:mode|"[wa]b?")|cpuinfo""")
+WRITES = re.compile(r"""open\((?:mode|"[wa]b?")|cpuinfo|json\.dumps""")
 SAFE = {"input_files.py", "json_files.py", "npz.py"}
 """The files that open input and check it first."""
 
