@@ -223,7 +223,7 @@ def _array(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, wanted:
         header = _checked_header(stream, entry)
         content, done = np.empty(header.size, np.uint8), 0
         while done < header.size:
-            count = stream.readinto(memoryview(content)[done : done + _PIECE])
+            count = stream.readinto(content.data[done : done + _PIECE])
             if not count:
                 raise ValueError(f"{shortened(entry.filename)} ends before its last element")
             done += count

@@ -4,7 +4,7 @@ import csv
 import io
 import sys
 from array import array
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,9 +79,11 @@ def exactly(
     return choose
 
 
-def _read(path: Path, rows, names: list[str], columns: Columns) -> Table:
+def _read(path: Path, rows: Iterable[tuple[int, list[str]]], names: list[str], columns: Columns) -> Table:
     places = {name: place for place, name in enumerate(names)}
-    numbers, words, lines = {name: array("d") for name in columns.numbers}, {name: [] for name in columns.words}, []
+    numbers = {name: array("d") for name in columns.numbers}
+    words: dict[str, list[str]] = {name: [] for name in columns.words}
+    lines: list[int] = []
     for line, row in rows:
         if len(row) != len(names):
             entries = f"{len(row)} entries, its header {len(names)}"
