@@ -219,6 +219,7 @@ def _checked_header(stream: Any, entry: zipfile.ZipInfo) -> ArrayHeader:
 
 def _array(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, wanted: str) -> np.ndarray:
     _check_entry(path, entry, wanted)
+    stream: Any
     with archive.open(entry) as stream:
         header = _checked_header(stream, entry)
         content, done = np.empty(header.size, np.uint8), 0

@@ -29,6 +29,7 @@ class Undistortion:
     @cached_property
     def _maps(self) -> tuple[np.ndarray, np.ndarray]:
         # Made for the first image: a description alone is cheap to open.
+        assert self.K is not None
         rows, cols = self.shape
         return cv2.initUndistortRectifyMap(self.K, self.distortion, np.eye(3), self.K, (cols, rows), cv2.CV_16SC2)
 
