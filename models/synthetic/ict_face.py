@@ -18,7 +18,11 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.typing import AnyKey
 
-_LANDMARKS, _SURFACE = "ict_landmarks68.npz", "ict_face9409.npz"
+ICT_FILES = {
+    "ict_landmarks68.npz": ("vertex_ids",),
+    "ict_face9409.npz": ("neutral", "quads", "identity", "expression", "expression_names"),
+}
+"""Files in the model's folder, and the arrays that are used of each."""
 _TO_OURS = np.array([10.0, -10.0, -10.0])
 
 
@@ -54,20 +58,42 @@ def read_ict(folder: Path) -> IctModel:
     Raises:
         ValueError: if the folder lacks one of the two files, or one of them lacks an array.
     """
-    points, surface = _arrays(folder / _LANDMARKS, "vertex_ids"), _arrays(folder / _SURFACE, "neutral", "quads")
-    surface |= _arrays(folder / _SURFACE, "identity", "expression", "expression_names")
-    quads = surface["quads"]
+    paths = [folder / name for name in ICT_FILES]
+    return ict_model(*(_arrays(path, *names) for path, names in zip(paths, ICT_FILES.values(), strict=True)))
+
+
+def ict_model(points: dict[str, np.ndarray], surface: dict[str, np.ndarray]) -> IctModel:
+    """The face model of the arrays of its two files.
+
+    Args:
+        points: Of the first of `ICT_FILES`.
+        surface: Of the second.
+
+    Raises:
+        ValueError: if their shapes do not fit each other, they are not finite, or indices name vertices that are not
+            there.
+    """
+    neutral, quads, landmarks = surface["neutral"], surface["quads"], points["vertex_ids"]
+    num_vertices, names = len(np.atleast_1d(neutral)), np.atleast_1d(surface["expression_names"])
+    shapes = {
+        "identity": (*surface["identity"].shape[:1], num_vertices, 3),
+        "expression": (len(names), num_vertices, 3),
+    }
+    for name, shape in {"neutral": (num_vertices, 3), **shapes}.items():
+        array = surface[name]
+        # Beyond this, lengths in millimetres overflow in single precision once they are squared.
+        if array.shape != shape or array.dtype.kind != "f" or not np.all(np.abs(array.astype(float)) < 1e12):
+            raise ValueError(f"{name} must be finite numbers {shape}; got {array.shape} {array.dtype}.")
+    for name, indices, shape in (("quads", quads, (len(np.atleast_1d(quads)), 4)), ("vertex_ids", landmarks, (68,))):
+        named = indices.shape == shape and indices.dtype.kind in "iu" and indices.size > 0
+        if not named or indices.min() < 0 or indices.max() >= num_vertices:
+            raise ValueError(f"{name} must name {shape} of {num_vertices} vertices by index; got {indices.shape}.")
     # The files wind their quads counter-clockwise from outside; turning y and z over keeps that.
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    neutral, identity, expression = (
-        jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float)
-        for name in ("neutral", "identity", "expression")
+    scaled = (jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float) for name in ("neutral", *shapes))
+    return IctModel(
+        *scaled, jnp.asarray(landmarks, jnp.int32), jnp.asarray(faces, jnp.int32), tuple(str(name) for name in names)
     )
-    landmarks = np.asarray(points["vertex_ids"])
-    if landmarks.shape != (68,) or landmarks.max() >= len(neutral):
-        raise ValueError(f"vertex_ids of {folder / _LANDMARKS} must name 68 of {len(neutral)} vertices.")
-    names = tuple(str(name) for name in surface["expression_names"])
-    return IctModel(neutral, identity, expression, jnp.asarray(landmarks), jnp.asarray(faces, jnp.int32), names)
 
 
 @jax.jit

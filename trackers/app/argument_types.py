@@ -2,6 +2,13 @@
 
 import argparse
 import math
+import re
+
+_MOST_DIGITS = 18
+"""Of an integer that fits into 64 bits."""
+_MOST_PIXELS = 128 * 2**20
+_LONGEST = 40
+"""Characters of a wrong argument that its error repeats."""
 
 
 def positive_number(text: str) -> float:
@@ -11,27 +18,52 @@ def positive_number(text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"expected a finite number above 0; got {text}")
+        raise argparse.ArgumentTypeError(f"expected a finite number above 0; got {_shown(text)}")
+    return value
+
+
+def finite_number(text: str) -> float:
+    """A number of either sign."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a finite number; got {_shown(text)}")
     return value
 
 
 def positive_integer(text: str) -> int:
     """A count of at least 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a positive integer; got {text}")
-    return int(text)
+    value = _integer(text)
+    if value is None or value < 1:
+        raise argparse.ArgumentTypeError(f"expected a positive integer; got {_shown(text)}")
+    return value
 
 
 def seed(text: str) -> int:
     """The seed of a random key."""
-    if not -(2**63) <= int(text) < 2**63:
-        raise argparse.ArgumentTypeError(f"a seed must fit into 64 bits; got {text}")
-    return int(text)
+    value = int(text) if re.fullmatch(r"[+-]?\d{1,19}", text.strip(), re.ASCII) else None
+    if value is None or not -(2**63) <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"a seed must fit into 64 bits; got {_shown(text)}")
+    return value
 
 
 def image_size(text: str) -> tuple[int, int]:
     """Columns and rows of an image, in pixels."""
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 640x480; got {text}")
-    return int(width), int(height)
+    width, _, height = text.lower().partition("x")
+    sides = _integer(width), _integer(height)
+    if sides[0] is None or sides[1] is None or min(sides[0], sides[1]) < 1:
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 640x480; got {_shown(text)}")
+    if sides[0] * sides[1] > _MOST_PIXELS:
+        raise argparse.ArgumentTypeError(f"expected at most {_MOST_PIXELS >> 20} million pixels; got {_shown(text)}")
+    return sides[0], sides[1]
+
+
+def _integer(text: str) -> int | None:
+    return int(text) if re.fullmatch(rf"\d{{1,{_MOST_DIGITS}}}", text, re.ASCII) else None
+
+
+def _shown(text: str) -> str:
+    printable = "".join(letter if letter.isprintable() else "?" for letter in text[: _LONGEST + 1])
+    return printable if len(printable) <= _LONGEST else printable[: _LONGEST - 3] + "..."

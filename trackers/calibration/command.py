@@ -1,7 +1,6 @@
 """`jaxfilters calibrate`: where fixed cameras stand, from points, from pictures of a board, or from Tsai's XML."""
 
 import argparse
-import csv
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from jaxfilters.trackers.calibration.stereo import calibrate_rig
 from jaxfilters.trackers.io.cameras import open_intrinsics, read_tsai, write_calibration, write_camera
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import read_image
+from jaxfilters.trackers.io.tables import exactly, read_table
 
 _COLUMNS = ("x_m", "y_m", "z_m", "u", "v")
 _FEW_COEFFICIENTS, _MANY_POINTS = 2, 30
@@ -51,7 +51,7 @@ def calibrate(options: argparse.Namespace) -> str:
 
 
 def _from_points(options: argparse.Namespace) -> str:
-    points_m, pixels, lines = _read_points(options.file)
+    points_m, pixels, lines = read_room_points(options.file)
     size = options.image_size
     outside = ((pixels < -0.5) | (pixels > np.asarray(size) - 0.5)).any(axis=1)
     if outside.any():
@@ -84,32 +84,16 @@ def _camera_of_points(points_m: np.ndarray, pixels: np.ndarray, options: argpars
     return calibrate_points(points_m, pixels, coefficients=coefficients), how
 
 
-def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
+def read_room_points(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Places in the room (n, 3), metres, their pixels (n, 2), and the lines of the file (n,) that they are from.
+
+    Raises:
+        InputError: a file that cannot be read, another header, or entries that are no finite numbers.
+    """
     wanted = f"expected a header {','.join(_COLUMNS)} and numbers"
-    try:
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            header = [name.strip() for name in reader.fieldnames or []]
-            if header != list(_COLUMNS):
-                raise InputError(f"{path}: {wanted}; the header is {','.join(header)!r}.")
-            reader.fieldnames = header
-            numbered = [(reader.line_num, row) for row in reader]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {wanted}.") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: no CSV ({error}); {wanted}.") from None
-    values = np.array([_numbers(row, f"{path}: line {line}") for line, row in numbered]).reshape(-1, len(_COLUMNS))
-    return values[:, :3], values[:, 3:], [line for line, _ in numbered]
-
-
-def _numbers(row: dict, place: str) -> list[float]:
-    try:
-        values = [float(row[name]) for name in _COLUMNS]
-    except (TypeError, ValueError):
-        values = []
-    if len(values) != len(_COLUMNS) or not np.isfinite(values).all() or None in row:
-        raise InputError(f"{place}: expected five finite numbers; got {list(row.values())}.")
-    return values
+    table = read_table(path, wanted, exactly(path, wanted, _COLUMNS))
+    values = np.stack([table.numbers[name] for name in _COLUMNS], axis=-1)
+    return values[:, :3], values[:, 3:], table.lines.tolist()
 
 
 def _from_boards(options: argparse.Namespace) -> str:
@@ -124,22 +108,22 @@ def _from_boards(options: argparse.Namespace) -> str:
         raise InputError(f"{other[0]}: {sizes[other[0]]} pixels; {files[0]} has {size}. All must be of one camera.")
     views = {file: detect_board(image, board) for file, image in images.items()}
     K, distortion, rms_px = as_input_error(lambda: calibrate_intrinsics(list(views.values()), size))
-    seen = sum(len(view.pixels) for view in views.values())
-    told = [f"intrinsics from {seen} corners in {len(files)} pictures: reprojection error {rms_px:.3f} px"]
+    corners = sum(len(view.pixels) for view in views.values())
+    lines = [f"intrinsics from {corners} corners in {len(files)} pictures: reprojection error {rms_px:.3f} px"]
     if options.floor is None:
         write_camera(options.out, size, K=K, distortion=distortion, name=options.out.stem)
-        told += [
+        lines += [
             f"focal length {K[0, 0]:.1f} x {K[1, 1]:.1f} px; where the camera stands is open: give --floor IMAGE of a "
             f"board on the floor, or use `calibrate points --intrinsics {options.out}`",
             f"intrinsics in {options.out}",
         ]
-        return "\n".join(told)
+        return "\n".join(lines)
     view = views[options.floor]
     calibration = _named(options.floor, lambda: calibrate_on_floor(view, K, distortion))
     options.image_size = size
     points_m = view.points_m * (1, -1, -1)
     return "\n".join(
-        [*told, _written(calibration, options, "the pose over the board on the floor", points_m, view.pixels)]
+        [*lines, _written(calibration, options, "the pose over the board on the floor", points_m, view.pixels)]
     )
 
 
@@ -169,10 +153,10 @@ def _written(
     camera = as_input_error(lambda: FloorCamera.from_matrix(calibration.P, (rows, cols)))
     write_calibration(options.out, calibration, (cols, rows), name=options.out.stem)
     x, y, z = np.asarray(camera.position(), float)
-    told = [f"camera at ({x:.2f}, {y:.2f}) m, {z:.2f} m above the floor; from {how}"]
+    described = [f"camera at ({x:.2f}, {y:.2f}) m, {z:.2f} m above the floor; from {how}"]
     if points_m is not None and pixels is not None:
-        told += _errors(calibration, points_m, pixels, lines)
-    return "\n".join([*told, f"camera in {options.out}"])
+        described += _errors(calibration, points_m, pixels, lines)
+    return "\n".join([*described, f"camera in {options.out}"])
 
 
 def _errors(calibration: Calibration, points_m: np.ndarray, pixels: np.ndarray, lines: list[int] | None) -> list[str]:
@@ -180,11 +164,12 @@ def _errors(calibration: Calibration, points_m: np.ndarray, pixels: np.ndarray, 
     errors_m = floor_errors_m(calibration, points_m, pixels)
     worst = int(np.argmax(errors_px))
     where = f" (line {lines[worst]})" if lines else ""
-    told = [f"reprojection error {calibration.rms_px:.3f} px rms, {errors_px[worst]:.2f} px at worst{where}"]
-    seen = errors_m[np.isfinite(errors_m)]
-    if len(seen):
-        told += [f"floor error {seen.mean():.3f} m on average, {seen.max():.3f} m at worst, in the plane of each point"]
-    return told
+    described = [f"reprojection error {calibration.rms_px:.3f} px rms, {errors_px[worst]:.2f} px at worst{where}"]
+    known_m = errors_m[np.isfinite(errors_m)]
+    if len(known_m):
+        mean_m, worst_m = known_m.mean(), known_m.max()
+        described += [f"floor error {mean_m:.3f} m on average, {worst_m:.3f} m at worst, in the plane of each point"]
+    return described
 
 
 def _named(path: Path, make: Callable):

@@ -36,7 +36,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
             "camera for every moment, in the order of their names."
         )
     views, image_size = _views(files, board)
-    found = [_intrinsics(folder, seen, image_size) for folder, seen in zip(folders, views, strict=True)]
+    found = [_intrinsics(folder, own, image_size) for folder, own in zip(folders, views, strict=True)]
     pose = as_input_error(lambda: calibrate_stereo(views[0], views[1], (found[0][:2], found[1][:2]), image_size))
     total = _check_agreement(pose, files)
     poses = [(np.eye(3), np.zeros(3)), (pose.R, 1000 * pose.t)]
@@ -46,7 +46,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
     ]
     note = f"reprojection error {pose.rms_px:.3g} px, epipolar error {total:.3g} px"
     write_rig(options.out, cameras, note=note)
-    return _told(options, pose, total, cameras, [rms for *_, rms in found])
+    return _described(options, pose, total, cameras, [rms for *_, rms in found])
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -94,7 +94,7 @@ def _check_agreement(pose: StereoPose, files: list[list[Path]]) -> float:
     return total
 
 
-def _told(
+def _described(
     options: argparse.Namespace, pose: StereoPose, total: float, cameras: list[RigCamera], rms_px: list[float]
 ) -> str:
     used = np.isfinite(pose.epipolar_px)

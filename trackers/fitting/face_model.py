@@ -22,21 +22,21 @@ from jaxfilters.models.face.multilinear import (
 from jaxfilters.models.face.multilinear_fit import leave_one_out
 from jaxfilters.models.face.people_alignment import aligned_people
 from jaxfilters.models.synthetic.face_training import generator_shapes, ict_shapes, people_of
-from jaxfilters.models.synthetic.ict_face import read_ict
 from jaxfilters.trackers.io.enrolled_people import People, write_people
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, save_face_model
+from jaxfilters.trackers.io.ict import open_ict
 from jaxfilters.trackers.io.landmark_sets import NAMES_68, LandmarkSets, read_landmark_sets, ten_of
 
 _ICT_FILE = "ict_landmarks68.npz"
 _MOST_LEFT_OUT = 12
 """People to leave out one after the other: each costs a model."""
 _NEAR_MM = 650.0
-"""Depth at which errors of size are told as errors of depth."""
+"""Depth at which errors of size are reported as errors of depth."""
 
 
 class Examples(NamedTuple):
-    """What is learnt from."""
+    """What a model is estimated from."""
 
     sets: LandmarkSets
     source: str
@@ -69,7 +69,9 @@ def fit(options: argparse.Namespace) -> str:
         raise InputError(f"--people must be 3 or more; got {options.people}.")
     with jax.enable_x64(True):
         examples = _examples(options)
-        model, tensor, quality = as_input_error(lambda: _learnt(examples.sets, options.identities, options.expressions))
+        model, tensor, quality = as_input_error(
+            lambda: _estimated(examples.sets, options.identities, options.expressions)
+        )
         parameters = {
             **examples.parameters,
             "identities": options.identities,
@@ -80,13 +82,13 @@ def fit(options: argparse.Namespace) -> str:
         sets = examples.sets
         file = FaceModelFile(model, sets.names, sets.pairs, examples.source, parameters)
         save_face_model(options.out, file)
-        told = [*_told(sets, examples.source, quality, options), *_generalisation(tensor, options)]
-        told.append(f"model in {options.out}")
+        lines = [*_described(sets, examples.source, quality, options), *_generalisation(tensor, options)]
+        lines.append(f"model in {options.out}")
         if options.remember is not None:
             names = tuple(f"{examples.source}, {i + 1}" for i in range(len(sets.shapes)))
             write_people(options.remember, People(names, remembered.of_tensor(model, tensor)), model)
-            told.append(f"people in {options.remember}")
-        return "\n".join(told)
+            lines.append(f"people in {options.remember}")
+        return "\n".join(lines)
 
 
 def _examples(options: argparse.Namespace) -> Examples:
@@ -110,7 +112,7 @@ def _examples(options: argparse.Namespace) -> Examples:
 
 def _ict_examples(options: argparse.Namespace, key: jax.Array, drawn: dict) -> Examples:
     # Read in single precision, the precision of its files; what is computed with it is double.
-    single = as_input_error(lambda: read_ict(options.data))
+    single = open_ict(options.data)
     widened = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
     model = jax.tree.map(widened, single)
     landmarks: tuple[int, ...]
@@ -134,7 +136,7 @@ def _aligned(sets: LandmarkSets) -> LandmarkSets:
     return sets._replace(shapes=np.asarray(aligned_people(jnp.asarray(sets.shapes), sets.neutral, weights)))
 
 
-def _learnt(sets: LandmarkSets, identities: int, expressions: int) -> tuple[MultilinearFace, jax.Array, Quality]:
+def _estimated(sets: LandmarkSets, identities: int, expressions: int) -> tuple[MultilinearFace, jax.Array, Quality]:
     observed = sets.observed
     if min(observed.shape) < 2:
         raise ValueError(f"two people and two expressions are needed; got {observed.shape}.")
@@ -160,7 +162,7 @@ def _check_support(found: list[int], ranks: dict[int, int]) -> None:
             raise ValueError(f"{option} must be 1 to {rank}, the rank of the faces; got {ranks[mode]}.")
 
 
-def _told(sets: LandmarkSets, source: str, quality: Quality, options: argparse.Namespace) -> list[str]:
+def _described(sets: LandmarkSets, source: str, quality: Quality, options: argparse.Namespace) -> list[str]:
     observed = sets.observed
     num_people, num_expressions = observed.shape
     missing = f", {int((~observed).sum())} faces missing" if not observed.all() else ""
@@ -185,6 +187,7 @@ def _generalisation(tensor: jax.Array, options: argparse.Namespace) -> list[str]
     return [
         f"{len(chosen)} people, each left out in turn: {rms_mm.mean():.2f} mm a landmark on average, "
         f"{rms_mm.max():.2f} mm at worst",
-        f"their size, told from their shape alone: {100 * size.mean():.1f} % off on average, {100 * size.max():.1f} % "
-        f"at worst; {_NEAR_MM * size.mean():.0f} and {_NEAR_MM * size.max():.0f} mm of depth at {_NEAR_MM:.0f} mm",
+        f"their size, estimated from their shape alone: {100 * size.mean():.1f} % off on average, "
+        f"{100 * size.max():.1f} % at worst; {_NEAR_MM * size.mean():.0f} and {_NEAR_MM * size.max():.0f} mm of depth "
+        f"at {_NEAR_MM:.0f} mm",
     ]

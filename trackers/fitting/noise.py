@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilters.models.moving_points import learn, tracks_of
-from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
+from jaxfilters.trackers.io.errors import InputError, as_input_error
+from jaxfilters.trackers.io.json_files import write_json
 from jaxfilters.trackers.io.points import read_points
 
 _SYNTHETIC = (0.5, 40.0)
@@ -21,8 +22,6 @@ def fit_noise(options: argparse.Namespace) -> str:
         InputError: the tracks cannot be used.
         OutputError: the file cannot be written.
     """
-    if not options.fps > 0:
-        raise InputError(f"--fps must be positive; got {options.fps}.")
     points, times = _synthetic(options.seed) if options.tracks is None else read_points(options.tracks, options.fps)
     tracks, _ = as_input_error(lambda: tracks_of(points, times))
     found = as_input_error(lambda: learn(tracks))
@@ -44,14 +43,11 @@ def _write(path: Path, found, points: np.ndarray, times: np.ndarray) -> None:
         "frames": len(times),
         "points": points.shape[1],
     }
-    try:
-        path.write_text(json.dumps(document, indent=2) + "\n")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+    write_json(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
 def _synthetic(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Five points in a plane, driven and seen with known noises at 30 frames a second."""
+    """Five points in a plane, driven and observed with known noises at 30 frames a second."""
     rng = np.random.default_rng(seed)
     sensor, drive = _SYNTHETIC
     dt = 1 / 30

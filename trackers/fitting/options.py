@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxfilters.trackers.app.argument_types import positive_number
+from jaxfilters.trackers.app.argument_types import positive_integer, positive_number
 from jaxfilters.trackers.gestures.options import add_fit_gestures
 
 IDENTITIES, EXPRESSIONS, PEOPLE = 15, 5, 200
@@ -27,17 +27,25 @@ def add_fit(commands: Any, seed: Callable[[str], int]) -> None:
     )
     face.add_argument("--out", type=Path, required=True, metavar="MODEL.npz", help="the file to write")
     face.add_argument(
-        "--identities", type=int, default=IDENTITIES, metavar="N", help="parameters of identity (default: %(default)s)"
+        "--identities",
+        type=positive_integer,
+        default=IDENTITIES,
+        metavar="N",
+        help="parameters of identity (default: %(default)s)",
     )
     face.add_argument(
-        "--expressions", type=int, default=EXPRESSIONS, metavar="N", help="of expression (default: %(default)s)"
+        "--expressions",
+        type=positive_integer,
+        default=EXPRESSIONS,
+        metavar="N",
+        help="of expression (default: %(default)s)",
     )
     face.add_argument(
         "--points", type=int, choices=(10, 68), help="landmarks (default: those of DATA; 10 where it has no own)"
     )
     face.add_argument(
         "--people",
-        type=int,
+        type=positive_integer,
         default=PEOPLE,
         metavar="N",
         help="how many to draw from the generator or the ICT face model (default: %(default)s)",

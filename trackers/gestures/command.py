@@ -1,4 +1,4 @@
-"""`jaxfilters fit gestures` and `jaxfilters recognise`: symbols learnt from strokes, and strokes told apart."""
+"""`jaxfilters fit gestures` and `jaxfilters recognise`: symbols estimated from strokes, and strokes recognised."""
 
 import argparse
 import csv
@@ -46,7 +46,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
             )
         states = before.symbols.models.log_initial.shape[-1] if before else options.states
         floor = before.min_variance if before else None
-        learnt = as_input_error(
+        trained = as_input_error(
             lambda: learn_strokes(
                 examples.strokes,
                 examples.labels,
@@ -56,17 +56,17 @@ def fit_gestures(options: argparse.Namespace) -> str:
             )
         )
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
-        symbols = as_input_error(lambda: extended(before.symbols, learnt)) if before else learnt
+        symbols = as_input_error(lambda: extended(before.symbols, trained)) if before else trained
         source = f"{before.source}; {source}" if before else source
         write_symbols(options.out, SymbolsFile(symbols, source, parameters))
         num_models, num_states = symbols.models.log_initial.shape
-        told = [
-            f"{source}: {len(examples.strokes)} strokes of {len(learnt.names)} symbols",
+        lines = [
+            f"{source}: {len(examples.strokes)} strokes of {len(trained.names)} symbols",
             f"{len(symbols.names)} symbols, {num_models} models of {num_states} states",
         ]
         if options.held_out:
-            told += _held_out(examples, options.states, ways)
-    return "\n".join([*told, f"model in {options.out}"])
+            lines += _held_out(examples, options.states, ways)
+    return "\n".join([*lines, f"model in {options.out}"])
 
 
 def recognise(options: argparse.Namespace) -> str:
@@ -139,18 +139,18 @@ def _judged(file: SymbolsFile, strokes: StrokeSet, margin: float) -> Recognition
 def _row(names: tuple[str, ...], strokes: StrokeSet, found: Recognition, i: int) -> tuple[str, ...]:
     label = int(found.label[i])
     confidence, lead = float(found.confidence[:, i].max()), float(found.lead[i])
-    told = (names[label], f"{confidence:.3f}") if label >= 0 else ("", "")
-    return strokes.ids[i], *told, f"{lead:.3f}" if np.isfinite(lead) else "", strokes.labels[i]
+    found_symbol = (names[label], f"{confidence:.3f}") if label >= 0 else ("", "")
+    return strokes.ids[i], *found_symbol, f"{lead:.3f}" if np.isfinite(lead) else "", strokes.labels[i]
 
 
 def _summary(rows: list[tuple[str, ...]]) -> str:
     rejected = sum(not row[1] for row in rows)
-    told = f"{len(rows)} strokes, {rejected} rejected"
+    summary = f"{len(rows)} strokes, {rejected} rejected"
     labelled = [row for row in rows if row[4]]
     if not labelled:
-        return told
+        return summary
     right = sum(row[1] == row[4] for row in labelled)
-    return f"{told}; of {len(labelled)} with a label {right} are right, {100 * right / len(labelled):.1f} %"
+    return f"{summary}; of {len(labelled)} with a label {right} are right, {100 * right / len(labelled):.1f} %"
 
 
 def _write(path: Path, rows: list[tuple[str, ...]]) -> None:

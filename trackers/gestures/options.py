@@ -4,13 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.app.argument_types import finite_number, positive_integer
+
 WRITERS, TRIALS = 6, 30
 """Of the generator, and how often each draws every shape with one finger and with two: what the model that comes with
 the package was made with."""
 _DATA = (
     "strokes: .csv with a row for each point (columns stroke,label,time,x,y and perhaps z, person, fingers), folder "
     "with a folder of such files for each symbol, .npz with points, length, label and perhaps person, or file of "
-    "UNIPEN; without it, symbols that are drawn at random"
+    "UNIPEN, InkML (.inkml) or JSON (.json, .ndjson); without it, symbols that are drawn at random"
 )
 
 
@@ -26,10 +28,13 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         "--held-out", choices=("person",), help="also say how strokes of each person are recognised by the others'"
     )
     gestures.add_argument(
-        "--states", type=int, metavar="N", help="of each model (default: 10; 16 for paths in a plane)"
+        "--states", type=positive_integer, metavar="N", help="of each model (default: 10; 16 for paths in a plane)"
     )
     gestures.add_argument(
-        "--ways", type=int, metavar="N", help="to draw each symbol (default: one for 40 examples, at most 20)"
+        "--ways",
+        type=positive_integer,
+        metavar="N",
+        help="to draw each symbol (default: one for 40 examples, at most 20)",
     )
     gestures.add_argument(
         "--seed", type=seed, default=0, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"
@@ -46,7 +51,7 @@ def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
     recognise.add_argument("--out", type=Path, metavar="FILE.csv", help="write a row for each stroke there")
     recognise.add_argument(
         "--margin",
-        type=float,
+        type=finite_number,
         default=0.0,
         metavar="NATS",
         help="a point by which a symbol has to beat what all of them are made of (default: %(default)s)",

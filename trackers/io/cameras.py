@@ -1,6 +1,5 @@
 """Fixed cameras on disk: `camera.json`, and Tsai's parameters as XML."""
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +8,9 @@ import numpy as np
 from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.tsai import TsaiCamera
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shown
+from jaxfilters.trackers.io.images import check_num_pixels
+from jaxfilters.trackers.io.input_files import LARGEST
 from jaxfilters.trackers.io.json_files import (
     check_intrinsics,
     image_size_of,
@@ -20,6 +21,7 @@ from jaxfilters.trackers.io.json_files import (
     write_json,
 )
 from jaxfilters.trackers.io.undistortion import Undistortion
+from jaxfilters.trackers.io.xml_files import read_xml
 
 _KEYS = {"name", "note", "image_size", "P", "K", "R", "t", "distortion"}
 _WANTED = (
@@ -27,6 +29,9 @@ _WANTED = (
     'in metres with Z up, and {"K", "distortion": [k1, k2, p1, p2, k3]} for images with lens distortion'
 )
 _ORTHONORMAL = 1e-4
+_HIGHEST_M = 200.0
+"""Above the floor: no camera shows people from higher up, and one whose lengths are millimetres stands there."""
+_WANTED_XML = "expected XML with Geometry, Intrinsic and Extrinsic, parameters of Tsai's model"
 
 
 class CameraFile(NamedTuple):
@@ -69,9 +74,10 @@ def open_camera(path: str | Path, *, image_size: tuple[int, int] | None = None) 
         camera = FloorCamera.from_matrix(_projection(settings, K, path), (rows, cols))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
+    _check_height(camera, path)
     name = settings.get("name", path.stem)
     if not isinstance(name, str):
-        raise InputError(f"{path}: name must be text; got {name!r}.")
+        raise InputError(f"{path}: name must be text; got {shown(name)}.")
     return CameraFile(name, camera, Undistortion((rows, cols), K, distortion))
 
 
@@ -149,28 +155,27 @@ def read_tsai(path: str | Path) -> TsaiCamera:
         InputError: an unreadable file, or one that lacks a number.
     """
     path = Path(path)
-    try:
-        root = ElementTree.parse(path).getroot()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path}: not XML ({error}).") from None
+    root = read_xml(path, _WANTED_XML)
 
     def number(element: str, name: str) -> float:
         found = root.find(element)
         text = None if found is None else found.get(name)
         if text is None:
-            raise InputError(f"{path}: {element} {name} missing.")
+            raise InputError(f"{path}: {element} {name} missing; {_WANTED_XML}.")
         try:
             value = float(text)
         except ValueError:
             value = float("nan")
-        if not np.isfinite(value):
-            raise InputError(f"{path}: {element} {name} must be a finite number; got {text!r}.")
+        if not abs(value) <= LARGEST:
+            raise InputError(f"{path}: {element} {name} must be a finite number; got {shown(text)}.")
         return value
 
+    size = (int(number("Geometry", "width")), int(number("Geometry", "height")))
+    if min(size) < 1:
+        raise InputError(f"{path}: Geometry width and height must be positive; got {size}.")
+    check_num_pixels(*size, f"{path}: Geometry")
     return TsaiCamera(
-        image_size=(int(number("Geometry", "width")), int(number("Geometry", "height"))),
+        image_size=size,
         focal=number("Intrinsic", "focal"),
         kappa1=number("Intrinsic", "kappa1"),
         center=(number("Intrinsic", "cx"), number("Intrinsic", "cy")),
@@ -179,6 +184,18 @@ def read_tsai(path: str | Path) -> TsaiCamera:
         translation=(number("Extrinsic", "tx"), number("Extrinsic", "ty"), number("Extrinsic", "tz")),
         rotation=(number("Extrinsic", "rx"), number("Extrinsic", "ry"), number("Extrinsic", "rz")),
     )
+
+
+def _check_height(camera: FloorCamera, path: Path) -> None:
+    """Raise `InputError` for a camera that is finite in double precision only, or stands where none stands."""
+    if not np.isfinite(np.asarray(camera.P)).all():
+        raise InputError(f"{path}: the projection matrix is not finite in single precision; {_WANTED}.")
+    height_m = float(camera.position()[2])
+    if not 0 < height_m <= _HIGHEST_M:
+        raise InputError(
+            f"{path}: the camera stands {height_m:.4g} m above the floor, expected at most {_HIGHEST_M:g} m; P and t "
+            "must be in metres (are they in millimetres?)."
+        )
 
 
 def _projection(settings: dict[str, Any], K: np.ndarray | None, path: Path) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfilters.trackers.io.errors import CheckpointError
+from jaxfilters.trackers.io.errors import CheckpointError, InputError, shortened, shown
+from jaxfilters.trackers.io.json_files import parse_json
+from jaxfilters.trackers.io.npz import read_npz
 
+_WANTED = "expected a checkpoint"
 SCHEMA = 1
 """Version of the layout below; a file of another version is refused."""
 
@@ -36,7 +38,8 @@ def load(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     arrays, meta = _read(path)
     leaves, treedef = jax.tree_util.tree_flatten_with_path(template)
     if (expected := {_name(place) for place, _ in leaves}) != set(arrays):
-        raise CheckpointError(f"{path}: its arrays differ from the expected ones in {sorted(expected ^ set(arrays))}.")
+        different = shown(sorted(expected ^ set(arrays)), 160)
+        raise CheckpointError(f"{path}: its arrays differ from the expected ones in {different}.")
     return jax.tree.unflatten(treedef, [_restore(path, _name(p), arrays[_name(p)], leaf) for p, leaf in leaves]), meta
 
 
@@ -61,10 +64,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         CheckpointError: no such file, or a damaged one.
     """
     try:
-        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path}: not a complete checkpoint ({error}).") from None
+        return read_npz(path, _WANTED)
+    except InputError as error:
+        reason = shortened(str(error).removeprefix(f"{path}: "), 160)
+        raise CheckpointError(f"{path}: not a complete checkpoint ({reason})") from None
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -83,13 +86,15 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = read_arrays(path)
     try:
-        header = json.loads(str(arrays.pop("header")))
-        schema, meta = header["schema"], header["meta"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path}: not a complete checkpoint ({error}).") from None
-    if schema != SCHEMA:
-        raise CheckpointError(f"{path}: schema {schema}, but this version reads {SCHEMA}.")
-    return arrays, meta
+        header = parse_json(str(arrays.pop("header", "")), f"{path}: header", _WANTED)
+    except InputError as error:
+        reason = shortened(str(error).removeprefix(f"{path}: "), 160)
+        raise CheckpointError(f"{path}: not a complete checkpoint ({reason})") from None
+    if not isinstance(header, dict) or not isinstance(header.get("meta"), dict):
+        raise CheckpointError(f"{path}: not a complete checkpoint (without schema and meta).")
+    if header.get("schema") != SCHEMA:
+        raise CheckpointError(f"{path}: schema {shown(header.get('schema'))}, but this version reads {SCHEMA}.")
+    return arrays, header["meta"]
 
 
 def _restore(path: Path, name: str, saved: np.ndarray, leaf: Any) -> Any:

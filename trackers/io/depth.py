@@ -1,20 +1,17 @@
 """Depth recordings on disk: folders of PNG images and `.npz` files, read one frame at a time."""
 
-import math
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
-from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.images import check_pixels
-from jaxfilters.trackers.io.json_files import read_json, refuse_unknown
-from jaxfilters.trackers.io.npz import names_in_npz, read_array_header, read_npz
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.images import check_num_pixels, read_image
+from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
+from jaxfilters.trackers.io.json_files import check_intrinsics, read_json, refuse_unknown
+from jaxfilters.trackers.io.npz import ArrayStream, names_in_npz, read_npz
 
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "K", "depth_scale", "timestamps_us", "fps"}
 _SHORTEST_STEP_US = 1000
@@ -34,6 +31,7 @@ def open_depth(path: str | Path, *, fps: float = 30.0) -> DepthSequence:
         InputError: missing or wrong intrinsics, shapes, types or times, or an unreadable file.
     """
     path = Path(path)
+    check_rate(fps)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
     if path.is_dir():
@@ -45,9 +43,11 @@ def open_depth(path: str | Path, *, fps: float = 30.0) -> DepthSequence:
 
 def _camera(K: Any, shape: tuple[int, int], name: str) -> Pinhole:
     try:
-        return Pinhole.from_matrix(K, shape)
+        camera = Pinhole.from_matrix(K, shape)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: {error}") from None
+        raise InputError(f"{name}: {shortened(str(error), 160)}") from None
+    check_intrinsics(np.asarray(K, float), name)
+    return camera
 
 
 def _metres(raw: np.ndarray, units_per_metre: float) -> np.ndarray:
@@ -60,8 +60,8 @@ def _open_folder(folder: Path, fps: float) -> DepthSequence:
         raise InputError(f"{folder}: no PNG images in it.")
     settings = _read_camera_json(folder / "camera.json")
     scale = settings.get("depth_scale", 1000.0)
-    if not isinstance(scale, int | float) or not 0 < scale < np.inf:
-        raise InputError(f"{folder / 'camera.json'}: depth_scale must be positive units per metre; got {scale!r}.")
+    if not isinstance(scale, int | float) or not 1 / LARGEST <= scale <= LARGEST:
+        raise InputError(f"{folder / 'camera.json'}: depth_scale must be positive units per metre; got {shown(scale)}.")
     shape = _read_png(files[0], None).shape
 
     def read(index: int) -> np.ndarray:
@@ -97,8 +97,8 @@ def _folder_times(files: list[Path], settings: dict[str, Any], fps: float, folde
     if "timestamps_us" in settings:
         return _from_microseconds(settings["timestamps_us"], len(files), f"{folder / 'camera.json'}: timestamps_us")
     fps = settings.get("fps", fps)
-    if not isinstance(fps, int | float) or not 0 < fps < np.inf:
-        raise InputError(f"{folder / 'camera.json'}: fps must be positive; got {fps!r}.")
+    if not isinstance(fps, int | float) or not 1 / LARGEST <= fps <= LARGEST:
+        raise InputError(f"{folder / 'camera.json'}: fps must be positive; got {shown(fps)}.")
     if not all(file.stem.isdecimal() for file in files):
         return np.arange(len(files)) / fps
     numbers = np.asarray([int(file.stem) for file in files], np.float64)
@@ -109,7 +109,7 @@ def _folder_times(files: list[Path], settings: dict[str, Any], fps: float, folde
 def _from_microseconds(times: Any, frames: int, name: str) -> np.ndarray:
     try:
         times_us = np.asarray(times, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: expected {frames} numbers (microseconds).") from None
     if times_us.shape != (frames,):
         raise InputError(f"{name}: expected {frames} times, one a frame; got shape {times_us.shape}.")
@@ -117,14 +117,7 @@ def _from_microseconds(times: Any, frames: int, name: str) -> np.ndarray:
 
 
 def _read_png(file: Path, shape: tuple[int, int] | None) -> np.ndarray:
-    try:
-        encoded = np.fromfile(file, np.uint8)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}).") from None
-    check_pixels(encoded, file)
-    image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size else None
-    if image is None:
-        raise InputError(f"{file}: not a complete PNG image (truncated or damaged).")
+    image = read_image(file, as_it_is=True)
     if image.ndim != 2 or image.dtype != np.uint16:
         raise InputError(f"{file}: expected one 16-bit channel; got shape {image.shape}, {image.dtype}.")
     if shape is not None and image.shape != shape:
@@ -137,43 +130,19 @@ def _open_npz(file: Path, fps: float) -> DepthSequence:
     if missing := {"depth_mm", "K"} - set(names_in_npz(file, wanted)):
         raise InputError(f"{file}: {sorted(missing)} missing; {wanted}.")
     small = read_npz(file, wanted, ("K", "t_us", "joints_mm"))
-    depth = _NpzFrames(file)
-    frames, rows, cols = depth.shape
+    depth = ArrayStream(file, "depth_mm", wanted)
+    shape, fortran_order, dtype = depth.header
+    if len(shape) != 3 or dtype != np.uint16 or fortran_order:
+        order = " in Fortran order" if fortran_order else ""
+        raise InputError(f"{file}: depth_mm must be (T, H, W) uint16; got {shape} {dtype}{order}.")
+    frames, rows, cols = shape
+    if not rows * cols:
+        raise InputError(f"{file}: depth_mm must be (T, H, W) uint16; got {shape}, without pixels.")
+    check_num_pixels(cols, rows, f"{file}: depth_mm")
     times_s = _from_microseconds(small["t_us"], frames, f"{file}: t_us") if "t_us" in small else np.arange(frames) / fps
-    joints = small["joints_mm"].astype(np.float32) / 1000 if "joints_mm" in small else None
+    joints = small.get("joints_mm")
+    if joints is not None and (joints.dtype.kind not in "fiu" or too_large(joints).any()):
+        raise InputError(f"{file}: joints_mm must be finite numbers or NaN; got {joints.dtype}.")
+    joints = None if joints is None else joints.astype(np.float32) / 1000
     camera = _camera(small["K"], (rows, cols), str(file))
     return DepthSequence(camera, times_s, lambda i: _metres(depth.read(i), 1000.0), str(file), joints)
-
-
-class _NpzFrames:
-    """Frames of the compressed `depth_mm` of an `.npz`, without holding the whole array.
-
-    Reading forward continues in the open stream; only a step back starts decompression anew.
-    """
-
-    def __init__(self, file: Path):
-        self._file = file
-        archive = zipfile.ZipFile(file)
-        size = archive.getinfo("depth_mm.npy").file_size
-        self._stream = archive.open("depth_mm.npy")
-        try:
-            self.shape, fortran_order, dtype = read_array_header(self._stream)
-        except (ValueError, EOFError) as error:
-            raise InputError(f"{file}: depth_mm is not a NumPy array ({error}).") from None
-        if len(self.shape) != 3 or dtype != np.uint16 or fortran_order:
-            order = " in Fortran order" if fortran_order else ""
-            raise InputError(f"{file}: depth_mm must be (T, H, W) uint16; got {self.shape} {dtype}{order}.")
-        self._dtype, self._first_byte = dtype, self._stream.tell()
-        if self._first_byte + 2 * math.prod(self.shape) != size:
-            raise InputError(f"{file}: depth_mm claims shape {self.shape}, and holds {size} bytes.")
-
-    def read(self, index: int) -> np.ndarray:
-        size = self.shape[1] * self.shape[2] * self._dtype.itemsize
-        try:
-            self._stream.seek(self._first_byte + index * size)
-            content = self._stream.read(size)
-        except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{self._file}: frame {index} of depth_mm is damaged ({error}).") from None
-        if len(content) != size:
-            raise InputError(f"{self._file}: depth_mm ends inside frame {index}.")
-        return np.frombuffer(content, self._dtype).reshape(self.shape[1:])

@@ -21,9 +21,9 @@ import numpy as np
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.trackers.io.checkpoint import write_npz
-from jaxfilters.trackers.io.errors import InputError, OutputError
-from jaxfilters.trackers.io.npz import read_npz
-from jaxfilters.trackers.io.npz_headers import read_header
+from jaxfilters.trackers.io.errors import InputError, OutputError, shown
+from jaxfilters.trackers.io.input_files import LARGEST, are_finite
+from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters people", 1
 _ASYMMETRY = 1e-3
@@ -88,17 +88,17 @@ def _read(path: Path, face: MultilinearFace) -> People:
     arrays = read_npz(path, _WANTED)
     if missing := [name for name in (*Remembered._fields, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
-    header = read_header(arrays, path, FORMAT, VERSION)
+    header = read_header(arrays, path, _WANTED, FORMAT, VERSION, "mm")
     if header.get("model") != fingerprint(face):
         raise InputError(f"{path}: people of another model of the face than the one that is used (--model).")
     names = header.get("names")
     if not isinstance(names, list) or not names:
-        raise InputError(f"{path}: names must be of one person or more; got {names!r}.")
+        raise InputError(f"{path}: names must be of one person or more; got {shown(names)}.")
     count, num_identities = len(names), face.num_identities
     shapes = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
     for name, shape in zip(Remembered._fields, shapes, strict=True):
         _check(arrays[name], name, shape, path)
-    arrays["covariance"] = _covariances(arrays["covariance"], path)
+    arrays["covariance"] = _covariances(arrays["covariance"].astype(float), path)
     remembered = Remembered(*(jnp.asarray(arrays[name], float) for name in Remembered._fields))
     return People(tuple(str(name) for name in names), remembered)
 
@@ -119,5 +119,5 @@ def _symmetric(matrices: np.ndarray) -> np.ndarray:
 def _check(array: np.ndarray, name: str, shape: tuple[int, ...], path: Path) -> None:
     if array.shape != shape or array.dtype.kind != "f":
         raise InputError(f"{path}: {name} must be numbers {shape}; got {array.shape} {array.dtype}.")
-    if not np.isfinite(array).all():
-        raise InputError(f"{path}: {name} must be finite.")
+    if not are_finite(array):
+        raise InputError(f"{path}: {name} must be finite, at most {LARGEST:g}.")

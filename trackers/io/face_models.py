@@ -19,9 +19,9 @@ import numpy as np
 from jaxfilters.models.face.mirroring import Pairs, mirror_map
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.trackers.io.checkpoint import write_npz
-from jaxfilters.trackers.io.errors import InputError, OutputError
-from jaxfilters.trackers.io.npz import read_npz
-from jaxfilters.trackers.io.npz_headers import read_header
+from jaxfilters.trackers.io.errors import InputError, OutputError, shortened, shown
+from jaxfilters.trackers.io.input_files import LARGEST, are_finite
+from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters face model", 1
 DEFAULT_FILE = Path(__file__).with_name("face_model.npz")
@@ -90,12 +90,11 @@ def load_face_model(path: str | Path) -> FaceModelFile:
         _check_covariance(arrays[name], name, path)
     names, pairs = _landmarks(header, sizes["K"], path)
     model = MultilinearFace(**{name: jnp.asarray(arrays[name], float) for name in _ARRAYS})
-    parameters = header.get("parameters", {})
-    return FaceModelFile(model, names, pairs, str(header.get("source", "")), parameters)
+    return FaceModelFile(model, names, pairs, str(header.get("source", "")), header["parameters"])
 
 
 def default_face_model() -> FaceModelFile:
-    """The model that comes with the package: ten landmarks, learnt from faces of the generator."""
+    """The model that comes with the package: ten landmarks, estimated from faces of the generator."""
     return load_face_model(DEFAULT_FILE)
 
 
@@ -103,7 +102,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = read_npz(path, _WANTED)
     if missing := [name for name in (*_ARRAYS, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
-    return arrays, read_header(arrays, path, FORMAT, VERSION)
+    return arrays, read_header(arrays, path, _WANTED, FORMAT, VERSION, "mm")
 
 
 def _check_array(array: np.ndarray, name: str, shape: tuple, sizes: dict[str, int], path: Path) -> None:
@@ -116,25 +115,28 @@ def _check_array(array: np.ndarray, name: str, shape: tuple, sizes: dict[str, in
         fits = array.shape == expected and array.size > 0
     if not fits:
         raise InputError(f"{path}: {name} must be numbers {shape} with {sizes}; got {array.shape} {array.dtype}.")
-    if not np.isfinite(array).all():
-        raise InputError(f"{path}: {name} must be finite.")
+    if not are_finite(array):
+        raise InputError(f"{path}: {name} must be finite, at most {LARGEST:g}.")
 
 
 def _check_covariance(array: np.ndarray, name: str, path: Path) -> None:
+    array = array.astype(float)
     scale = np.abs(array).max()
     if np.abs(array - array.T).max() > 1e-5 * scale or np.linalg.eigvalsh(array).min() < -1e-5 * scale:
         raise InputError(f"{path}: {name} must be symmetric and positive semidefinite.")
     if np.any(np.diagonal(array) <= 0):
-        raise InputError(f"{path}: {name} must have positive variances; got {np.diagonal(array)}.")
+        raise InputError(f"{path}: {name} must have positive variances; got {np.diagonal(array).min():.3g}.")
 
 
 def _landmarks(header: dict[str, Any], num_landmarks: int, path: Path) -> tuple[tuple[str, ...], Pairs]:
     names, pairs = header.get("names"), header.get("pairs", ())
     if not isinstance(names, list) or len(names) != num_landmarks:
-        raise InputError(f"{path}: names must be of {num_landmarks} landmarks; got {names!r}.")
+        raise InputError(f"{path}: names must be of {num_landmarks} landmarks; got {shown(names)}.")
     try:
         checked = tuple((int(right), int(left)) for right, left in pairs)
         mirror_map(checked, num_landmarks)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: pairs must be [right, left] indices of landmarks ({error}).") from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"{path}: pairs must be [right, left] indices of landmarks ({shortened(str(error))})."
+        ) from None
     return tuple(str(name) for name in names), checked

@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxfilters.trackers.articulated.recording import FeatureSequence, Start, features_named, from_keypoints
 from jaxfilters.trackers.io import keypoints as keypoint_files
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.images import check_num_pixels
+from jaxfilters.trackers.io.input_files import LARGEST, are_finite, check_rate, too_large
 from jaxfilters.trackers.io.npz import names_in_npz, read_npz
 
 FPS = 30.0
@@ -42,10 +44,10 @@ def open_features(
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
-    if fps is not None and not 0 < fps < np.inf:
-        raise InputError(f"fps must be positive; got {fps}.")
+    if fps is not None:
+        check_rate(fps)
     shape = None if image_size is None else (image_size[1], image_size[0])
-    if path.is_file() and path.suffix == ".npz":
+    if path.suffix == ".npz" and not path.is_dir():
         return _open_npz(path, shape, noise_px, fps)
     detections = keypoint_files.read(path, hand, fps or FPS)
     points = detections.points
@@ -78,7 +80,7 @@ def _open_npz(
     if "keypoints" not in arrays:
         raise InputError(
             f"{file}: expected features (T, rows) with names and noise_std, or keypoints (T, 21, 2); "
-            f"got {', '.join(present) or 'nothing'}."
+            f"got {shortened(', '.join(present)) or 'nothing'}."
         )
     points = _numbers(file, arrays, "keypoints")
     if points.ndim != 3:
@@ -134,7 +136,10 @@ def _read(file: Path) -> tuple[dict[str, np.ndarray], list[str]]:
 def _numbers(file: Path, arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
     if not np.issubdtype(arrays[name].dtype, np.number) or np.iscomplexobj(arrays[name]):
         raise InputError(f"{file}: {name} must be numbers; got {arrays[name].dtype}.")
-    return arrays[name].astype(np.float64)
+    numbers = arrays[name].astype(np.float64)
+    if too_large(numbers[np.isfinite(numbers)]).any():
+        raise InputError(f"{file}: {name} must be numbers of at most {LARGEST:g}.")
+    return numbers
 
 
 def _scalar(file: Path, arrays: dict[str, np.ndarray], name: str) -> float:
@@ -152,7 +157,7 @@ def _times(file: Path, arrays: dict[str, np.ndarray], frames: int, fps: float | 
                 raise InputError(f"{file}: {name}: expected {frames} times, one a frame; got shape {times.shape}.")
             return times * seconds
     fps = _scalar(file, arrays, "fps") if "fps" in arrays else fps or FPS
-    if not 0 < fps < np.inf:
+    if not 1 / LARGEST <= fps <= LARGEST:
         raise InputError(f"{file}: fps must be positive; got {fps}.")
     return np.arange(frames) / fps
 
@@ -161,8 +166,9 @@ def _image_shape(arrays: dict[str, np.ndarray], file: Path) -> tuple[int, int] |
     if "image_shape" not in arrays:
         return None
     shape = _numbers(file, arrays, "image_shape")
-    if shape.shape != (2,) or not (np.isfinite(shape).all() and (shape >= 1).all()):
-        raise InputError(f"{file}: image_shape must be rows and columns, positive; got {shape.tolist()}.")
+    if shape.shape != (2,) or not (are_finite(shape) and (shape >= 1).all()):
+        raise InputError(f"{file}: image_shape must be rows and columns, positive; got {shown(shape.tolist())}.")
+    check_num_pixels(int(shape[1]), int(shape[0]), f"{file}: image_shape")
     return int(shape[0]), int(shape[1])
 
 

@@ -4,7 +4,7 @@ An `.npz` with the arrays `owner` (m,), the symbol that each model is a way to d
 `log_transition` (m, Q, Q) of the models; those of their emission, and `header`, a text in JSON:
 
     {"format": "jaxfilters symbols", "version": 1, "names": [...], "emission": "shape" or "codes",
-     "settings": {...}, "source": "what was learnt from", "parameters": {...}}
+     "settings": {...}, "source": "what it was estimated from", "parameters": {...}}
 
 States of kind `shape` have `mean` and `variance` (m, Q, 3 d + 2) of the features of strokes in d dimensions, those of
 kind `codes` `log_codes` (m, Q, 17) and `log_counts` (m, Q, 6). `jaxfilters fit gestures` writes such files.
@@ -22,9 +22,9 @@ from jaxfilters.hmm import HiddenMarkovModel
 from jaxfilters.models.gesture.codes import MOST_TIPS, STILL
 from jaxfilters.models.gesture.symbols import Symbols
 from jaxfilters.trackers.io.checkpoint import write_npz
-from jaxfilters.trackers.io.errors import InputError, OutputError
-from jaxfilters.trackers.io.json_text import parse_json
-from jaxfilters.trackers.io.npz import read_npz
+from jaxfilters.trackers.io.errors import InputError, OutputError, shown
+from jaxfilters.trackers.io.input_files import LARGEST, too_large
+from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters symbols", 1
 DEFAULT_FILE = Path(__file__).with_name("gesture_model.npz")
@@ -40,7 +40,7 @@ class SymbolsFile(NamedTuple):
 
     symbols: Symbols
     source: str
-    """What was learnt from."""
+    """What it was estimated from."""
     parameters: dict[str, Any]
     """How."""
 
@@ -104,14 +104,16 @@ def read_symbols(path: str | Path) -> SymbolsFile:
     path = Path(path)
     arrays, header = _read(path)
     kind, names = header.get("emission"), header.get("names")
-    if kind not in _ARRAYS:
-        raise InputError(f"{path}: emission must be one of {', '.join(_ARRAYS)}; got {kind!r}.")
-    if not isinstance(names, list) or not names or len(set(names)) != len(names):
-        raise InputError(f"{path}: names must be of one symbol or more, none twice; got {names!r}.")
+    if not isinstance(kind, str) or kind not in _ARRAYS:
+        raise InputError(f"{path}: emission must be one of {', '.join(_ARRAYS)}; got {shown(kind)}.")
+    are_words = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not names or not are_words or len(set(names)) != len(names):
+        raise InputError(f"{path}: names must be of one symbol or more, none twice; got {shown(names)}.")
     _check(arrays, kind, len(names), path)
-    setting = header.get("settings", {}).get(_SETTINGS[kind])
-    if not isinstance(setting, int | float) or not setting >= 0:
-        raise InputError(f"{path}: settings must say {_SETTINGS[kind]}, not negative; got {setting!r}.")
+    settings = header.get("settings")
+    setting = settings.get(_SETTINGS[kind]) if isinstance(settings, dict) else None
+    if not isinstance(setting, int | float) or not 0 <= setting <= LARGEST:
+        raise InputError(f"{path}: settings must say {_SETTINGS[kind]}, not negative; got {shown(setting)}.")
     first, second = (jnp.asarray(arrays[name], float) for name in _ARRAYS[kind])
     emission: hmm.Emission
     if kind == SHAPE:
@@ -122,7 +124,7 @@ def read_symbols(path: str | Path) -> SymbolsFile:
         jnp.asarray(arrays["log_initial"], float), jnp.asarray(arrays["log_transition"], float), emission
     )
     symbols = Symbols(models, jnp.asarray(arrays["owner"], jnp.int32), tuple(str(name) for name in names))
-    return SymbolsFile(symbols, str(header.get("source", "")), header.get("parameters", {}))
+    return SymbolsFile(symbols, str(header.get("source", "")), header["parameters"])
 
 
 def default_symbols() -> SymbolsFile:
@@ -132,12 +134,7 @@ def default_symbols() -> SymbolsFile:
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = read_npz(path, _WANTED)
-    header = parse_json(str(arrays.get("header", "")), f"{path}: header", _WANTED)
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise InputError(f'{path}: header must say format "{FORMAT}"; {_WANTED}.')
-    if header.get("version") != VERSION:
-        raise InputError(f"{path}: version {header.get('version')}; this program reads version {VERSION}.")
-    return arrays, header
+    return arrays, read_header(arrays, path, _WANTED, FORMAT, VERSION)
 
 
 def _check(arrays: dict[str, np.ndarray], kind: str, num_names: int, path: Path) -> None:
@@ -161,9 +158,15 @@ def _check(arrays: dict[str, np.ndarray], kind: str, num_names: int, path: Path)
                 f"{path}: {name} must be numbers {shapes[name]}; got {arrays[name].shape} {arrays[name].dtype}."
             )
         logs = name.startswith("log")
-        if np.any(np.isnan(arrays[name])) or np.any(arrays[name] > 1e-3 if logs else np.isinf(arrays[name])):
+        values = arrays[name]
+        # The logarithm of an impossible transition is -inf; any other must be finite in single precision.
+        finite = np.isneginf(values) if logs else np.zeros(values.shape, bool)
+        finite |= ~np.isnan(values) & ~too_large(values)
+        if not finite.all() or (logs and np.any(values > 1e-3)):
             raise InputError(f"{path}: {name} must be {'logarithms of probabilities' if logs else 'finite'}.")
     if set(arrays["owner"].tolist()) != set(range(num_names)):
-        raise InputError(f"{path}: owner must give each of {num_names} symbols a model; got {arrays['owner']}.")
+        raise InputError(
+            f"{path}: owner must give each of {num_names} symbols a model; got {shown(arrays['owner'].tolist())}."
+        )
     if kind == SHAPE and ((symbols[0] - 2) not in (6, 9) or np.any(arrays["variance"] <= 0)):
         raise InputError(f"{path}: mean and variance must be of 8 or 11 features, variances positive.")

@@ -7,7 +7,6 @@ image's width and height, `z` a depth that is not used, and `visibility` that it
 wrist, thumb 1-4, index, middle, ring, little finger, base to tip.
 """
 
-import csv
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfilters.trackers.articulated.recording import NUM_KEYPOINTS
-from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.json_text import read_json_text
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
+from jaxfilters.trackers.io.json_files import read_json_value
+from jaxfilters.trackers.io.tables import Columns, read_table
 
 _SHORTEST_STEP_US = 1000
 """Numbers of frames that step by less count frames, not microseconds: no camera runs at 1 kHz."""
@@ -25,6 +26,15 @@ _LARGEST_SHARE = 2.0
 """Coordinates that all stay within it are shares of the image, some of them outside: no hand fits into two pixels."""
 _MOST_GAPS = 100
 """Missing frames per frame that is there, at most: beyond it the numbers are no frame numbers."""
+_MOST_FRAMES = 1_000_000
+"""Nine hours."""
+_LONG = ("frame", "landmark", "x", "y", "visibility", "confidence", "time_s")
+_WIDE = {f"{letter}{i}" for letter in "xy" for i in range(NUM_KEYPOINTS)}
+_WIDE_EXTRA = {*(f"c{i}" for i in range(NUM_KEYPOINTS)), "frame", "time_s"}
+_WANTED_TABLE = (
+    "expected the columns frame, landmark, x, y (and visibility, time_s), or x0, y0 to x20, y20 (and c0 to c20, frame, "
+    "time_s)"
+)
 _HANDS = ("landmarks", "hand_landmarks", "multi_hand_landmarks", "multiHandLandmarks", "landmark")
 """What the detector's own interfaces call a frame's hands, or a hand's landmarks."""
 
@@ -51,6 +61,7 @@ def read(path: Path, hand: str, fps: float) -> Detections:
     Raises:
         InputError: the file is damaged or of another form, or shows several hands at once.
     """
+    check_rate(fps)
     if path.is_dir():
         return _read_openpose(path, hand, fps)
     readers: dict[str, Callable[[Path, float], Detections]] = {".json": _read_mediapipe, ".csv": _read_table}
@@ -64,8 +75,8 @@ def read(path: Path, hand: str, fps: float) -> Detections:
 
 def looks_normalized(points: np.ndarray) -> bool:
     """Whether coordinates, NaN aside, can only be shares of the image's width and height."""
-    seen = points[np.isfinite(points)]
-    return bool(seen.size) and float(np.abs(seen).max()) <= _LARGEST_SHARE
+    observed = points[np.isfinite(points)]
+    return bool(observed.size) and float(np.abs(observed).max()) <= _LARGEST_SHARE
 
 
 def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
@@ -82,10 +93,10 @@ def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
             one, other = files[same[0]].name, files[same[0] + 1].name
             raise InputError(f"{folder}: {one} and {other} have one frame number; a folder must hold one recording.")
     hands = {side: [_openpose_hand(file, side) for file in files] for side in ("right", "left")}
-    seen = {side: any(numbers.any() for numbers in frames) for side, frames in hands.items()}
+    has_hand = {side: any(numbers.any() for numbers in frames) for side, frames in hands.items()}
     other = "left" if hand == "right" else "right"
-    if not seen[hand]:
-        hint = f"; there are {other} hands: --hand {other}" if seen[other] else " (OpenPose needs --hand)"
+    if not has_hand[hand]:
+        hint = f"; there are {other} hands: --hand {other}" if has_hand[other] else " (OpenPose needs --hand)"
         raise InputError(f"{folder}: no {hand} hand in any of {len(files)} frames{hint}.")
     values = np.stack(hands[hand])
     confidence = values[..., 2]
@@ -102,6 +113,8 @@ def _openpose_hand(file: Path, side: str) -> np.ndarray:
     key, hands = f"hand_{side}_keypoints_2d", []
     for person in people:
         numbers = _array(file, key, person.get(key) or [])
+        if np.isnan(numbers).any():
+            raise InputError(f"{file}: {key} must be finite; keypoints that were not found are 0, 0, 0.")
         if numbers.size and numbers.shape != (3 * NUM_KEYPOINTS,):
             raise InputError(f"{file}: {key} must be {3 * NUM_KEYPOINTS} numbers or none; got shape {numbers.shape}.")
         if numbers.any():
@@ -126,6 +139,8 @@ def _read_mediapipe(file: Path, fps: float) -> Detections:
     if len(known := [time for time in times if time is not None]) not in (0, len(frames)):
         raise InputError(f"{file}: time_s must be in every frame or in none; {len(known)} of {len(frames)} have it.")
     times_s = _array(file, "time_s", known) if known else np.arange(len(frames)) / fps
+    if times_s.shape != (len(frames),):
+        raise InputError(f"{file}: time_s must be one number a frame; got shape {times_s.shape}.")
     return _detections(times_s, values[..., :2], _visibility(values[..., 2]))
 
 
@@ -134,7 +149,7 @@ def _hand_of(frame: Any, name: str) -> list[Any]:
     while isinstance(frame, dict):
         keys = [key for key in _HANDS if key in frame]
         if not keys:
-            raise InputError(f"{name}: expected landmarks; got an object with {sorted(frame)}.")
+            raise InputError(f"{name}: expected landmarks; got an object with {shown(sorted(frame))}.")
         frame = frame[keys[0]]
     if frame is None or frame == []:
         return []
@@ -157,7 +172,7 @@ def _mediapipe_hand(landmarks: list[Any], name: str) -> np.ndarray:
     rows = []
     for i, landmark in enumerate(landmarks):
         if not isinstance(landmark, dict) or not {"x", "y"} <= set(landmark):
-            raise InputError(f'{name}, landmark {i}: expected {{"x", "y"}}; got {landmark!r}.')
+            raise InputError(f'{name}, landmark {i}: expected {{"x", "y"}}; got {shown(landmark)}.')
         visibility = landmark.get("visibility")
         rows.append([landmark["x"], landmark["y"], np.nan if visibility is None else visibility])
     return _array(name, "landmarks", rows)
@@ -165,30 +180,16 @@ def _mediapipe_hand(landmarks: list[Any], name: str) -> np.ndarray:
 
 def _read_table(file: Path, fps: float) -> Detections:
     """One landmark a row (frame, landmark, x, y) or one frame a row (x0, y0 to x20, y20)."""
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as content:
-            header, *lines = [row for row in csv.reader(content) if row] or [[]]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: not a table ({error}).") from None
-    columns = {name.strip().lower(): place for place, name in enumerate(header)}
-    table = np.full((len(lines), len(header)), np.nan)
-    wanted = {"frame", "landmark", "x", "y", "visibility", "confidence", "time_s"}
-    wanted |= {f"{letter}{i}" for letter in "xyc" for i in range(NUM_KEYPOINTS)}
-    for i, line in enumerate(lines):
-        if len(line) != len(header):
-            raise InputError(f"{file}: row {i + 1} has {len(line)} entries, its header {len(header)} (truncated?).")
-        for name in wanted & set(columns):
-            table[i, columns[name]] = _number(file, line[columns[name]], name, i + 1)
-    cells = {name: table[:, columns[name]] for name in wanted & set(columns)}
-    if {"frame", "landmark", "x", "y"} <= set(cells):
-        numbers, values, times = _from_long(file, cells)
-    elif all(f"{letter}{i}" in cells for letter in "xy" for i in range(NUM_KEYPOINTS)):
-        numbers, values, times = _from_wide(file, cells)
-    else:
-        raise InputError(
-            f"{file}: expected the columns frame, landmark, x, y (and visibility, time_s), or x0, y0 to x20, y20 (and "
-            f"c0 to c20, frame, time_s); got {', '.join(header) or 'nothing'}."
-        )
+
+    def choose(names: list[str]) -> Columns:
+        is_long = {"frame", "landmark", "x", "y"} <= set(names)
+        if not is_long and not set(names) >= _WIDE:
+            raise InputError(f"{file}: {_WANTED_TABLE}; got {shortened(', '.join(names) or 'nothing')}.")
+        numbers = tuple(name for name in (_LONG if is_long else _WIDE | _WIDE_EXTRA) if name in names)
+        return Columns(numbers, may_lack=frozenset(numbers))
+
+    cells = read_table(file, _WANTED_TABLE, choose).numbers
+    numbers, values, times = (_from_long if "landmark" in cells else _from_wide)(file, cells)
     if not len(numbers):
         raise InputError(f"{file}: no rows in it.")
     return _with_gaps(file, numbers, values, times, fps)
@@ -236,8 +237,10 @@ def _with_gaps(file: Path, numbers: np.ndarray, values: np.ndarray, times: np.nd
         raise InputError(f"{file}: time_s must be a number in every row; frame {frame} lacks it.")
     step = int(np.gcd.reduce(steps)) if len(steps) else 1
     places = (numbers - numbers[0]) // step
-    if places[-1] + 1 > _MOST_GAPS * len(numbers):
-        raise InputError(f"{file}: {len(numbers)} frames numbered from {numbers[0]} to {numbers[-1]}: too many gaps.")
+    if places[-1] + 1 > min(_MOST_GAPS * len(numbers), _MOST_FRAMES):
+        raise InputError(
+            f"{file}: {len(numbers)} frames numbered from {numbers[0]} to {numbers[-1]}: too many gaps, or too many."
+        )
     whole = np.full((places[-1] + 1, NUM_KEYPOINTS, 3), np.nan)
     whole[places] = values
     every = numbers[0] + step * np.arange(len(whole))
@@ -262,21 +265,17 @@ def _times_of(numbers: np.ndarray, fps: float) -> np.ndarray:
 
 
 def _json(file: Path) -> Any:
-    return read_json_text(file, "expected landmarks of a hand")
+    return read_json_value(file, "expected landmarks of a hand")
 
 
 def _array(name: Any, what: str, numbers: Any) -> np.ndarray:
     try:
-        return np.asarray(numbers, np.float64)
+        found = np.asarray(numbers, np.float64)
     except (TypeError, ValueError):
         raise InputError(f"{name}: {what} must be numbers.") from None
-
-
-def _number(file: Path, text: str, column: str, row: int) -> float:
-    try:
-        return float(text) if text.strip() else np.nan
-    except ValueError:
-        raise InputError(f"{file}: row {row}, {column}: expected a number; got {text!r}.") from None
+    if too_large(found).any():
+        raise InputError(f"{name}: {what} must be numbers of at most {LARGEST:g}.")
+    return found
 
 
 def _whole(file: Path, name: str, values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Landmarks in space of several people with the same expressions: what a model of the face is learnt from.
+"""Landmarks in space of several people with the same expressions: what a model of the face is estimated from.
 
 An `.npz` holds `shapes` (S people, A expressions, K landmarks, 3) in millimetres, x to the image's right, y down, z
 away from a camera that the face faces; a face that is missing is NaN throughout. Ten landmarks are in the trackers'
@@ -12,7 +12,6 @@ landmark of each expression that there is; names are those of the ten landmarks,
 called `neutral` is the one that faces are aligned to.
 """
 
-import csv
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,10 +19,12 @@ import numpy as np
 
 from jaxfilters.models.face.landmarks import FROM_68, NAMES
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs, mirror_map
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.input_files import too_large
 from jaxfilters.trackers.io.npz import read_npz
+from jaxfilters.trackers.io.tables import exactly, read_table
 
-_COLUMNS = ["expression", "name", "x_mm", "y_mm", "z_mm"]
+_COLUMNS = ("expression", "name", "x_mm", "y_mm", "z_mm")
 NAMES_68 = tuple(str(k) for k in range(68))
 _KNOWN = {10: (NAMES, PAIRS), 68: (NAMES_68, PAIRS_68)}
 _WANTED_NPZ = "expected shapes (people, expressions, landmarks, 3) in millimetres"
@@ -60,7 +61,7 @@ def read_landmark_sets(path: Path) -> LandmarkSets:
     sets = _of_folder(path) if path.is_dir() else _of_npz(path)
     shapes = sets.shapes
     partly = np.isnan(shapes).any(axis=(2, 3)) & ~np.isnan(shapes).all(axis=(2, 3))
-    if partly.any() or np.isinf(shapes).any():
+    if partly.any() or too_large(shapes).any():
         raise InputError(f"{path}: faces must be finite, or NaN throughout where they are missing.")
     if sets.neutral is not None and not np.isfinite(shapes[:, sets.neutral]).all():
         raise InputError(f"{path}: everybody must have the neutral expression, number {sets.neutral}.")
@@ -116,7 +117,9 @@ def _neutral(arrays: dict[str, np.ndarray], shape: tuple[int, ...], path: Path) 
         return None
     neutral = arrays["neutral"]
     if neutral.shape != () or neutral.dtype.kind not in "iu" or not 0 <= neutral < shape[1]:
-        raise InputError(f"{path}: neutral must be the index of one of {shape[1]} expressions; got {neutral}.")
+        raise InputError(
+            f"{path}: neutral must be the index of one of {shape[1]} expressions; got {shortened(str(neutral))}."
+        )
     if shape[2] not in _KNOWN:
         raise InputError(
             f"{path}: neutral is for 10 or 68 landmarks; got {shape[2]}. Align the faces, and leave it out."
@@ -133,7 +136,9 @@ def _of_folder(folder: Path) -> LandmarkSets:
     found = {name for person in people for _, name in person}
     names, pairs = _KNOWN[10] if found <= set(NAMES) else _KNOWN[68]
     if unknown := found - set(names):
-        raise InputError(f"{folder}: unknown landmarks {sorted(unknown)}; names are {', '.join(NAMES)}, or 0 to 67.")
+        raise InputError(
+            f"{folder}: unknown landmarks {shown(sorted(unknown))}; names are {', '.join(NAMES)}, or 0 to 67."
+        )
     shapes = np.full((len(people), len(expressions), len(names), 3), np.nan)
     for person, points in enumerate(people):
         for (expression, name), point in points.items():
@@ -144,23 +149,14 @@ def _of_folder(folder: Path) -> LandmarkSets:
 
 def _person(file: Path) -> dict[tuple[str, str], np.ndarray]:
     """Points by expression and name."""
-    try:
-        with file.open(newline="") as content:
-            rows = [[entry.strip() for entry in row] for row in csv.reader(content) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: cannot be read ({error}); {_WANTED_CSV}.") from None
-    if not rows or rows[0] != _COLUMNS:
-        raise InputError(f"{file}: {_WANTED_CSV}; the header is {','.join(rows[0]) if rows else ''!r}.")
+    table = read_table(file, _WANTED_CSV, exactly(file, _WANTED_CSV, _COLUMNS, ("expression", "name")))
     points: dict[tuple[str, str], np.ndarray] = {}
-    for number, row in enumerate(rows[1:], 2):
-        try:
-            expression, name, *coordinates = row
-            point = np.array([float(entry) for entry in coordinates])
-        except ValueError:
-            point = np.zeros(0)
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise InputError(f"{file}: row {number}: expected {','.join(_COLUMNS)}; got {row}.")
+    coordinates = np.stack([table.numbers[axis] for axis in _COLUMNS[2:]], axis=-1)
+    for line, *label, point in zip(
+        table.lines, table.words["expression"], table.words["name"], coordinates, strict=True
+    ):
+        expression, name = label
         if (expression, name) in points:
-            raise InputError(f"{file}: row {number}: {name} of {expression} comes twice.")
+            raise InputError(f"{file}: line {line}: {shortened(name)} of {shortened(expression)} comes twice.")
         points[expression, name] = point
     return points

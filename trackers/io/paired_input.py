@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from jaxfilters.trackers.io.input_files import check_rate
 from jaxfilters.trackers.io.video_input import ImageFolder, Moment, VideoSource
 
 _SAME_STEP = 0.1
@@ -19,7 +20,7 @@ class PairedInput:
 
     def __init__(self, sources: Sequence[VideoSource]):
         self._sources = list(sources)
-        self._half_s = 0.5 / max(source.fps for source in sources)
+        self._half_s = 0.5 / max(check_rate(source.fps, f"{source.name}: fps") for source in sources)
         self._first_gap: tuple[float, str] | None = None
         self._ended: list[str] = []
         self.moments = self.incomplete = 0

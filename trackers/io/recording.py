@@ -5,6 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.input_files import LARGEST, are_finite
 
 
 @runtime_checkable
@@ -34,6 +35,8 @@ def check_times(times_s: np.ndarray, name: str) -> None:
         raise InputError(f"{name}: expected at least one frame; times have shape {times_s.shape}.")
     if not np.isfinite(times_s).all():
         raise InputError(f"{name}: times must be finite; frame {int(np.argmin(np.isfinite(times_s)))} is not.")
+    if not are_finite(times_s):
+        raise InputError(f"{name}: times must be at most {LARGEST:g} s; got {np.abs(times_s).max():.3g}.")
     steps = np.diff(times_s)
     if (steps <= 0).any():
         i = int(np.argmax(steps <= 0))

@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shown
 from jaxfilters.trackers.io.json_files import (
     check_intrinsics,
     image_size_of,
@@ -87,7 +87,7 @@ def open_rig(path: str | Path) -> RigFile:
     refuse_unknown(settings, _KEYS, path)
     listed = settings.get("cameras")
     if not isinstance(listed, list) or len(listed) < 2:
-        what = f"{len(listed)}" if isinstance(listed, list) else repr(listed)
+        what = f"{len(listed)}" if isinstance(listed, list) else shown(listed)
         raise InputError(f"{path}: cameras must be a list of two or more; got {what}; {_WANTED}.")
     cameras = [_camera(one, i, f"{path}: cameras[{i}]") for i, one in enumerate(listed)]
     for i, camera in enumerate(cameras[1:], 1):
@@ -118,11 +118,11 @@ def _settings(camera: RigCamera) -> dict[str, Any]:
 
 def _camera(settings: Any, index: int, place: str) -> RigCamera:
     if not isinstance(settings, dict):
-        raise InputError(f"{place}: {_WANTED}; got {settings!r}.")
+        raise InputError(f"{place}: {_WANTED}; got {shown(settings)}.")
     refuse_unknown(settings, _CAMERA_KEYS, place)
     name = settings.get("name", f"camera {index + 1}")
     if not isinstance(name, str):
-        raise InputError(f"{place}: name must be text; got {name!r}.")
+        raise InputError(f"{place}: name must be text; got {shown(name)}.")
     image_size = image_size_of(settings, place)
     K = numbers_of(settings, "K", (3, 3), place)
     if K is None:

@@ -1,4 +1,4 @@
-"""Strokes that a person drew, labelled or not: what symbols are learnt from and what is recognised.
+"""Strokes that a person drew, labelled or not: what models of symbols are trained on and what is recognised.
 
 An `.npz` holds `points` (N, d), two or three coordinates in any one unit, y down; `length`, the number of points of
 each piece; where a stroke has several pieces, as those of a pen, `pieces`, the number of pieces of each stroke; and may
@@ -9,11 +9,10 @@ A `.csv` holds a row for each point, with the columns `stroke,x,y` and, if known
 `fingers`, the number of fingertips in that moment. Rows of a stroke without times are in the order of the file.
 
 A folder holds such a `.csv` for each stroke, without the column `stroke`, in a folder with the name of the symbol, or
-in such a folder in the folder of a person. A file of UNIPEN is read by `unipen_files`.
+in such a folder in the folder of a person. Files of UNIPEN, InkML and JSON are read by `unipen`, `inkml` and
+`stroke_json`.
 """
 
-import csv
-from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,8 +21,11 @@ import numpy as np
 from jaxfilters.models.gesture.coded import voted
 from jaxfilters.models.gesture.codes import MOST_TIPS
 from jaxfilters.models.gesture.stroke import Drawn
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io import inkml, stroke_json
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.input_files import LARGEST, too_large
 from jaxfilters.trackers.io.npz import read_npz
+from jaxfilters.trackers.io.tables import Columns, Table, read_table
 from jaxfilters.trackers.io.unipen import SUFFIXES, read_unipen
 
 ARRAYS = {
@@ -35,7 +37,8 @@ ARRAYS = {
     "fingers": ("fingers",),
 }
 """What an array of an `.npz` may be called."""
-_COLUMNS = ("stroke", "label", "person", "time", "x", "y", "z", "fingers")
+_WORDS, _NUMBERS = ("stroke", "label", "person"), ("time", "x", "y", "z", "fingers")
+"""Columns."""
 _WANTED_NPZ = "expected an .npz with points (N, 2 or 3) and length, the number of points of each piece"
 _WANTED_CSV = "expected a CSV file with a header such as stroke,label,time,x,y"
 
@@ -59,6 +62,16 @@ class StrokeSet(NamedTuple):
         return max((len(pieces) for pieces, _ in self.strokes), default=0)
 
 
+class _Own(NamedTuple):
+    """A stroke of a table."""
+
+    points: np.ndarray
+    fingers: int
+    id: str
+    words: dict[str, str]
+    warning: str
+
+
 def read_strokes(path: Path) -> StrokeSet:
     """The strokes of a file or folder.
 
@@ -78,7 +91,38 @@ def read_strokes(path: Path) -> StrokeSet:
         ids = tuple(f"{path.stem} {i}" for i in range(len(found)))
         strokes = tuple((pieces, 1) for pieces, _ in found)
         return StrokeSet(strokes, ids, tuple(label for _, label in found), ("",) * len(found), 2, tuple(warnings))
-    return _of_rows(_rows(path, ("stroke",)), path)
+    if path.suffix.lower() in inkml.SUFFIXES:
+        return _of_inkml(path)
+    if path.suffix.lower() in stroke_json.SUFFIXES:
+        return _of_json(path)
+    return _joined(_of_table(_table(path, ("stroke",)), path), path)
+
+
+def _of_inkml(path: Path) -> StrokeSet:
+    found, ids, person = inkml.read_inkml(path)
+    if not found:
+        raise InputError(f"{path}: no trace holds any points.")
+    strokes = tuple((pieces, 1) for pieces, _ in found)
+    dimensions = found[0][0][0].shape[1]
+    return StrokeSet(strokes, tuple(ids), tuple(label for _, label in found), (person,) * len(found), dimensions)
+
+
+def _of_json(path: Path) -> StrokeSet:
+    found = stroke_json.read_json_strokes(path)
+    if not found:
+        raise InputError(f"{path}: no stroke in it.")
+    dimensions = {piece.shape[1] for own in found for piece in own.pieces if len(piece)}
+    if len(dimensions) > 1:
+        raise InputError(f"{path}: some strokes have two coordinates and some three.")
+    size = dimensions.pop() if dimensions else 2
+    empty = [np.zeros((0, size))]
+    return StrokeSet(
+        tuple(([piece for piece in own.pieces if len(piece)] or empty, own.fingers) for own in found),
+        tuple(own.id for own in found),
+        tuple(own.label for own in found),
+        tuple(own.person for own in found),
+        size,
+    )
 
 
 def _of_npz(path: Path) -> StrokeSet:
@@ -89,10 +133,16 @@ def _of_npz(path: Path) -> StrokeSet:
     if points.ndim != 2 or points.shape[1] not in (2, 3) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {_WANTED_NPZ}; got points {points.shape} {points.dtype}.")
     pieces = arrays.get("pieces", np.ones(len(lengths), int))
+    if too_large(points).any():
+        raise InputError(f"{path}: points must be numbers of at most {LARGEST:g}, or NaN.")
     _check_parts(lengths, len(points), "length", path)
     _check_parts(pieces, len(lengths), "pieces", path)
     words = {name: arrays.get(name, np.full(len(pieces), "")) for name in ("label", "person")}
     fingers = arrays.get("fingers", np.ones(len(pieces), int))
+    if fingers.dtype.kind not in "iu" or not np.all((fingers >= 0) & (fingers <= MOST_TIPS)):
+        raise InputError(
+            f"{path}: fingers must be counts from 0 to {MOST_TIPS}; got {shown(fingers.ravel().tolist())}."
+        )
     for name, values in {**words, "fingers": fingers}.items():
         if values.shape != (len(pieces),):
             raise InputError(
@@ -108,74 +158,92 @@ def _of_npz(path: Path) -> StrokeSet:
 def _check_parts(counts: np.ndarray, total: int, name: str, path: Path) -> None:
     if counts.ndim != 1 or not len(counts) or counts.dtype.kind not in "iu" or counts.min() < 0:
         raise InputError(f"{path}: {name} must be counts, at least one; got {counts.shape} {counts.dtype}.")
-    if counts.sum() != total:
-        raise InputError(f"{path}: {name} must add up to {total}; got {counts.sum()}.")
+    # Counts beyond the total could add up to it once their sum has overflowed.
+    if counts.max() > total or counts.sum() != total:
+        raise InputError(f"{path}: {name} must add up to {total}; got {counts.astype(float).sum():.17g}.")
 
 
 def _of_folder(folder: Path) -> StrokeSet:
     files = sorted([*folder.glob("*/*.csv"), *folder.glob("*/*/*.csv")])
     if not files:
         raise InputError(f"{folder}: no CSV files in folders with the names of symbols.")
-    rows: list[dict[str, str]] = []
+    found = []
     for file in files:
         *person, label = file.relative_to(folder).parts[:-1]
-        own = {"stroke": str(file.relative_to(folder)), "label": label, "person": person[0] if person else ""}
-        rows += [{**row, **own} for row in _rows(file, ())]
-    return _of_rows(rows, folder)
+        words = {"label": label, "person": person[0] if person else ""}
+        table = _table(file, ())
+        # A file is a stroke, whatever it says of itself.
+        table = table._replace(words={"stroke": [str(file.relative_to(folder))] * len(table.lines)})
+        found += [own._replace(words=words) for own in _of_table(table, file)]
+    return _joined(found, folder)
 
 
-def _rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as content:
-            reader = csv.DictReader(content, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {_WANTED_CSV}.") from None
-    if missing := [name for name in (*needed, "x", "y") if name not in header]:
-        raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED_CSV}; the header is {','.join(header)!r}.")
-    if unknown := set(header) - set(_COLUMNS):
-        raise InputError(f"{path}: unknown columns {sorted(unknown)}; columns are {', '.join(_COLUMNS)}.")
-    return [{**row, "row": f"{path}: row {number}"} for number, row in enumerate(rows, 2)]
+def _table(path: Path, needed: tuple[str, ...]) -> Table:
+    def choose(names: list[str]) -> Columns:
+        if missing := [name for name in (*needed, "x", "y") if name not in names]:
+            header = shortened(",".join(names))
+            raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED_CSV}; the header is {header!r}.")
+        if unknown := set(names) - {*_NUMBERS, *_WORDS}:
+            known = ", ".join((*_WORDS, *_NUMBERS))
+            raise InputError(f"{path}: unknown columns {shown(sorted(unknown))}; columns are {known}.")
+        there = [tuple(name for name in group if name in names) for group in (_NUMBERS, _WORDS)]
+        return Columns(there[0], there[1], frozenset(there[0]))
+
+    return read_table(path, _WANTED_CSV, choose)
 
 
-def _of_rows(rows: list[dict[str, str]], path: Path) -> StrokeSet:
-    if not rows:
+def _of_table(table: Table, path: Path) -> list[_Own]:
+    """The strokes of a table, in the order of their first rows; all rows are one stroke where none is named."""
+    names = np.asarray(table.words.get("stroke", [""] * len(table.lines)))
+    if not len(names):
+        return []
+    _, which = np.unique(names, return_inverse=True)
+    axes = [axis for axis in ("x", "y", "z") if axis in table.numbers]
+    points = np.stack([table.numbers[axis] for axis in axes], axis=-1)
+    # Rows without a time or a number of fingers have the usual ones.
+    times = np.nan_to_num(table.numbers.get("time", np.zeros(len(names))), nan=0.0)
+    fingers = np.nan_to_num(table.numbers.get("fingers", np.ones(len(names))), nan=1.0)
+    found = []
+    order = np.argsort(which, kind="stable")
+    for rows in sorted(np.split(order, np.cumsum(np.bincount(which))[:-1]), key=lambda rows: rows[0]):
+        place = f"{path}: line {table.lines[rows[0]]}"
+        counts = fingers[rows]
+        if not np.all(np.isin(counts, np.arange(MOST_TIPS + 1))):
+            raise InputError(
+                f"{place}: fingers must be from 0 to {MOST_TIPS}; got {shown(np.unique(counts).tolist())}."
+            )
+        lacking = rows[np.isnan(points[rows]).any(axis=1)]
+        warning = f"{path}: line {table.lines[lacking[0]]}: {_no_number(names[rows[0]])}" if len(lacking) else ""
+        own = points[rows[np.argsort(times[rows], kind="stable")]]
+        words = [
+            _word([table.words[name][row] for row in rows], name, place) for name in _WORDS[1:] if name in table.words
+        ]
+        labels = dict(zip([name for name in _WORDS[1:] if name in table.words], words, strict=True))
+        found.append(_Own(own, voted(counts.astype(int)), str(names[rows[0]]), labels, warning))
+    return found
+
+
+def _no_number(stroke: str) -> str:
+    return f"stroke {shortened(str(stroke))} has a coordinate that is no number, and is not recognised as anything"
+
+
+def _joined(found: list[_Own], path: Path) -> StrokeSet:
+    if not found:
         raise InputError(f"{path}: no stroke; {_WANTED_CSV}.")
-    dimensions = {3 if "z" in row else 2 for row in rows}
+    dimensions = {own.points.shape[1] for own in found}
     if len(dimensions) > 1:
         raise InputError(f"{path}: some strokes have a column z and some have not.")
-    axes = ("x", "y", "z")[: dimensions.pop()]
-    by_stroke: dict[str, list[dict[str, str]]] = defaultdict(list)
-    for row in rows:
-        by_stroke[row["stroke"]].append(row)
-    strokes, labels, people = [], [], []
-    for own in by_stroke.values():
-        points = np.array([[_number(row, axis) for axis in axes] for row in own])
-        times = [_number(row, "time", 0.0) for row in own]
-        counts = np.array([_number(row, "fingers", 1.0) for row in own])
-        if not np.all(np.isin(counts, np.arange(MOST_TIPS + 1))):
-            raise InputError(f"{own[0]['row']}: fingers must be from 0 to {MOST_TIPS}; got {np.unique(counts)}.")
-        strokes.append(([points[np.argsort(times, kind="stable")]], voted(counts.astype(int))))
-        labels.append(_word(own, "label"))
-        people.append(_word(own, "person"))
-    return StrokeSet(tuple(strokes), tuple(by_stroke), tuple(labels), tuple(people), len(axes))
+    return StrokeSet(
+        tuple(([own.points], own.fingers) for own in found),
+        tuple(own.id for own in found),
+        tuple(own.words.get("label", "") for own in found),
+        tuple(own.words.get("person", "") for own in found),
+        dimensions.pop(),
+        tuple(own.warning for own in found if own.warning),
+    )
 
 
-def _word(rows: list[dict[str, str]], name: str) -> str:
-    words = {(row.get(name) or "").strip() for row in rows}
-    if len(words) > 1:
-        raise InputError(f"{rows[0]['row']}: one stroke with several entries in {name}, {sorted(words)}.")
-    return words.pop()
-
-
-def _number(row: dict[str, str], name: str, otherwise: float | None = None) -> float:
-    """The number in a column; `otherwise` where there is none. NaN is allowed: such a stroke is none."""
-    text = (row.get(name) or "").strip()
-    if not text and otherwise is not None:
-        return otherwise
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{row['row']}: {name} must be a number; got {text!r}.") from None
+def _word(words: list[str], name: str, place: str) -> str:
+    if len(different := set(words)) > 1:
+        raise InputError(f"{place}: one stroke with several entries in {name}, {shown(sorted(different))}.")
+    return words[0]

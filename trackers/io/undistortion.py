@@ -1,4 +1,6 @@
-"""Images without lens distortion, by one map that is computed once."""
+"""Images without lens distortion, by one map that is computed for the first of them."""
+
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -18,24 +20,25 @@ class Undistortion:
         self.shape = shape
         self.K = None if K is None else np.asarray(K, float)
         self.distortion = np.zeros(5) if distortion is None else np.asarray(distortion, float)
-        self._maps = None
-        if self.K is not None and self.distortion.any():
-            rows, cols = shape
-            self._maps = cv2.initUndistortRectifyMap(
-                self.K, self.distortion, np.eye(3), self.K, (cols, rows), cv2.CV_16SC2
-            )
 
     @property
     def is_identity(self) -> bool:
         """Whether images pass as they are."""
-        return self._maps is None
+        return self.K is None or not self.distortion.any()
+
+    @cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        # Made for the first image: a description alone is cheap to open.
+        assert self.K is not None
+        rows, cols = self.shape
+        return cv2.initUndistortRectifyMap(self.K, self.distortion, np.eye(3), self.K, (cols, rows), cv2.CV_16SC2)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """The image (rows, cols[, 3]) straightened; black where the camera saw nothing.
+        """The image (rows, cols[, 3]) straightened; black where the camera observed nothing.
 
         Raises:
             ValueError: an image of another size.
         """
         if image.shape[:2] != self.shape:
             raise ValueError(f"image must have {self.shape[0]} rows and {self.shape[1]} columns; got {image.shape}.")
-        return image if self._maps is None else cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+        return image if self.is_identity else cv2.remap(image, *self._maps, cv2.INTER_LINEAR)

@@ -13,11 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.input_files import LARGEST, read_text
 
 SUFFIXES = (".unipen", ".dat", ".upn")
 """Of files of UNIPEN."""
-MOST_INCLUDES = 1000
+MOST_INCLUDES, MOST_PIECES = 1000, 100_000
+"""Files below a file, and components of one segment, which may name them again and again."""
 Pieces = list[Float[np.ndarray, "_ 2"]]
 
 
@@ -52,7 +54,7 @@ def read_unipen(path: Path) -> UnipenFile:
             case ".COORD":
                 axes = rest.upper().split()
                 if not {"X", "Y"} <= set(axes):
-                    raise InputError(f"{line.where}: .COORD must name X and Y; got {rest.strip()!r}.")
+                    raise InputError(f"{line.where}: .COORD must name X and Y; got {shown(rest.strip())}.")
             case ".PEN_DOWN":
                 is_down = True
                 components.append([])
@@ -75,10 +77,7 @@ def _lines(path: Path, including: tuple[Path, ...], count: list[int]):
     count[0] += 1
     if path.resolve() in including or count[0] > MOST_INCLUDES:
         raise InputError(f"{path}: includes itself, or more than {MOST_INCLUDES} files.")
-    try:
-        lines = path.read_text(encoding="latin-1").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of UNIPEN.") from None
+    lines = read_text(path, "expected a file of UNIPEN", encoding="latin-1").splitlines()
     for number, text in enumerate(lines, 1):
         where = f"{path}: line {number}"
         found = re.match(r"\s*\.INCLUDE\s+(\S+)", text, re.IGNORECASE)
@@ -91,13 +90,13 @@ def _lines(path: Path, including: tuple[Path, ...], count: list[int]):
 def _included(path: Path, name: str, where: str) -> Path:
     wanted = Path(name)
     if wanted.is_absolute() or ".." in wanted.parts:
-        raise InputError(f"{where}: an included file must be named below its folder; got {name!r}.")
+        raise InputError(f"{where}: an included file must be named below its folder; got {shown(name)}.")
     folders = [path.parent, *(folder / "include" for folder in path.absolute().parents)]
     # A file and what it includes often have the same name, in `data` and in `include`.
     for candidate in (folder / wanted for folder in folders):
         if candidate.is_file() and candidate.resolve() != path.resolve():
             return candidate
-    raise InputError(f"{where}: {name} is neither beside the file nor in a folder `include` above it.")
+    raise InputError(f"{where}: {shortened(name)} is neither beside the file nor in a folder `include` above it.")
 
 
 def _point(line: _Line, axes: list[str]) -> list[float]:
@@ -106,8 +105,8 @@ def _point(line: _Line, axes: list[str]) -> list[float]:
         point = [values[axes.index(axis)] for axis in ("X", "Y")]
     except (ValueError, IndexError):
         point = [np.nan]
-    if not np.isfinite(point).all():
-        raise InputError(f"{line.where}: expected {len(axes)} numbers; got {line.text.strip()[:80]!r}.")
+    if not np.all(np.abs(point) <= LARGEST):
+        raise InputError(f"{line.where}: expected {len(axes)} numbers; got {shown(line.text.strip())}.")
     return point
 
 
@@ -122,9 +121,9 @@ def _segments(lines: list[_Line], pieces: Pieces) -> UnipenFile:
         own = _parts(entry[1], pieces) if entry else None
         if entry is None or own is None:
             expected = f"expected components from 0 to {len(pieces) - 1}"
-            raise InputError(f"{line.where}: {expected}; got {line.text[:80]!r}.")
+            raise InputError(f"{line.where}: {expected}; got {shown(line.text)}.")
         if not own:
-            warnings.append(f"{line.where}: the segment holds no points and is left out: {line.text[:80]}")
+            warnings.append(f"{line.where}: the segment holds no points and is left out: {shortened(line.text)}")
             continue
         found.append((own, re.sub(r"\\(.)", r"\1", entry[2] or "")))
     return UnipenFile(found, warnings)
@@ -146,4 +145,6 @@ def _parts(text: str, pieces: Pieces) -> Pieces | None:
         for i in range(first, last + 1):
             piece = pieces[i][start if i == first else 0 : stop if i == last else None]
             found += [piece] if len(piece) else []
+        if len(found) > MOST_PIECES:
+            return None
     return found

@@ -6,15 +6,17 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
 from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.images import images_in, read_image
+from jaxfilters.trackers.io.images import check_num_pixels, images_in, read_image
+from jaxfilters.trackers.io.input_files import check_rate, check_regular
 
 DEFAULT_FPS = 30.0
+_SLOWEST_FPS, _FASTEST_FPS = 1e-3, 1e6
 SILENT_S = 2.0
 """A live camera that delivers nothing for so long has stopped."""
 
@@ -51,8 +53,8 @@ def open_video(place: str, *, fps: float | None = None) -> VideoSource:
     Raises:
         InputError: nothing there, nothing that OpenCV can read, or a rate that is not finite and positive.
     """
-    if fps is not None and not (math.isfinite(fps) and fps > 0):
-        raise InputError(f"fps must be finite and above 0; got {fps}.")
+    if fps is not None:
+        check_rate(fps)
     if place.isdecimal():
         return LiveCamera(int(place))
     path = Path(place)
@@ -68,11 +70,14 @@ class VideoFile:
 
     def __init__(self, path: Path, fps: float | None = None):
         self.name, self._path, self._is_stamped = str(path), path, fps is None
+        check_regular(path, "expected a video file; a live camera is given by its number, as in 0")
         capture = self._open()
         self.image_size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-        self.fps = fps or _rate(float(capture.get(cv2.CAP_PROP_FPS)))
+        self.fps = _rate(float(capture.get(cv2.CAP_PROP_FPS))) if fps is None else check_rate(fps)
         self.frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        """As the file claims; there may be more or fewer."""
         capture.release()
+        check_num_pixels(*self.image_size, self.name)
         self._trouble: str | None = None
 
     def _open(self) -> cv2.VideoCapture:
@@ -82,20 +87,29 @@ class VideoFile:
         return capture
 
     def sample(self, most: int) -> list[np.ndarray]:
-        """Every n-th image; decoded in order, since seeking is not exact in all containers."""
-        every = max(1, self.frames // most)
-        return [image for i, (_, image) in enumerate(self.images()) if i % every == 0 and image is not None][:most]
+        """Every n-th image; decoded in order, since seeking is not exact in all containers.
+
+        Where the file has more frames than it claims, every second of the images is dropped whenever there are twice
+        too many.
+        """
+        every, kept = max(1, self.frames // most), []
+        for i, (_, image) in enumerate(self.images()):
+            if i % every == 0 and image is not None:
+                kept.append(image)
+            if len(kept) > 2 * most:
+                every, kept = 2 * every, kept[::2]
+        return kept[:most]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         capture, done = self._open(), 0
         stamps = _Stamps(1 / self.fps)
         try:
             while True:
-                there, image = capture.read()
-                if not there:
+                image = _next_image(capture)
+                if image is None:
                     break
-                said_s = stamps.next(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
-                yield (said_s if self._is_stamped else done / self.fps), image
+                time_s = stamps.next(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+                yield (time_s if self._is_stamped else done / self.fps), image
                 done += 1
         finally:
             capture.release()
@@ -109,8 +123,17 @@ class VideoFile:
 
 
 def _rate(claimed: float) -> float:
-    """Frames per second as a file claims them, or the usual ones where it claims none or nonsense."""
-    return claimed if math.isfinite(claimed) and claimed > 0 else DEFAULT_FPS
+    """Frames per second as a file or a camera claims them, or the usual ones where it claims none or nonsense."""
+    return claimed if math.isfinite(claimed) and _SLOWEST_FPS <= claimed <= _FASTEST_FPS else DEFAULT_FPS
+
+
+def _next_image(capture: Any) -> np.ndarray | None:
+    """The next image; None at the end, and where one cannot be decoded."""
+    try:
+        there, image = capture.read()
+    except cv2.error:
+        return None
+    return image if there else None
 
 
 class _Stamps:
@@ -122,12 +145,12 @@ class _Stamps:
     def __init__(self, period_s: float):
         self._period_s, self._first_s, self._last_s = period_s, 0.0, -period_s
 
-    def next(self, said_s: float) -> float:
+    def next(self, claimed_s: float) -> float:
         if self._last_s < 0:
-            self._first_s = said_s
-        said_s -= self._first_s
-        is_later = np.isfinite(said_s) and said_s > self._last_s
-        self._last_s = said_s if is_later else self._last_s + self._period_s
+            self._first_s = claimed_s
+        claimed_s -= self._first_s
+        is_later = np.isfinite(claimed_s) and claimed_s > self._last_s
+        self._last_s = claimed_s if is_later else self._last_s + self._period_s
         return self._last_s
 
 
@@ -135,7 +158,7 @@ class ImageFolder:
     """Images of one size in a folder, in the order of their names."""
 
     def __init__(self, path: Path, fps: float):
-        self.name, self.fps = str(path), fps
+        self.name, self.fps = str(path), check_rate(fps)
         self._files = images_in(path)
         rows, cols = read_image(self._files[0]).shape[:2]
         self.image_size, self.frames = (cols, rows), len(self._files)
@@ -171,7 +194,7 @@ class LiveCamera:
             self._capture.release()
             raise InputError(f"{self.name}: cannot be opened, or delivers no image.")
         self.image_size = (image.shape[1], image.shape[0])
-        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self.fps = _rate(float(self._capture.get(cv2.CAP_PROP_FPS)))
         self._newest: tuple[float, np.ndarray] | None = None
         self._trouble: str | None = None
         self._lock, self._arrived, self._over = threading.Lock(), threading.Event(), threading.Event()
@@ -224,9 +247,9 @@ def together(sources: list[VideoSource]) -> Iterator[Moment]:
 
     Ends when the last recording ends; one that ends earlier has nothing new from then on.
     """
+    half = 0.5 / max(check_rate(source.fps, f"{source.name}: fps") for source in sources)
     streams = [source.images() for source in sources]
     waiting = [next(stream, None) for stream in streams]
-    half = 0.5 / max(source.fps for source in sources)
     began = min((item[0] for item in waiting if item is not None), default=0.0)
     while any(item is not None for item in waiting):
         now = min(item[0] for item in waiting if item is not None)

@@ -75,7 +75,7 @@ def test_missing_files_and_arrays_are_named(model_folder, tmp_path_factory):
     with pytest.raises(ValueError, match="lacks vertex_ids"):
         read_ict(model_folder)
     np.savez(model_folder / "ict_landmarks68.npz", vertex_ids=np.arange(68) + 40)
-    with pytest.raises(ValueError, match="must name 68 of 90 vertices"):
+    with pytest.raises(ValueError, match=r"must name .* of 90 vertices"):
         read_ict(model_folder)
 
 

@@ -88,9 +88,9 @@ def test_the_worst_point_is_pointed_at(tmp_path, capsys):
     [
         ("x,y,z,u,v\n1,2,3,4,5\n", "expected a header x_m,y_m,z_m,u,v and numbers; the header is 'x,y,z,u,v'"),
         ("", "the header is ''"),
-        ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n1,2,3,4\n", "line 3: expected five finite numbers"),
-        ("x_m,y_m,z_m,u,v\n1,2,3,4,five\n", "line 2: expected five finite numbers"),
-        ("x_m,y_m,z_m,u,v\n1,2,3,4,5,6\n", "line 2: expected five finite numbers"),
+        ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n1,2,3,4\n", "line 3 has 4 entries, its header 5"),
+        ("x_m,y_m,z_m,u,v\n1,2,3,4,five\n", "line 2: v must be a number; got 'five'"),
+        ("x_m,y_m,z_m,u,v\n1,2,3,4,5,6\n", "line 2 has 6 entries, its header 5"),
         ("x_m,y_m,z_m,u,v\n1,2,3,-4,5\n", "line 2: pixel (-4, 5) lies outside an image of 640x480"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,500\n", "line 2: pixel (4, 500) lies outside an image of 640x480"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n2,3,4,5,6\n", "6 points or more are needed, or 4 in one plane; got 2"),

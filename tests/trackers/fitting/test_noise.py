@@ -10,8 +10,8 @@ from jaxfilters.trackers.io.points import read_points
 
 @pytest.mark.system
 def test_noises_of_synthetic_tracks_are_found_and_written(tmp_path, capsys):
-    assert main(["fit", "noise", "--out", str(tmp_path / "noise.json")]) == 0
-    found = json.loads((tmp_path / "noise.json").read_text())
+    assert main(["fit", "noise", "--out", str(tmp_path / "new" / "noise.json")]) == 0
+    found = json.loads((tmp_path / "new" / "noise.json").read_text())
     assert abs(found["sensor"] - 0.5) < 4 * found["sensor_standard_error"]
     assert abs(found["drive"] - 40.0) < 4 * found["drive_standard_error"]
     assert "Synthetic" in capsys.readouterr().out

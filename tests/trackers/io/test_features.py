@@ -172,14 +172,14 @@ def test_a_damaged_file_is_refused(npz):
 def test_an_array_that_is_no_archive_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros(3))
     (tmp_path / "a.npy").rename(tmp_path / "a.npz")
-    with pytest.raises(InputError, match=r"a\.npz: not a complete \.npz file"):
+    with pytest.raises(InputError, match=r"a\.npz: a single array; expected an \.npz"):
         open_features(tmp_path / "a.npz")
 
 
 def test_options_that_do_not_fit_are_named(npz):
     with pytest.raises(InputError, match="--noise is for keypoints; features have their own noise_std"):
         open_features(npz(FEATURES), noise_px=2.0)
-    with pytest.raises(InputError, match=r"fps must be positive; got 0\.0"):
+    with pytest.raises(InputError, match=r"fps must be finite and above 0; got 0\.0"):
         open_features(npz(FEATURES), fps=0.0)
     with pytest.raises(InputError, match="nowhere: no such file or folder"):
         open_features("nowhere")

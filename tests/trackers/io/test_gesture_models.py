@@ -136,7 +136,7 @@ def test_files_that_are_no_strokes_are_refused_with_the_reason(tmp_path):
         ("stroke,x,y\n", "no stroke"),
         ("stroke,x\na,1\n", "without y"),
         ("stroke,x,y,colour\na,1,2,red\n", "unknown columns"),
-        ("stroke,x,y\na,1,b\n", "row 2: y must be a number; got 'b'"),
+        ("stroke,x,y\na,1,b\n", "line 2: y must be a number; got 'b'"),
         ("stroke,x,y,fingers\na,1,2,6\n", "fingers"),
         ("stroke,x,y,label\na,1,2,V\na,1,2,L\n", "several entries in label"),
     ):

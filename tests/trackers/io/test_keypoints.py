@@ -305,8 +305,8 @@ WRONG_TABLES = {
     "a header": (long_rows()[:1], "no rows in it"),
     "other columns": ([["t", "u", "v"], ["1", "2", "3"]], "expected the columns .*; got t, u, v"),
     "a finger too few": ([row[:-3] for row in wide_rows()], "expected the columns"),
-    "a row cut off": ([*long_rows()[:-1], ["12", "20"]], r"row 84 has 2 entries, its header 6 \(truncated\?\)"),
-    "a word": (replaced(long_rows(), 3, 2, "left"), "row 3, x: expected a number; got 'left'"),
+    "a row cut off": ([*long_rows()[:-1], ["12", "20"]], r"line 85 has 2 entries, its header 6 \(truncated\?\)"),
+    "a word": (replaced(long_rows(), 3, 2, "left"), "line 4: x must be a number; got 'left'"),
     "half a frame": (replaced(long_rows(), 3, 0, "4.5"), "frame must be whole numbers"),
     "no frame": (replaced(long_rows(), 3, 0, ""), "frame must be whole numbers"),
     "landmark 21": (replaced(long_rows(), 3, 1, "21"), "landmark must be 0 to 20; got 21"),
@@ -314,7 +314,7 @@ WRONG_TABLES = {
     "frames that go back": (replaced(wide_rows(), 3, 0, "4"), "frames must increase; frame 4 follows frame 6"),
     "numbers that are times": (replaced(wide_rows(), 5, 0, "1700000001"), "too many gaps"),
     "no time": (replaced(long_rows(with_times=True), 21, 6, ""), "time_s must be a number in every row; frame 4"),
-    "an infinite place": (replaced(wide_rows(), 1, 1, "inf"), "keypoints must be finite or NaN; frame 0, keypoint 0"),
+    "an infinite place": (replaced(wide_rows(), 1, 1, "inf"), "line 2: x0 must be a finite number"),
     "confidence below 0": (replaced(wide_rows(), 1, 3, "-1"), "confidence must be 0 or more; frame 0, keypoint 0"),
 }
 
@@ -328,7 +328,7 @@ def test_wrong_tables_are_named(table, what):
 
 def test_files_of_another_kind_are_refused(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00frame")
-    with pytest.raises(InputError, match=r"a\.csv: not a table"):
+    with pytest.raises(InputError, match=r"a\.csv: not text in UTF-8"):
         open_features(tmp_path / "a.csv")
     (tmp_path / "clip.mp4").touch()
     with pytest.raises(InputError, match=r"expected a folder of OpenPose's \*_keypoints.json, or .*suffix '\.mp4'"):

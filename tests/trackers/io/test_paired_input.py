@@ -132,6 +132,7 @@ class Capture:
 
 def test_a_video_without_stamps_goes_on_at_its_pace(tmp_path, monkeypatch):
     monkeypatch.setattr(VideoFile, "_open", lambda self: Capture())
+    (tmp_path / "a.mp4").touch()
     times = [t for t, _ in VideoFile(tmp_path / "a.mp4").images()]
     np.testing.assert_allclose(times, [0, 0.04, 0.08, 0.12, 0.16, 0.2])
 

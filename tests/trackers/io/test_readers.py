@@ -13,7 +13,7 @@ import pytest
 
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.images import read_image
-from jaxfilters.trackers.io.json_text import parse_json, read_json_text
+from jaxfilters.trackers.io.json_files import parse_json, read_json_value
 from jaxfilters.trackers.io.npz import names_in_npz, read_npz
 
 WANTED = "expected arrays"
@@ -63,8 +63,8 @@ def single_array(path):
 WRONG = {
     "claims 1e12 elements": (lambda p: archive(p, array_bytes((10**12,), content=b"1234")), "claims shape"),
     "claims fewer elements": (lambda p: archive(p, array_bytes((1,), content=bytes(16))), "claims shape"),
-    "claims more bytes than fit": (lambda p: archive(p, array_bytes((9,)), file_size=2**31), "not a complete .npz"),
-    "more than the limit": (lambda p: archive(p, array_bytes((9,)), file_size=2**34), "more than 8 GiB"),
+    "claims more bytes than fit": (lambda p: archive(p, array_bytes((9,)), file_size=2**28), "not a complete .npz"),
+    "more than the limit": (lambda p: archive(p, array_bytes((9,)), file_size=2**34), "more than 512 MiB"),
     "encrypted": (lambda p: archive(p, array_bytes((0,)), flag_bits=1), "encrypted"),
     "unknown compression": (lambda p: archive(p, array_bytes((0,)), compress_type=zipfile.ZIP_LZMA), "not an array"),
     "not an array": (lambda p: archive(p, b"hello", name="a.txt"), "not an array"),
@@ -129,7 +129,7 @@ def test_wrong_json_is_named(tmp_path, text, words):
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(InputError, match=words) as caught:
-        read_json_text(path, WANTED)
+        read_json_value(path, WANTED)
     assert str(path) in str(caught.value)
     assert len(str(caught.value)) < 300 + len(str(path))
 
@@ -138,11 +138,11 @@ def test_json_is_that_of_the_standard_library(tmp_path):
     path = tmp_path / "a.json"
     value = {"a": [1, 2.5, -(10**17), "x", None, True], "b": {}}
     path.write_text(json.dumps(value))
-    assert read_json_text(path, WANTED) == value
+    assert read_json_value(path, WANTED) == value
     assert parse_json("[1e400]", "here", WANTED) == [np.inf]
     path.write_bytes(b"\xff\xfe{}")
-    with pytest.raises(InputError, match="not JSON"):
-        read_json_text(path, WANTED)
+    with pytest.raises(InputError, match="not text in UTF-8"):
+        read_json_value(path, WANTED)
 
 
 def test_a_png_that_claims_2_to_the_30_pixels_is_refused_before_they_are_allocated(tmp_path):
