@@ -57,6 +57,8 @@ from .particle.partitioned import Partitions as Partitions
 from .particle.partitioned import batch_log_likelihood as batch_log_likelihood
 from .particle.rao_blackwell import rao_blackwell as rao_blackwell
 from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
+from .particle.switching import SwitchingState as SwitchingState
+from .particle.switching import switching as switching
 from .particle.tempering import AdaptiveTempering as AdaptiveTempering
 from .particle.weighting import ParticleInfo as ParticleInfo
 

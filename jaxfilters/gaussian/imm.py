@@ -34,7 +34,7 @@ class IMMState(NamedTuple):
     """The belief with the moments of the mixture of all modes: in the common state where there are maps."""
 
     @property
-    def probabilities(self) -> Float[Array, " k"]:
+    def probabilities(self) -> Float[Array, "*t k"]:
         """Probabilities of the modes."""
         return jnp.exp(self.log_probabilities)
 

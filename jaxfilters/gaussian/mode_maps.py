@@ -64,9 +64,7 @@ class Pairwise:
         return self.convert(source, self.common, belief)
 
 
-def common_space(
-    to: Sequence[Callable[[Any], Any]], back: Sequence[Callable[[Any], Any]]
-) -> CommonSpace:
+def common_space(to: Sequence[Callable[[Any], Any]], back: Sequence[Callable[[Any], Any]]) -> CommonSpace:
     """Maps to a state that all modes have in common, and back.
 
     Args:
@@ -173,7 +171,9 @@ def _embedded(row: tuple[int, ...], fill: Belief, belief: Belief) -> Belief:
     if isinstance(fill, GaussianRoot) and isinstance(belief, GaussianRoot):
         own = jnp.zeros((fill.mean.size, belief.root.shape[1]), mean.dtype).at[known].set(belief.root)
         return GaussianRoot(mean, jnp.hstack([own, fill.root.at[known].set(0.0)]))
-    raise ValueError(f"fill must be a {type(belief).__name__}, as the states of filters are; got a {type(fill).__name__}.")
+    raise ValueError(
+        f"fill must be a {type(belief).__name__}, as the states of filters are; got a {type(fill).__name__}."
+    )
 
 
 def _picked(row: tuple[int, ...], belief: Belief) -> Belief:
