@@ -6,6 +6,7 @@ a batch of parameters, which is a program of the size of one filter; others run 
 
 from collections.abc import Callable, Sequence
 from dataclasses import field
+from functools import partial
 from typing import Any
 
 import jax
@@ -39,11 +40,11 @@ class Separate:
         """Results of `function(filter, *row)` for each filter, with its row of the columns."""
         return tuple(map(function, self.filters, *columns))
 
-    def apply_to_blocks(self, function: Callable[..., Any], *joined: PyTree) -> Any:
-        """Results of `function(filter, *blocks)` side by side along the last axis, as the blocks of `joined` are."""
-        blocks = [_blocks(leaf, self.count) for leaf in joined]
+    def apply_to_ensemble(self, function: Callable[..., Any], ensemble: PyTree) -> Any:
+        """Results of `function(filter, element)` along the last axis, whose equal parts are those of the filters."""
+        parts = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], self.count, -1), ensemble)
         found = [
-            function(filter, *(jax.tree.map(lambda leaf, i=i: leaf[..., i, :], block) for block in blocks))
+            jax.vmap(partial(function, filter), -1, -1)(jax.tree.map(lambda leaf, i=i: leaf[..., i, :], parts))
             for i, filter in enumerate(self.filters)
         ]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *found)
@@ -64,21 +65,19 @@ class Stacked:
         found = jax.vmap(function, (self._filter_axes(), *[-1] * len(columns)), -1)(self.filter, *stacked)
         return tuple(jax.tree.map(lambda leaf, i=i: leaf[..., i], found) for i in range(self.count))
 
-    def apply_to_blocks(self, function: Callable[..., Any], *joined: PyTree) -> Any:
-        """Results of `function(filter, *blocks)` side by side along the last axis, as the blocks of `joined` are."""
-        blocks = [_blocks(leaf, self.count) for leaf in joined]
-        found = jax.vmap(function, (self._filter_axes(), *[-2] * len(joined)), -2)(self.filter, *blocks)
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], -1), found)
+    def apply_to_ensemble(self, function: Callable[..., Any], ensemble: PyTree) -> Any:
+        """Results of `function(filter, element)` along the last axis, whose equal parts are those of the filters."""
+        size = jax.tree.leaves(ensemble)[0].shape[-1] // self.count
+        rows = zip(jax.tree.leaves(self.filter), self.axes, strict=True)
+        repeated = [leaf if axis is None else jnp.repeat(leaf, size, axis=axis) for leaf, axis in rows]
+        filter = jax.tree.unflatten(jax.tree.structure(self.filter), repeated)
+        return jax.vmap(function, (self._filter_axes(), -1), -1)(filter, ensemble)
 
     def _filter_axes(self) -> Any:
         return jax.tree.unflatten(jax.tree.structure(self.filter), self.axes)
 
 
 Bank = Separate | Stacked
-
-
-def _blocks(joined: PyTree, count: int) -> PyTree:
-    return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], count, -1), joined)
 
 
 def bank_of(filters: Sequence[Filter]) -> Bank:

@@ -115,8 +115,10 @@ def optimal(key: Key, log_weights: Float[Array, " m"], num_survivors: int) -> Su
     relative = _relative(log_weights)
     kept, places, small_sum = _kept(relative, num_survivors)
     small = jnp.where(kept, 0.0, relative)
-    whole, fraction = prefix.positions(small, places.astype(relative.dtype))
-    drawn_below = jnp.minimum(whole + (fraction > jax.random.uniform(key, (), relative.dtype)), places)
+    whole, fraction = prefix.positions(small, places)
+    drawn_below = jnp.minimum(
+        whole + (fraction > jax.random.uniform(key, (), relative.dtype)), places.astype(jnp.int32)
+    )
     ends = prefix.running_count(kept.astype(jnp.int32)) + drawn_below
     indices = jnp.minimum(_ancestors(ends, num_survivors), count - 1)
     survives = (jnp.arange(num_survivors) < ends[-1, -1]) & (log_weights[indices] > -jnp.inf)
@@ -128,25 +130,25 @@ def optimal(key: Key, log_weights: Float[Array, " m"], num_survivors: int) -> Su
 
 def _kept(
     relative: Float[Array, "rows 32"], num: int
-) -> tuple[Bool[Array, "rows 32"], Int32[Array, ""], Float[Array, ""]]:
+) -> tuple[Bool[Array, "rows 32"], Float[Array, ""], Float[Array, ""]]:
     """Which particles are kept for certain, the number of places for the others, and the sum of the others."""
     positive = relative > 0
+    few = jnp.sum(positive) <= num
 
-    def split(c: Array) -> tuple[Array, Array, Array]:
-        kept = positive & (relative * c >= 1)
-        return kept, num - jnp.sum(kept, dtype=jnp.int32), jnp.sum(jnp.where(kept, 0.0, relative))
+    def unsolved(carry: tuple) -> Array:
+        c, places, small_sum = carry
+        return (places > 0) & (places > c * small_sum)
 
     def newton(carry: tuple) -> tuple:
-        c, _ = carry
-        _, places, small_sum = split(c)
         # The sum of min(1, c w) is concave in c: from below, no step leads beyond the solution.
-        further = jnp.where((places > 0) & (small_sum > 0), places / small_sum, c)
-        return jnp.maximum(further, c), further > c
+        c = carry[1] / carry[2]
+        kept = relative * c >= 1
+        return c, num - jnp.sum(kept, dtype=relative.dtype), jnp.sum(jnp.where(kept, 0.0, relative))
 
-    first = jnp.where(jnp.sum(positive) <= num, jnp.inf, num / jnp.sum(relative))
-    c, _ = jax.lax.while_loop(lambda carry: carry[1], newton, (first, jnp.isfinite(first)))
-    kept, places, small_sum = split(c)
-    return kept, jnp.where(small_sum > 0, places, 0), small_sum
+    start = jnp.where(few, jnp.inf, 0.0), jnp.where(few, 0.0, num), jnp.where(few, 0.0, jnp.sum(relative))
+    start = tuple(value.astype(relative.dtype) for value in start)
+    c, places, small_sum = jax.lax.while_loop(unsolved, newton, start)
+    return positive & (relative * c >= 1), jnp.where(small_sum > 0, places, 0.0), small_sum
 
 
 def _relative(log_weights: Array) -> Array:

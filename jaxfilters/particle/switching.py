@@ -141,11 +141,8 @@ def switching(
 def _init(model: Switching, key: AnyKey) -> SwitchingState:
     count, num = model.bank.count, model.num_particles
 
-    def repeated(filter: Filter) -> Belief:
-        belief: Belief = filter.init(filter.params, key)
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, num)), belief)
-
-    belief = model.bank.apply_to_blocks(repeated)
+    beliefs = model.bank.apply(lambda filter: filter.init(filter.params, key))
+    belief = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves, axis=-1), num, axis=-1), *beliefs)
     possible = model.initial > 0
     log_initial = jnp.where(possible, jnp.log(jnp.where(possible, model.initial, 1.0)), -jnp.inf)
     log_initial = log_initial.astype(belief.mean.dtype)
@@ -159,19 +156,17 @@ def _predict(model: Switching, key: AnyKey, state: SwitchingState, control: PyTr
     count, num = model.bank.count, model.num_particles
     transition = banks.transition_at(model.transition, control, count)
     chosen, log_weights = _chosen(model, key, state.log_weights)
-    parents = jax.tree.map(lambda leaf: jnp.take(leaf, chosen, axis=-1, mode="clip"), state.particles.belief)
-
-    def ahead(filter: Filter) -> Belief:
-        return jax.vmap(lambda belief: filter.predict(filter.params, key, belief, control), -1, -1)(parents)
-
+    places = jnp.tile(chosen, count)
+    parents = jax.tree.map(lambda leaf: jnp.take(leaf, places, axis=-1, mode="clip"), state.particles.belief)
+    ahead = lambda filter, belief: filter.predict(filter.params, key, belief, control)
     possible = transition > 0
     log_transition = jnp.where(possible, jnp.log(jnp.where(possible, transition, 1.0)), -jnp.inf)
     # Rows are the modes that follow, columns the parents.
     successors = log_transition.T[:, chosen // num] + log_weights
     return SwitchingState(
-        SwitchingParticle(_modes(count, num), model.bank.apply_to_blocks(ahead)),
+        SwitchingParticle(_modes(count, num), model.bank.apply_to_ensemble(ahead, parents)),
         successors.reshape(-1),
-        jnp.tile(chosen, count),
+        places,
         _of_modes(successors),
     )
 
@@ -179,14 +174,11 @@ def _predict(model: Switching, key: AnyKey, state: SwitchingState, control: PyTr
 def _update(
     model: Switching, key: AnyKey, state: SwitchingState, observation: PyTree
 ) -> tuple[SwitchingState, ParticleInfo]:
-    def after(filter: Filter, predicted: Belief) -> tuple[Belief, Array]:
-        def one(belief: Belief) -> tuple[Belief, Array]:
-            updated, info = filter.update(filter.params, key, belief, observation)
-            return updated, info.log_evidence
+    def after(filter: Filter, belief: Belief) -> tuple[Belief, Array]:
+        updated, info = filter.update(filter.params, key, belief, observation)
+        return updated, info.log_evidence
 
-        return jax.vmap(one, -1, -1)(predicted)
-
-    belief, log_likelihoods = model.bank.apply_to_blocks(after, state.particles.belief)
+    belief, log_likelihoods = model.bank.apply_to_ensemble(after, state.particles.belief)
     log_weights, info = reweight(state.log_weights, log_likelihoods, state.ancestors, no_tempering)
     # Where no sequence explains the observation, the prediction is all that is known.
     dead = info.log_evidence == -jnp.inf
