@@ -12,6 +12,7 @@ from . import linearize as linearize
 from . import manifold as manifold
 from . import mixture as mixture
 from . import mode_maps as mode_maps
+from . import noise_models as noise_models
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust
 from . import sigma_point as sigma_point

@@ -19,7 +19,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.manifold import Manifold, euclidean
-from jaxfilters.typing import as_pytree
+from jaxfilters.typing import only_inputs
 
 _TOLERANCE = 1e-4
 """Of sums of probabilities: far above the rounding of float32, far below a mistake."""
@@ -144,15 +144,15 @@ def manifold_of(filter: Filter) -> Manifold:
 def transition_of(value: Any, count: int) -> Array | Callable[..., Any]:
     """The transition probabilities of the modes: a checked matrix, or a function of the inputs as a pytree."""
     if callable(value):
-        return as_pytree(value)
+        return only_inputs("transition_matrix", value)
     return transition_matrix("transition_matrix", value, count)
 
 
-def transition_at(transition: Array | Callable[..., Any], control: PyTree, count: int) -> Array:
+def transition_at(transition: Array | Callable[..., Any], inputs: PyTree, count: int) -> Array:
     """The matrix of one step."""
     if not callable(transition):
         return transition
-    return transition_matrix("the result of transition_matrix", transition(control), count)
+    return transition_matrix("the result of transition_matrix", transition(inputs), count)
 
 
 def transition_matrix(name: str, value: Any, count: int) -> Array:

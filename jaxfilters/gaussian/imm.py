@@ -84,7 +84,7 @@ def imm(
             `unscented_kalman`, `cubature_kalman` or `robust`, all with `Gaussian` or all with `GaussianRoot` beliefs.
             The prior of each is the belief before the first observation given its mode.
         transition_matrix: (k, k), with rows that sum to one: [i, j] is the probability that mode j follows mode i. Or a
-            function `control -> (k, k)` of the inputs of the step.
+            function `inputs -> (k, k)` of the inputs of the step.
         initial_probabilities: (k,), of the modes before the first observation; the first prediction applies the
             transition matrix to them.
         maps: How beliefs about the state of one mode become beliefs about that of another, made by a function of
@@ -140,17 +140,17 @@ def _init(model: IMM, key: AnyKey) -> IMMState:
     return _state(model, beliefs, log_initial.astype(beliefs[0].mean.dtype))
 
 
-def _predict(model: IMM, key: AnyKey, state: IMMState, control: PyTree) -> IMMState:
-    transition = banks.transition_at(model.transition, control, model.bank.count)
+def _predict(model: IMM, key: AnyKey, state: IMMState, inputs: PyTree) -> IMMState:
+    transition = banks.transition_at(model.transition, inputs, model.bank.count)
     log_predicted, origins = interaction(transition, state.log_probabilities)
     mixed = _mixed(model, state.beliefs, origins)
-    ahead = model.bank.apply(lambda filter, belief: filter.predict(filter.params, key, belief, control), mixed)
+    ahead = model.bank.apply(lambda filter, belief: filter.predict(filter.params, key, belief, inputs), mixed)
     return _state(model, ahead, log_predicted)
 
 
-def _update(model: IMM, key: AnyKey, state: IMMState, observation: PyTree) -> tuple[IMMState, IMMInfo]:
+def _update(model: IMM, key: AnyKey, state: IMMState, observation: PyTree, inputs: PyTree) -> tuple[IMMState, IMMInfo]:
     found = model.bank.apply(
-        lambda filter, belief: filter.update(filter.params, key, belief, observation), state.beliefs
+        lambda filter, belief: filter.update(filter.params, key, belief, observation, inputs), state.beliefs
     )
     log_likelihoods = jnp.stack([info.log_evidence for _, info in found])
     usable = jnp.where(log_likelihoods < jnp.inf, log_likelihoods, -jnp.inf)

@@ -90,7 +90,7 @@ def switching(
     Args:
         filters: One filter for each mode, as for `imm`, with states of one size.
         transition_matrix: (k, k), with rows that sum to one: [i, j] is the probability that mode j follows mode i. Or a
-            function `control -> (k, k)` of the inputs of the step.
+            function `inputs -> (k, k)` of the inputs of the step.
         initial_probabilities: (k,), of the modes before the first observation; the first prediction applies the
             transition matrix to them.
         num_particles: Number n of sequences of modes that are continued; every step costs n k filters.
@@ -152,13 +152,13 @@ def _init(model: Switching, key: AnyKey) -> SwitchingState:
     return SwitchingState(particles, log_weights, jnp.arange(count * num, dtype=jnp.int32), log_initial)
 
 
-def _predict(model: Switching, key: AnyKey, state: SwitchingState, control: PyTree) -> SwitchingState:
+def _predict(model: Switching, key: AnyKey, state: SwitchingState, inputs: PyTree) -> SwitchingState:
     count, num = model.bank.count, model.num_particles
-    transition = banks.transition_at(model.transition, control, count)
+    transition = banks.transition_at(model.transition, inputs, count)
     chosen, log_weights = _chosen(model, key, state.log_weights)
     places = jnp.tile(chosen, count)
     parents = jax.tree.map(lambda leaf: jnp.take(leaf, places, axis=-1, mode="clip"), state.particles.belief)
-    ahead = lambda filter, belief: filter.predict(filter.params, key, belief, control)
+    ahead = lambda filter, belief: filter.predict(filter.params, key, belief, inputs)
     possible = transition > 0
     log_transition = jnp.where(possible, jnp.log(jnp.where(possible, transition, 1.0)), -jnp.inf)
     # Rows are the modes that follow, columns the parents.
@@ -172,10 +172,10 @@ def _predict(model: Switching, key: AnyKey, state: SwitchingState, control: PyTr
 
 
 def _update(
-    model: Switching, key: AnyKey, state: SwitchingState, observation: PyTree
+    model: Switching, key: AnyKey, state: SwitchingState, observation: PyTree, inputs: PyTree
 ) -> tuple[SwitchingState, ParticleInfo]:
     def after(filter: Filter, belief: Belief) -> tuple[Belief, Array]:
-        updated, info = filter.update(filter.params, key, belief, observation)
+        updated, info = filter.update(filter.params, key, belief, observation, inputs)
         return updated, info.log_evidence
 
     belief, log_likelihoods = model.bank.apply_to_ensemble(after, state.particles.belief)
