@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, Num, PyTree
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
@@ -63,8 +63,8 @@ class IMM:
 
 def imm(
     filters: Sequence[Filter],
-    transition_matrix: Float[ArrayLike, "k k"] | Callable[[PyTree], Array],
-    initial_probabilities: Float[ArrayLike, " k"],
+    transition_matrix: Num[ArrayLike, "..."] | Sequence[Sequence[float]] | Callable[[PyTree], Array],
+    initial_probabilities: Num[ArrayLike, "..."] | Sequence[float],
     *,
     maps: ModeMaps | None = None,
 ) -> Filter:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int32, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int32, Num, PyTree
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
@@ -67,8 +67,8 @@ class Switching:
 
 def switching(
     filters: Sequence[Filter],
-    transition_matrix: Float[ArrayLike, "k k"] | Callable[[PyTree], Array],
-    initial_probabilities: Float[ArrayLike, " k"],
+    transition_matrix: Num[ArrayLike, "..."] | Sequence[Sequence[float]] | Callable[[PyTree], Array],
+    initial_probabilities: Num[ArrayLike, "..."] | Sequence[float],
     *,
     num_particles: int,
     scheme: ResamplingScheme | Callable[..., Survivors] = optimal,

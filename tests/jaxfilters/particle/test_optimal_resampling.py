@@ -7,6 +7,8 @@ import pytest
 
 import jaxfilters as jf
 
+pytestmark = pytest.mark.system
+
 COUNT, PLACES, DRAWS = 40, 16, 4000
 KEYS = jax.random.split(jax.random.key(0), DRAWS)
 RNG = np.random.default_rng(0)
