@@ -127,8 +127,9 @@ def check_filters(filters: Any, *, one_size: str | None) -> list[Gaussian | Gaus
     sizes = [state.mean.size for state in states]
     if one_size is not None and len(set(sizes)) > 1:
         raise ValueError(f"filters must have states of one size{one_size}; got the sizes {', '.join(map(str, sizes))}.")
-    spaces = [jax.tree.structure(manifold_of(filter)) for filter in filters]
-    if any(space != spaces[0] for space in spaces):
+    spaces = [manifold_of(filter) for filter in filters]
+    structures = [None if space.flat else jax.tree.structure(space) for space in spaces]
+    if any(structure != structures[0] for structure in structures):
         raise ValueError("filters must all have states on one manifold; got different ones.")
     return states
 

@@ -182,7 +182,7 @@ def _picked(row: tuple[int, ...], belief: Belief) -> Belief:
 
 def _square(belief: Belief) -> Belief:
     """The belief with a square root, whatever its width was."""
-    if isinstance(belief, Gaussian) or belief.root.shape[0] == belief.root.shape[1]:
+    if not isinstance(belief, GaussianRoot) or belief.root.shape[0] == belief.root.shape[1]:
         return belief
     return GaussianRoot(belief.mean, linalg.tria(belief.root))
 

@@ -136,18 +136,21 @@ def _kept(
     few = jnp.sum(positive) <= num
 
     def unsolved(carry: tuple) -> Array:
-        c, places, small_sum = carry
-        return (places > 0) & (places > c * small_sum)
+        _, places, small_sum, more = carry
+        return more & (places > 0) & (small_sum > 0)
 
     def newton(carry: tuple) -> tuple:
-        # The sum of min(1, c w) is concave in c: from below, no step leads beyond the solution.
-        c = carry[1] / carry[2]
+        # The sum of min(1, c w) is concave in c: from below, no step leads beyond the solution. It is reached when no
+        # particle is added to those that are kept.
+        _, places, small_sum, _ = carry
+        c = places / small_sum
         kept = relative * c >= 1
-        return c, num - jnp.sum(kept, dtype=relative.dtype), jnp.sum(jnp.where(kept, 0.0, relative))
+        rest = num - jnp.sum(kept, dtype=relative.dtype)
+        return c, rest, jnp.sum(jnp.where(kept, 0.0, relative)), rest < places
 
     start = jnp.where(few, jnp.inf, 0.0), jnp.where(few, 0.0, num), jnp.where(few, 0.0, jnp.sum(relative))
     start = tuple(value.astype(relative.dtype) for value in start)
-    c, places, small_sum = jax.lax.while_loop(unsolved, newton, start)
+    c, places, small_sum, _ = jax.lax.while_loop(unsolved, newton, (*start, ~few))
     return positive & (relative * c >= 1), jnp.where(small_sum > 0, places, 0.0), small_sum
 
 

@@ -37,10 +37,9 @@ def rooted():
 
 
 def turning():
-    space = jf.manifold.product(jf.manifold.vector(1), jf.manifold.vector(1))
-    return jf.extended_kalman(
-        jf.Gaussian(jnp.zeros(2), jnp.eye(2)), lambda x: x, jnp.eye(2), lambda x: x[:1], jnp.eye(1), manifold=space
-    )
+    space = jf.manifold.product(jf.manifold.rotation)
+    prior = jf.Gaussian(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(3))
+    return jf.extended_kalman(prior, lambda x: x, jnp.eye(3), lambda x: x[:1], jnp.eye(1), manifold=space)
 
 
 TWO = (linear(), linear())
@@ -66,7 +65,7 @@ def of_each(name, build):
         Case(f"{name}, no filters", lambda: build(()), ("filters", "empty")),
         Case(f"{name}, another kind", lambda: build((linear(), FILL)), ("filters[1]", "Filter", "Gaussian")),
         Case(f"{name}, kinds", lambda: build((linear(), rooted())), ("filters", "Gaussian, GaussianRoot")),
-        Case(f"{name}, spaces", lambda: build((linear(), turning())), ("filters", "manifold")),
+        Case(f"{name}, spaces", lambda: build((linear(4), turning())), ("filters", "manifold")),
         Case(f"{name}, sizes", lambda: build(OTHER_SIZES), ("filters", "one size", "2, 3")),
         Case(f"{name}, columns", lambda: build(chain=CHAIN.T), ("transition_matrix", "rows (axis 1)", "transpose")),
         Case(f"{name}, sum", lambda: build(chain=CHAIN * 0.9), ("transition_matrix", "rows", "row 0", "0.9")),
