@@ -76,3 +76,10 @@ def test_the_weights_keep_their_derivative():
     slope = jax.jacobian(lambda w: jf.resampling.optimal(KEYS[0], w, PLACES).log_weights)(log_weights)
     kept = jf.resampling.optimal(KEYS[0], log_weights, PLACES).indices
     np.testing.assert_array_equal(slope, jax.nn.one_hot(kept, COUNT))
+
+
+def test_the_threshold_is_found_for_any_weights():
+    """A search that compares rounded sums goes on for ever for one set of weights in some hundred."""
+    log_weights = jnp.asarray(np.random.default_rng(1).normal(0, 5, (DRAWS, COUNT)), jnp.float32)
+    found = jax.jit(jax.vmap(lambda key, w: jf.resampling.optimal(key, w, PLACES)))(KEYS, log_weights)
+    assert (jnp.sum(found.log_weights > -jnp.inf, axis=1) == PLACES).all()
