@@ -20,6 +20,7 @@ from .gaussian import arithmetic as arithmetic
 from .gaussian import constraints as constraints
 from .gaussian import linearize as linearize
 from .gaussian import manifold as manifold
+from .gaussian import mode_maps as mode_maps
 from .gaussian.arithmetic.info import KalmanInfo as KalmanInfo
 from .gaussian.belief import Gaussian as Gaussian
 from .gaussian.belief import GaussianRoot as GaussianRoot
@@ -33,7 +34,10 @@ from .gaussian.extended import extended_kalman as extended_kalman
 from .gaussian.gaussian_sum import GaussianSumState as GaussianSumState
 from .gaussian.gaussian_sum import gaussian_sum as gaussian_sum
 from .gaussian.gaussian_sum import map_component as map_component
+from .gaussian.imm import IMMState as IMMState
+from .gaussian.imm import imm as imm
 from .gaussian.linear import kalman as kalman
+from .gaussian.mixture import mixture_moments as mixture_moments
 from .gaussian.noise_models import NonAdditiveNoise as NonAdditiveNoise
 from .gaussian.robust import robust as robust
 from .gaussian.sigma_point import cubature_kalman as cubature_kalman
@@ -54,6 +58,8 @@ from .particle.partitioned import Partitions as Partitions
 from .particle.partitioned import batch_log_likelihood as batch_log_likelihood
 from .particle.rao_blackwell import rao_blackwell as rao_blackwell
 from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
+from .particle.switching import SwitchingState as SwitchingState
+from .particle.switching import switching as switching
 from .particle.tempering import AdaptiveTempering as AdaptiveTempering
 from .particle.weighting import ParticleInfo as ParticleInfo
 

@@ -1,13 +1,17 @@
 from . import arithmetic as arithmetic
+from . import bank as bank
 from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
 from . import ensemble as ensemble
 from . import extended as extended
 from . import gaussian_sum as gaussian_sum
+from . import imm as imm
 from . import linear as linear
 from . import linearize as linearize
 from . import manifold as manifold
+from . import mixture as mixture
+from . import mode_maps as mode_maps
 from . import noise_models as noise_models
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust

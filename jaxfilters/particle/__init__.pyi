@@ -11,5 +11,6 @@ from . import rao_blackwell as rao_blackwell
 from . import resampling as resampling
 from . import sharding as sharding
 from . import smoothing as smoothing
+from . import switching as switching
 from . import tempering as tempering
 from . import weighting as weighting

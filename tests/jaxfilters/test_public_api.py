@@ -81,6 +81,11 @@ EXACT = {
     ),
     "schmidt_kalman": lambda noise: jf.schmidt_kalman(extended(noise), observe, jnp.zeros(2, bool), 1e-3),
     "robust": lambda noise: jf.robust(extended(noise), 1e-7, jnp.array([[25.0]])),
+    # Two modes of one model are that model.
+    "imm": lambda noise: jf.imm([extended(noise)] * 2, [[0.9, 0.1], [0.4, 0.6]], [0.3, 0.7]),
+    "switching": lambda noise: jf.switching(
+        [extended(noise)] * 2, [[0.9, 0.1], [0.4, 0.6]], [0.3, 0.7], num_particles=4
+    ),
 }
 """Filters that are exact for a linear Gaussian model."""
 
