@@ -101,8 +101,8 @@ def _p_value(ranks: Int[Array, "runs ..."], num_ranks: int, num_bins: int) -> Fl
 
 
 def _check_draws(draws: PyTree, theta: PyTree, num_bins: int) -> None:
-    if jax.tree.structure(draws) != jax.tree.structure(theta):
-        structures: tuple[Any, Any] = jax.tree.structure(theta), jax.tree.structure(draws)
+    structures: tuple[Any, Any] = jax.tree.structure(theta), jax.tree.structure(draws)
+    if structures[0] != structures[1]:
         raise ValueError(f"sample_posterior must return a tree like theta, {structures[0]}; got {structures[1]}.")
     for (path, leaf), truth in zip(jax.tree_util.tree_leaves_with_path(draws), jax.tree.leaves(theta), strict=True):
         name = f"sample_posterior{jax.tree_util.keystr(path)}"

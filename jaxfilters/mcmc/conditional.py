@@ -9,7 +9,7 @@ its first row, and then one row a frame.
 
 from collections.abc import Callable
 from dataclasses import field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,7 @@ class PathInfo(NamedTuple):
     not even its own predecessor. Where it is not 0 the trajectory is no draw from the posterior."""
 
 
+@runtime_checkable
 class Redraw(Protocol):
     """How a sweep departs from the given trajectory: `ancestral`, `ancestor_sampling` or `backward_sampling`."""
 

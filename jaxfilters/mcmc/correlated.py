@@ -59,17 +59,20 @@ class CorrelatedLikelihood:
         prior_key, transition_key, offset_key = jax.random.split(key, 3)
         return FilterNoise(
             jax.random.normal(prior_key, (*shape, count)),
-            jax.random.normal(transition_key, (length, *_shape_of(model.noise), count)),
+            jax.random.normal(transition_key, (length, *_shape_of(_checked_noise(model)), count)),
             jax.random.normal(offset_key, (length,)),
         )
 
     def perturb(self, key: AnyKey, numbers: FilterNoise) -> FilterNoise:
         """A step of a Crank-Nicolson (first-order autoregressive) chain."""
         rho = self.correlation
-        keys = jax.random.split(key, len(numbers))
-        fresh = [jax.random.normal(key, leaf.shape, leaf.dtype) for key, leaf in zip(keys, numbers, strict=True)]
-        mixed = [rho * old + jnp.sqrt(1 - jnp.square(rho)) * new for old, new in zip(numbers, fresh, strict=True)]
-        return FilterNoise(*(leaf.astype(old.dtype) for leaf, old in zip(mixed, numbers, strict=True)))
+        keys = FilterNoise(*jax.random.split(key, len(numbers)))
+
+        def mixed(key: AnyKey, old: Array) -> Array:
+            fresh = jax.random.normal(key, old.shape, old.dtype)
+            return (rho * old + jnp.sqrt(1 - jnp.square(rho)) * fresh).astype(old.dtype)
+
+        return jax.tree.map(mixed, keys, numbers)
 
     def evaluate(self, numbers: FilterNoise, theta: PyTree) -> Float[Array, ""]:
         """Log of the estimate, an exact function of the numbers."""
@@ -157,9 +160,14 @@ def _frame(model: Bootstrap, sort_by: Callable[[PyTree], Array]) -> Callable:
 
 def _model_of(filter: Filter) -> Bootstrap:
     checks.check_bootstrap(filter, "the result of filter_of")
-    if not isinstance(filter.params.noise, StandardNormal):
-        raise ValueError(f"noise of the filter must be StandardNormal(...); got {filter.params.noise!r}.")
+    _checked_noise(filter.params)
     return filter.params
+
+
+def _checked_noise(model: Bootstrap) -> StandardNormal:
+    if not isinstance(model.noise, StandardNormal):
+        raise ValueError(f"noise of the filter must be StandardNormal(...); got {model.noise!r}.")
+    return model.noise
 
 
 def _shape_of(noise: StandardNormal) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ _FLOOR = 1e-6
 """Share of the initial variance that stays in the adapted covariance."""
 
 
+@runtime_checkable
 class Proposal(Protocol):
     """How a Metropolis-Hastings sampler proposes parameters; its state may adapt in warm-up."""
 

@@ -8,7 +8,7 @@ Moral, A. Doucet and A. Jasra, "Sequential Monte Carlo samplers", Journal of the
 from collections.abc import Callable
 from dataclasses import field
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ class TemperingInfo(NamedTuple):
     """Number of proposed parameters with a log density of NaN or `+inf`; they were rejected."""
 
 
+@runtime_checkable
 class Temperatures(Protocol):
     """A schedule: `adaptive_temperatures` or `fixed_temperatures`."""
 
@@ -71,7 +72,8 @@ class AdaptiveTemperatures:
         del stage
         left = 1 - temperature
         n = log_likelihood.size
-        share = weights.temper_exponent(left * log_likelihood, jnp.zeros(n, left.dtype), self.ess_fraction * n)
+        target = jnp.asarray(self.ess_fraction, left.dtype) * n
+        share = weights.temper_exponent(left * log_likelihood, jnp.zeros(n, left.dtype), target)
         return jnp.where(share >= 1, 1.0, temperature + share * left).astype(temperature.dtype)
 
 
