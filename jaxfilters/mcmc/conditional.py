@@ -29,7 +29,7 @@ from jaxfilters.particle import smoothing
 from jaxfilters.particle.bootstrap import Bootstrap
 from jaxfilters.particle.smoothing import History, LogTransition
 from jaxfilters.priors import sample_ensemble
-from jaxfilters.typing import AnyKey, as_pytree
+from jaxfilters.typing import AnyKey, taking_inputs
 
 
 class PathInfo(NamedTuple):
@@ -50,12 +50,12 @@ class Redraw(Protocol):
     """How a sweep departs from the given trajectory: `ancestral`, `ancestor_sampling` or `backward_sampling`."""
 
     def parent(
-        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, control: PyTree, /
+        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree, /
     ) -> tuple[Array, Array]:
         """Index of the particle that precedes a state of the given trajectory, and whether none could."""
         ...
 
-    def trace(self, key: AnyKey, history: History, controls: PyTree, /) -> PyTree:
+    def trace(self, key: AnyKey, history: History, inputs: PyTree, /) -> PyTree:
         """One trajectory through the ensembles of a sweep."""
         ...
 
@@ -65,15 +65,15 @@ class Ancestral:
     """The given trajectory keeps its past, and the new one is the ancestry of a particle of the last frame."""
 
     def parent(
-        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, control: PyTree
+        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
     ) -> tuple[Array, Array]:
         """The given trajectory's own particle."""
-        del point, log_weights, particles, x_next, control
+        del point, log_weights, particles, x_next, inputs
         return jnp.zeros((), jnp.int32), jnp.zeros((), bool)
 
-    def trace(self, key: AnyKey, history: History, controls: PyTree) -> PyTree:
+    def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
         """The ancestry of a particle that is drawn by its weight."""
-        del controls
+        del inputs
         return _ancestry(key, history)
 
 
@@ -84,20 +84,20 @@ class AncestorSampling:
     log_transition: LogTransition
 
     def parent(
-        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, control: PyTree
+        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
     ) -> tuple[Array, Array]:
         """A particle drawn by its weight times the density of the transition to `x_next`."""
 
         def log_density(x: PyTree) -> Array:
-            return particle_checks.scalar_log_density("log_transition", self.log_transition(x_next, x, control))
+            return particle_checks.scalar_log_density("log_transition", self.log_transition(x_next, x, inputs))
 
         joined = log_weights + jax.vmap(log_density, in_axes=-1)(particles)
         impossible = ~jnp.any(joined > -jnp.inf)
         return jnp.where(impossible, 0, _draw_index(joined, point)), impossible
 
-    def trace(self, key: AnyKey, history: History, controls: PyTree) -> PyTree:
+    def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
         """The ancestry of a particle that is drawn by its weight."""
-        del controls
+        del inputs
         return _ancestry(key, history)
 
 
@@ -108,17 +108,17 @@ class BackwardSampling:
     log_transition: LogTransition
 
     def parent(
-        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, control: PyTree
+        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
     ) -> tuple[Array, Array]:
         """The given trajectory's own particle."""
-        del point, log_weights, particles, x_next, control
+        del point, log_weights, particles, x_next, inputs
         return jnp.zeros((), jnp.int32), jnp.zeros((), bool)
 
-    def trace(self, key: AnyKey, history: History, controls: PyTree) -> PyTree:
+    def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
         """One draw by backward sampling."""
-        # The transition into row t has the control of row t; the first row, before which there is none, repeats it.
-        controls = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf]), controls)
-        paths = smoothing.backward_sampling(key, history, self.log_transition, controls, num_paths=1)
+        # The transition into row t has the inputs of row t; the first row, before which there is none, repeats it.
+        inputs = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf]), inputs)
+        paths = smoothing.backward_sampling(key, history, self.log_transition, inputs, num_paths=1)
         return jax.tree.map(lambda leaf: leaf[..., 0], paths)
 
 
@@ -148,7 +148,8 @@ def ancestor_sampling(log_transition: LogTransition) -> AncestorSampling:
     densities a frame.
 
     Args:
-        log_transition: `(x_next, x, control) -> log p(x_next | x)`, a scalar; up to a constant that depends on neither.
+        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar, up to a constant that depends on neither; it may
+            take the inputs of the step as one more argument.
 
     Returns:
         An argument of `conditional_smc`.
@@ -157,7 +158,7 @@ def ancestor_sampling(log_transition: LogTransition) -> AncestorSampling:
         TypeError: If `log_transition` is not callable.
     """
     particle_checks.check_callables(log_transition=log_transition)
-    return AncestorSampling(as_pytree(log_transition))
+    return AncestorSampling(taking_inputs("log_transition", log_transition, "x_next", "x"))
 
 
 def backward_sampling(log_transition: LogTransition) -> BackwardSampling:
@@ -166,7 +167,8 @@ def backward_sampling(log_transition: LogTransition) -> BackwardSampling:
     The proposal is N. Whiteley's, in the discussion of Andrieu, Doucet and Holenstein (2010).
 
     Args:
-        log_transition: `(x_next, x, control) -> log p(x_next | x)`, a scalar; up to a constant that depends on neither.
+        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar, up to a constant that depends on neither; it may
+            take the inputs of the step as one more argument.
 
     Returns:
         An argument of `conditional_smc`.
@@ -175,7 +177,7 @@ def backward_sampling(log_transition: LogTransition) -> BackwardSampling:
         TypeError: If `log_transition` is not callable.
     """
     particle_checks.check_callables(log_transition=log_transition)
-    return BackwardSampling(as_pytree(log_transition))
+    return BackwardSampling(taking_inputs("log_transition", log_transition, "x_next", "x"))
 
 
 def conditional_smc(
@@ -200,11 +202,11 @@ def conditional_smc(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
-        ...     lambda key: jnp.zeros(1), lambda e, x, u: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
         ...     num_particles=20, noise=jf.StandardNormal(1),
         ... )
         >>> kernel = jf.mcmc.conditional_smc(
-        ...     pf, jf.mcmc.ancestor_sampling(lambda x_next, x, u: -0.5 * jnp.sum((x_next - x) ** 2))
+        ...     pf, jf.mcmc.ancestor_sampling(lambda x_next, x: -0.5 * jnp.sum((x_next - x) ** 2))
         ... )
         >>> ys = jnp.ones((5, 1))
         >>> path, info = jf.mcmc.initial_path(jax.random.key(0), kernel, ys)
@@ -225,7 +227,7 @@ def initial_path(
     key: AnyKey,
     kernel: ConditionalSMC,
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
 ) -> tuple[PyTree, PathInfo]:
@@ -235,17 +237,17 @@ def initial_path(
         key: Random key.
         kernel: What `conditional_smc` returns.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, or `None`.
         mask: Booleans (t,), `False` for frames without an observation.
 
     Returns:
         States, leaves `(t + 1, ...)`, of which the first is the one before the first observation; and the diagnostics.
 
     Raises:
-        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length; or, where that is
+        ValueError: If the leaves of `observations`, `inputs` and `mask` do not share one length; or, where that is
             known, if no particle explains a frame.
     """
-    path, info = _initial(key, kernel, observations, controls, mask)
+    path, info = _initial(key, kernel, observations, inputs, mask)
     checks.check_where_concrete(
         info.num_impossible,
         lambda number: number == 0,
@@ -256,10 +258,10 @@ def initial_path(
 
 @jax.jit
 def _initial(
-    key: AnyKey, kernel: ConditionalSMC, observations: PyTree, controls: PyTree, mask: Array | None
+    key: AnyKey, kernel: ConditionalSMC, observations: PyTree, inputs: PyTree, mask: Array | None
 ) -> tuple[PyTree, PathInfo]:
     sweep_key, trace_key = jax.random.split(key)
-    history, *counts = _sweep(sweep_key, kernel, None, observations, controls, mask)
+    history, *counts = _sweep(sweep_key, kernel, None, observations, inputs, mask)
     path = _ancestry(trace_key, history)
     return path, PathInfo(jnp.ones(history.log_weights.shape[0], bool), *counts)
 
@@ -270,7 +272,7 @@ def update_path(
     kernel: ConditionalSMC,
     path: PyTree,
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
 ) -> tuple[PyTree, PathInfo]:
@@ -281,30 +283,30 @@ def update_path(
         kernel: What `conditional_smc` returns.
         path: The trajectory before, leaves `(t + 1, ...)`.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, or `None`.
         mask: Booleans (t,), `False` for frames without an observation.
 
     Returns:
         The next trajectory, leaves `(t + 1, ...)`, and the diagnostics of the sweep.
 
     Raises:
-        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length, or `path` is not of
+        ValueError: If the leaves of `observations`, `inputs` and `mask` do not share one length, or `path` is not of
             the shape that the model and this length give.
     """
     sweep_key, trace_key = jax.random.split(key)
-    history, *counts = _sweep(sweep_key, kernel, path, observations, controls, mask)
-    after = kernel.redraw.trace(trace_key, history, controls)
+    history, *counts = _sweep(sweep_key, kernel, path, observations, inputs, mask)
+    after = kernel.redraw.trace(trace_key, history, inputs)
     return after, PathInfo(_rows_that_differ(path, after), *counts)
 
 
 def _sweep(
-    key: AnyKey, kernel: ConditionalSMC, path: PyTree, observations: PyTree, controls: PyTree, mask: Array | None
+    key: AnyKey, kernel: ConditionalSMC, path: PyTree, observations: PyTree, inputs: PyTree, mask: Array | None
 ) -> tuple[History, Int32[Array, ""], Int32[Array, ""]]:
     """Ensembles of all frames, row 0 before the first, and the counts of `PathInfo`.
 
     Particle 0 follows `path` where it is not `None`.
     """
-    length, model = checks.shared_length(observations=observations, controls=controls, mask=mask), kernel.model
+    length, model = checks.shared_length(observations=observations, inputs=inputs, mask=mask), kernel.model
     count = model.num_particles
     prior_key, noise_key, resample_key, point_key = jax.random.split(key, 4)
     particles = sample_ensemble(prior_key, model.sample_prior, count)
@@ -318,7 +320,7 @@ def _sweep(
         jax.random.uniform(point_key, (length,)),
         jax.tree.map(lambda leaf: leaf[1:], path),
         observations,
-        controls,
+        inputs,
         mask,
     )
     _, (history, invalid, impossible) = jax.lax.scan(_frame(kernel, conditional=path is not None), start, frames)
@@ -330,21 +332,20 @@ def _sweep(
 def _frame(kernel: ConditionalSMC, *, conditional: bool) -> Callable:
     model = kernel.model
     move = jax.vmap(particle_checks.checked_transition(model.sample_transition), in_axes=(-1, -1, None), out_axes=-1)
-    likelihoods = jax.vmap(particle_checks.checked_log_likelihood(model.log_likelihood), in_axes=(-1, None))
+    likelihoods = jax.vmap(particle_checks.checked_log_likelihood(model.log_likelihood), in_axes=(-1, None, None))
 
     def frame(carry: tuple, given: tuple) -> tuple[tuple, tuple]:
         particles, log_weights = carry
-        key, noise, point, x_next, observation, control, is_observed = given
+        key, noise, point, x_next, observation, inputs, is_observed = given
         if conditional:
-            parent, impossible = kernel.redraw.parent(point, log_weights, particles, x_next, control)
+            parent, impossible = kernel.redraw.parent(point, log_weights, particles, x_next, inputs)
             ancestors = kernel.scheme(key, log_weights, parent)
         else:
             ancestors, impossible = systematic_at(point, log_weights), jnp.zeros((), bool)
-        moved = move(
-            noise, jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), particles), control
-        )
-        moved = _with_first(moved, x_next)
-        log_factor, num_invalid = _usable(likelihoods(moved, _without_nan(observation, is_observed)), is_observed)
+        chosen = jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), particles)
+        moved = _with_first(move(noise, chosen, inputs), x_next)
+        log_likelihoods = likelihoods(moved, _without_nan(observation, is_observed), inputs)
+        log_factor, num_invalid = _usable(log_likelihoods, is_observed)
         after, _ = weights.normalize(log_factor)
         impossible = impossible | ~jnp.any(log_factor > -jnp.inf)
         return (moved, after), (History(moved, after, ancestors), num_invalid, impossible)

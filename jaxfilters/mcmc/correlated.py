@@ -46,7 +46,7 @@ class CorrelatedLikelihood:
 
     filter_of: Callable[[PyTree], Filter]
     observations: PyTree
-    controls: PyTree
+    inputs: PyTree
     mask: PyTree
     correlation: ArrayLike
     sort_by: Callable[[PyTree], Array]
@@ -81,7 +81,7 @@ class CorrelatedLikelihood:
         particles = transform(numbers.prior)
         _check_order(self.sort_by, particles)
         start = particles, weights.uniform(model.num_particles)
-        frames = numbers.transitions, numbers.offsets, self.observations, self.controls, self.mask
+        frames = numbers.transitions, numbers.offsets, self.observations, self.inputs, self.mask
         _, log_evidences = jax.lax.scan(_frame(model, self.sort_by), start, frames)
         return jnp.sum(log_evidences)
 
@@ -89,7 +89,7 @@ class CorrelatedLikelihood:
 def correlated(
     filter_of: Callable[[PyTree], Filter],
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
     correlation: ArrayLike = 0.99,
@@ -101,7 +101,7 @@ def correlated(
         filter_of: `theta -> Filter`, made by `bootstrap` with `noise=StandardNormal(...)` and a `sample_prior` by
             `priors.gaussian_prior`, or by `priors.from_noise` of a `StandardNormal`. It resamples before every frame.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, or `None`.
         mask: Booleans (t,), `False` for frames without an observation.
         correlation: Correlation of the random numbers before and after a step, in [0, 1): 0 is the independent
             pseudo-marginal method. The less time and the more particles, the further from 1 it may be.
@@ -122,7 +122,7 @@ def correlated(
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> def filter_of(noise):
         ...     return jf.bootstrap(
-        ...         prior, lambda e, x, u: 0.9 * x + noise * e, lambda x, y: jax.scipy.stats.norm.logpdf(y, x[0]),
+        ...         prior, lambda e, x: 0.9 * x + noise * e, lambda x, y: jax.scipy.stats.norm.logpdf(y, x[0]),
         ...         num_particles=20, noise=jf.StandardNormal(1))
         >>> likelihood = jf.mcmc.correlated(filter_of, jnp.array([0.3, 0.5, 0.1]))
         >>> sampler = jf.mcmc.pmmh(
@@ -130,25 +130,25 @@ def correlated(
     """
     particle_checks.check_callables(filter_of=filter_of, sort_by=sort_by)
     particle_checks.check_scalar("correlation", correlation, "in [0, 1)", lambda rho: 0 <= rho < 1)
-    checks.shared_length(observations=observations, controls=controls, mask=mask)
+    checks.shared_length(observations=observations, inputs=inputs, mask=mask)
     order = as_pytree(_only_number if sort_by is None else sort_by)
-    return CorrelatedLikelihood(as_pytree(filter_of), observations, controls, mask, correlation, order)
+    return CorrelatedLikelihood(as_pytree(filter_of), observations, inputs, mask, correlation, order)
 
 
 def _frame(model: Bootstrap, sort_by: Callable[[PyTree], Array]) -> Callable:
     move = jax.vmap(particle_checks.checked_transition(model.sample_transition), in_axes=(-1, -1, None), out_axes=-1)
-    likelihoods = jax.vmap(particle_checks.checked_log_likelihood(model.log_likelihood), in_axes=(-1, None))
+    likelihoods = jax.vmap(particle_checks.checked_log_likelihood(model.log_likelihood), in_axes=(-1, None, None))
     order_of = jax.vmap(sort_by, in_axes=-1)
 
     def frame(carry: tuple, given: tuple) -> tuple[tuple, Array]:
         particles, log_weights = carry
-        noise, offset, observation, control, is_observed = given
+        noise, offset, observation, inputs, is_observed = given
         order = jnp.argsort(order_of(particles))
         chosen = order[systematic_at(jax.scipy.stats.norm.cdf(offset), log_weights[order])]
-        moved = move(noise, jax.tree.map(lambda leaf: leaf[..., chosen], particles), control)
+        moved = move(noise, jax.tree.map(lambda leaf: leaf[..., chosen], particles), inputs)
         if is_observed is not None:
             observation = jax.tree.map(lambda y: jnp.where(is_observed, y, jnp.zeros_like(y)), observation)
-        log_factor = likelihoods(moved, observation)
+        log_factor = likelihoods(moved, observation, inputs)
         log_factor = log_factor if is_observed is None else jnp.where(is_observed, log_factor, 0.0)
         after, log_sum = weights.normalize(log_factor)
         # A NaN is the caller's to report, not to average.

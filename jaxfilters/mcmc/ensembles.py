@@ -45,7 +45,7 @@ _REASONS = {
     SMCStatus.NO_WEIGHT: "log_likelihood must be finite for at least one draw of sample_prior; got -inf for all",
     SMCStatus.OUTSIDE_SUPPORT: "sample_prior must draw parameters with a finite log_prior; got -inf for some draws",
     SMCStatus.CONSTRAINT: "sample_prior must draw parameters that satisfy the constraints; some draws do not",
-    SMCStatus.INVALID_DENSITY: "log_prior and log_likelihood must be neither NaN nor +inf; some draws of the prior have such",
+    SMCStatus.INVALID_DENSITY: "log_prior and log_likelihood must be neither NaN nor +inf; they are for some draws",
     SMCStatus.UNFINISHED: "max_stages of adaptive_temperatures must be larger: they ended before the temperature 1",
     SMCStatus.SCHEDULE: "temperatures must increase strictly within (0, 1] and end at 1",
 }

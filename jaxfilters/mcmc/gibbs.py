@@ -31,7 +31,7 @@ class ParticleGibbs:
     kernel_of: Callable[[PyTree], ConditionalSMC]
     update_parameters: Callable[[AnyKey, PyTree, PyTree], PyTree]
     observations: PyTree
-    controls: PyTree
+    inputs: PyTree
     mask: PyTree
 
 
@@ -39,7 +39,7 @@ def particle_gibbs(
     kernel_of: Callable[[PyTree], ConditionalSMC],
     update_parameters: Callable[[AnyKey, PyTree, PyTree], PyTree],
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
 ) -> Sampler:
@@ -55,7 +55,7 @@ def particle_gibbs(
             that keeps it invariant, such as `metropolis_update`. `path` has leaves `(t + 1, ...)`, the first row of
             which is the state before the first observation.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, or `None`.
         mask: Booleans (t,), `False` for frames without an observation.
 
     Returns:
@@ -65,15 +65,15 @@ def particle_gibbs(
     Raises:
         TypeError: If `kernel_of` or `update_parameters` is not callable, or `kernel_of` returns something else than a
             `ConditionalSMC`.
-        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length.
+        ValueError: If the leaves of `observations`, `inputs` and `mask` do not share one length.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> ys, normal = jnp.array([0.2, -0.3, 0.4]), jax.scipy.stats.norm.logpdf
         >>> def kernel_of(q):
-        ...     pf = jf.bootstrap(lambda key: jax.random.normal(key), lambda e, x, u: 0.9 * x + q * e,
+        ...     pf = jf.bootstrap(lambda key: jax.random.normal(key), lambda e, x: 0.9 * x + q * e,
         ...         lambda x, y: normal(y, x), num_particles=10, noise=jf.StandardNormal(()))
-        ...     return jf.mcmc.conditional_smc(pf, jf.mcmc.ancestor_sampling(lambda z, x, u: normal(z, 0.9 * x, q)))
+        ...     return jf.mcmc.conditional_smc(pf, jf.mcmc.ancestor_sampling(lambda z, x: normal(z, 0.9 * x, q)))
         >>> update = jf.mcmc.metropolis_update(
         ...     lambda q, path: jax.scipy.stats.expon.logpdf(q) + normal(path[1:], 0.9 * path[:-1], q).sum(),
         ...     proposal=jf.mcmc.random_walk(jf.fit.positive))
@@ -84,14 +84,14 @@ def particle_gibbs(
         ((20, 2), (4, 2))
     """
     check_callables(kernel_of=kernel_of, update_parameters=update_parameters)
-    checks.shared_length(observations=observations, controls=controls, mask=mask)
-    params = ParticleGibbs(as_pytree(kernel_of), as_pytree(update_parameters), observations, controls, mask)
+    checks.shared_length(observations=observations, inputs=inputs, mask=mask)
+    params = ParticleGibbs(as_pytree(kernel_of), as_pytree(update_parameters), observations, inputs, mask)
     return Sampler(params, _init, _step, _step)
 
 
 def _init(model: ParticleGibbs, key: AnyKey, theta: PyTree) -> tuple[GibbsState, Array]:
     theta = jax.tree.map(jnp.asarray, theta)
-    path, info = initial_path(key, _kernel_at(model, theta), model.observations, model.controls, mask=model.mask)
+    path, info = initial_path(key, _kernel_at(model, theta), model.observations, model.inputs, mask=model.mask)
     fault = jnp.where(info.num_impossible > 0, Fault.LOG_LIKELIHOOD, Fault.NONE)
     return GibbsState(theta, path), fault.astype(jnp.int32)
 
@@ -99,7 +99,7 @@ def _init(model: ParticleGibbs, key: AnyKey, theta: PyTree) -> tuple[GibbsState,
 def _step(model: ParticleGibbs, key: AnyKey, state: GibbsState) -> tuple[GibbsState, PathInfo]:
     path_key, theta_key = jax.random.split(key)
     kernel = _kernel_at(model, state.theta)
-    path, info = update_path(path_key, kernel, state.path, model.observations, model.controls, mask=model.mask)
+    path, info = update_path(path_key, kernel, state.path, model.observations, model.inputs, mask=model.mask)
     theta = model.update_parameters(theta_key, state.theta, path)
     return GibbsState(like("the result of update_parameters", theta, state.theta, "theta"), path), info
 

@@ -125,7 +125,7 @@ def pmmh(
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> def filter_of(noise):
         ...     return jf.bootstrap(
-        ...         lambda key: jax.random.normal(key), lambda e, x, u: x + noise * e[0],
+        ...         lambda key: jax.random.normal(key), lambda e, x: x + noise * e[0],
         ...         lambda x, y: jax.scipy.stats.norm.logpdf(y, x, 0.5), num_particles=50, noise=jf.StandardNormal(1))
         >>> ys = jnp.array([0.1, 0.8, 1.4, 0.9, 1.8])
         >>> sampler = jf.mcmc.pmmh(

@@ -49,7 +49,7 @@ class _Problem:
     log_prior: Callable[[PyTree], Array]
     filter_of: Callable[[PyTree], Filter]
     observations: PyTree
-    controls: PyTree
+    inputs: PyTree
     mask: PyTree
     ess_threshold: ArrayLike
     num_particles: int = field(metadata={"static": True})
@@ -70,7 +70,7 @@ def smc2(
     sample_prior: SamplePrior,
     log_prior: Callable[[PyTree], Array],
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     num_particles: int,
     mask: Bool[Array, " t"] | None = None,
@@ -91,7 +91,7 @@ def smc2(
         sample_prior: `key -> theta`, or one of `jaxfilters.priors`.
         log_prior: `theta -> log p(theta)`, the density of theta itself of which `sample_prior` draws.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, or `None`.
         num_particles: Number n of parameters.
         mask: Booleans (t,), `False` for frames without an observation.
         num_moves: Number of Metropolis-Hastings steps at a time.
@@ -112,7 +112,7 @@ def smc2(
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> def filter_of(noise):
         ...     return jf.bootstrap(
-        ...         lambda key: jax.random.normal(key), lambda e, x, u: x + 0.1 * e[0],
+        ...         lambda key: jax.random.normal(key), lambda e, x: x + 0.1 * e[0],
         ...         lambda x, y: jax.scipy.stats.norm.logpdf(y, x, noise), num_particles=50, noise=jf.StandardNormal(1))
         >>> posterior = jf.mcmc.smc2(
         ...     jax.random.key(0), filter_of, jax.random.exponential, jax.scipy.stats.expon.logpdf,
@@ -124,14 +124,14 @@ def smc2(
     checks.check_count("num_particles", num_particles, 2)
     checks.check_count("num_moves", num_moves)
     check_scalar("ess_threshold", ess_threshold, "a fraction of num_particles, at least 0", lambda share: share >= 0)
-    checks.shared_length(observations=observations, controls=controls, mask=mask)
+    checks.shared_length(observations=observations, inputs=inputs, mask=mask)
     leaves, structure = jax.tree.flatten(constraints)
     problem = _Problem(
         as_pytree(sample_prior),
         as_pytree(log_prior),
         as_pytree(filter_of),
         observations,
-        controls,
+        inputs,
         mask,
         ess_threshold,
         num_particles,
@@ -166,10 +166,10 @@ def _start(problem: _Problem, key: AnyKey, theta: PyTree) -> tuple[Array, PyTree
 
 def _advance(problem: _Problem, key: AnyKey, theta: PyTree, state: PyTree, time: Array) -> tuple[Array, PyTree]:
     """Log evidence of one frame, and the state after it."""
-    frame = jax.tree.map(lambda leaf: leaf[time][None], (problem.observations, problem.controls, problem.mask))
-    observations, controls, mask = frame
+    frame = jax.tree.map(lambda leaf: leaf[time][None], (problem.observations, problem.inputs, problem.mask))
+    observations, inputs, mask = frame
     filter = problem.filter_of(theta)
-    state, info = filters.run(filter, key, observations, controls, mask=mask, state=state, collect=filters.keep_info)
+    state, info = filters.run(filter, key, observations, inputs, mask=mask, state=state, collect=filters.keep_info)
     return info.log_evidence[0], state
 
 
