@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfilters.benchmarks.scenarios._sampling_problems import PRIOR_MEAN, PRIOR_SD, RHO, Sizes, log_prior, regression
+from jaxfilters.benchmarks.scenarios._sampling_problems import (
+    PRIOR_MEAN,
+    PRIOR_SD,
+    RHO,
+    Sizes,
+    log_evidence_of_first,
+    log_prior,
+    regression,
+)
 from jaxfilters.typing import AnyKey
 
 PEERS = ("particles", "smcx", "blackjax")
@@ -37,7 +45,7 @@ def gibbs_of_particles(returns: Float[Array, " t"], sizes: Sizes) -> Callable[[i
         for _ in range(sizes.num_sweeps):
             sweep = mcmc.CSMC(fk=model, N=sizes.num_states, ESSrmin=1.1, xstar=path[0])
             sweep.run()
-            path[0] = [x[0] for x in sweep.hist.backward_sampling(1)]
+            path[0] = [np.ravel(x)[0] for x in sweep.hist.backward_sampling(1)]
             found.append(np.array(path[0]))
         return np.array(found)
 
@@ -45,8 +53,9 @@ def gibbs_of_particles(returns: Float[Array, " t"], sizes: Sizes) -> Callable[[i
 
 
 def smc2_of_particles(returns: Float[Array, " t"], sizes: Sizes) -> Callable[[int], float]:
-    """SMC^2; its log evidence."""
+    """SMC^2; its log evidence, to which that of the first return is added, because version 0.3 leaves it out."""
     library = import_module("particles")
+    first_return = float(log_evidence_of_first(returns))
     samplers = import_module("particles.smc_samplers")
     # Version 0.3 uses a name that NumPy no longer has.
     vars(np).setdefault("float", float)
@@ -66,7 +75,7 @@ def smc2_of_particles(returns: Float[Array, " t"], sizes: Sizes) -> Callable[[in
         )
         found = library.SMC(fk=model, N=sizes.num_parameters, collect="off")
         found.run()
-        return float(found.logLt)
+        return float(found.logLt) + first_return
 
     return run
 

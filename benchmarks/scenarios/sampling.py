@@ -83,8 +83,8 @@ def gibbs(returns: Float[Array, " t"], sizes: Sizes) -> OfSeed:
 
     @jax.jit
     def sweeps(key: AnyKey, path: Float[Array, "t_plus_1 1"]) -> Float[Array, "sweeps t"]:
-        def sweep(path: Array, key: AnyKey) -> tuple[Array, Array]:
-            path, _ = jf.mcmc.update_path(key, kernel, path, returns)
+        def sweep(path: Array, sweep_key: AnyKey) -> tuple[Array, Array]:
+            path, _ = jf.mcmc.update_path(sweep_key, kernel, path, returns)
             return path, path[1:, 0]
 
         return jax.lax.scan(sweep, path, jax.random.split(key, sizes.num_sweeps))[1]

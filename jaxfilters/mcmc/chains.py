@@ -169,14 +169,14 @@ def _run(
     count = checks.num_chains(state.theta)
     one = jax.vmap(partial(advance, sampler.params), in_axes=(0, -1), out_axes=-1)
 
-    def step(state: PyTree, key: AnyKey) -> tuple[PyTree, PyTree]:
-        return one(jax.random.split(key, count), state)
+    def step(state: PyTree, step_key: AnyKey) -> tuple[PyTree, PyTree]:
+        return one(jax.random.split(step_key, count), state)
 
-    def kept(state: PyTree, key: AnyKey) -> tuple[PyTree, PyTree]:
+    def kept(state: PyTree, kept_key: AnyKey) -> tuple[PyTree, PyTree]:
+        keys = jax.random.split(kept_key, thin)
         if thin > 1:
-            *before, key = jax.random.split(key, thin)
-            state, _ = jax.lax.scan(lambda state, key: (step(state, key)[0], None), state, jnp.stack(before))
-        state, info = step(state, key)
+            state, _ = jax.lax.scan(lambda state, step_key: (step(state, step_key)[0], None), state, keys[:-1])
+        state, info = step(state, keys[-1])
         return state, jax.vmap(collect, in_axes=-1, out_axes=-1)(state, info)
 
     return jax.lax.scan(kept, state, jax.random.split(key, num_steps))

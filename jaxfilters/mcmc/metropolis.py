@@ -173,8 +173,8 @@ def metropolis_update(
         def evaluate(theta: PyTree) -> Point:
             return Point(theta, jnp.zeros(()), checks.scalar("log_density", log_density(theta, path)))
 
-        def step(point: Point, key: AnyKey) -> tuple[Point, None]:
-            propose_key, accept_key = jax.random.split(key)
+        def step(point: Point, step_key: AnyKey) -> tuple[Point, None]:
+            propose_key, accept_key = jax.random.split(step_key)
             new, log_correction = walk.propose(propose_key, state, point.theta)
             return accept(accept_key, point, evaluate(new), log_correction)[0], None
 

@@ -218,8 +218,8 @@ def _moved(
     root = ensembles.root_of(target, ensemble.theta, log_weights)
     chosen = systematic_at(jax.random.uniform(resample_key), log_weights)
 
-    def step(ensemble: Point, key: AnyKey) -> tuple[Point, tuple[Array, Array]]:
-        ensemble, info = ensembles.metropolis(key, target, ensemble, root, 1.0)
+    def step(ensemble: Point, step_key: AnyKey) -> tuple[Point, tuple[Array, Array]]:
+        ensemble, info = ensembles.metropolis(step_key, target, ensemble, root, 1.0)
         return ensemble, (jnp.mean(info.acceptance_probability), jnp.sum(info.invalid, dtype=jnp.int32))
 
     keys = jax.random.split(steps_key, problem.num_moves)

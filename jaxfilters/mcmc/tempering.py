@@ -292,8 +292,8 @@ def _hashable(constraints):
 @partial(jax.jit, static_argnames=("sizes", "constraints"))
 def _standard(key, problem, sizes, constraints):
     def moved(key, target, chosen, root, temperature):
-        def step(ensemble, key):
-            return ensembles.metropolis(key, target, ensemble, root, temperature)
+        def step(ensemble, step_key):
+            return ensembles.metropolis(step_key, target, ensemble, root, temperature)
 
         return jax.lax.scan(step, chosen, jax.random.split(key, sizes.num_moves))
 
@@ -303,8 +303,8 @@ def _standard(key, problem, sizes, constraints):
 @partial(jax.jit, static_argnames=("sizes", "constraints"))
 def _waste_free(key, problem, sizes, constraints):
     def moved(key, target, chosen, root, temperature):
-        def step(ensemble, key):
-            after, info = ensembles.metropolis(key, target, ensemble, root, temperature)
+        def step(ensemble, step_key):
+            after, info = ensembles.metropolis(step_key, target, ensemble, root, temperature)
             return after, (after, info)
 
         _, (visited, infos) = jax.lax.scan(step, chosen, jax.random.split(key, sizes.num_moves))

@@ -75,7 +75,7 @@ CASES = [
     Case("one particle", lambda: kernel(filter_of(num_particles=1)), ("num_particles", "2", "1")),
     Case("tempered", lambda: kernel(filter_of(temper=jf.AdaptiveTempering(0.5))), ("filter", "temper", "0.5")),
     Case("no redraw", lambda: kernel(redraw=3), ("redraw", "ancestral()", "3")),
-    Case("no density", lambda: jf.mcmc.ancestor_sampling(None), ("log_transition", "NoneType")),
+    Case("no density", lambda: jf.mcmc.ancestor_sampling(None), ("log_transition", "None")),
     Case("backward density", lambda: jf.mcmc.backward_sampling(lambda x: x), ("log_transition", "x_next")),
     Case("short path", lambda: jf.mcmc.update_path(KEY, kernel(), jnp.zeros((3, 1)), YS), ("path", "(4, 1)", "(3, 1)")),
     Case("path of another kind", lambda: jf.mcmc.update_path(KEY, kernel(), {"x": 1.0}, YS), ("path", "structure")),
