@@ -135,8 +135,6 @@ CASES = [
     Case("nested particles", lambda: nested(num_particles=1), ("num_particles", "1")),
     Case("nested threshold", lambda: nested(ess_threshold=-1.0), ("ess_threshold", "-1.0")),
     Case("nested lengths", lambda: nested(mask=jnp.ones(2, bool)), ("observations", "mask", "(2,)")),
-    Case("nested prior", lambda: nested(sample_prior=jax.random.normal, constraints=jf.fit.positive),
-         ("sample_prior", "constraints")),
     Case("bins", lambda: calibrated(num_bins=1), ("num_bins", "1")),
     Case("draws and bins", lambda: calibrated(8), ("sample_posterior", "num_bins", "8")),
     Case("draws of another shape", lambda: calibrated(lambda key, y: jnp.zeros((9, 2))),
@@ -150,6 +148,13 @@ def test_bad_input_is_an_error_that_names_the_argument(case, check_rejected):
     check_rejected(case.call, case.words)
 
 
+@pytest.mark.system
+def test_nested_samplers_reject_draws_outside_their_constraints(check_rejected):
+    call = partial(nested, sample_prior=jax.random.normal, constraints=jf.fit.positive)
+    check_rejected(call, ("sample_prior", "constraints"))
+
+
+@pytest.mark.system
 def test_under_jit_a_sampler_announces_what_it_would_reject():
     sampler = partial(jf.mcmc.tempered_smc, num_particles=8, num_moves=1)
     densities = {

@@ -175,6 +175,7 @@ def test_samplers_have_the_posterior_of_quadrature_and_are_calibrated(name):
     assert stats.chisquare(counts).pvalue > 1e-3
 
 
+@pytest.mark.system
 def test_calibration_finds_a_posterior_that_is_too_narrow():
     """Of a standard normal mean given one observation with unit noise; the right one passes with probability .999."""
 
@@ -192,6 +193,7 @@ def test_calibration_finds_a_posterior_that_is_too_narrow():
     assert p_value(jnp.nan) == 0
 
 
+@pytest.mark.system
 def test_correlated_noise_makes_estimates_that_go_together():
     """Errors of two estimates with correlated noise nearly cancel, where those of independent ones do not."""
     likelihood = jf.mcmc.correlated(partial(particle_filter_of, num_particles=32), YS, correlation=0.99)
@@ -210,6 +212,7 @@ def test_correlated_noise_makes_estimates_that_go_together():
     assert np.corrcoef(first, second)[0, 1] > 0.9
 
 
+@pytest.mark.system
 def test_a_chain_continues_where_it_stopped_and_warm_up_reaches_its_acceptance_rate():
     """A state that was stored and read gives the same draws; .4 acceptance within 0.05 over 64 chains of 200 steps."""
     sampler = jf.mcmc.pmmh(lambda key, theta: normal(1.0, theta["q"], 0.5), log_prior, proposal=WALK)
