@@ -99,9 +99,11 @@ class FixedTemperatures:
 
 
 def adaptive_temperatures(ess_fraction: ArrayLike = 0.5, *, max_stages: int = 200) -> AdaptiveTemperatures:
-    """Choose every temperature so that a share of the effective sample size is left (Jasra et al. 2011), by bisection.
+    """Choose every temperature by bisection, so that a share of the effective sample size is left.
 
-    The evidence then has a bias of the order of one over the number of particles.
+    The rule is that of A. Jasra, D. A. Stephens, A. Doucet and T. Tsagaris, "Inference for Levy-driven stochastic
+    volatility models via adaptive sequential Monte Carlo", Scandinavian Journal of Statistics 38, 2011. The evidence
+    then has a bias of the order of one over the number of particles.
 
     Args:
         ess_fraction: Share of the number of particles, in (0, 1).
