@@ -140,7 +140,7 @@ def ancestral() -> Ancestral:
     return Ancestral()
 
 
-def ancestor_sampling(log_transition: LogTransition) -> AncestorSampling:
+def ancestor_sampling(log_transition: Callable[..., Array]) -> AncestorSampling:
     """Trajectories by ancestor sampling: all states change in most sweeps, with few particles.
 
     Before every frame the ancestor of the given trajectory is drawn anew (F. Lindsten, M. I. Jordan and T. B. Schon,
@@ -161,7 +161,7 @@ def ancestor_sampling(log_transition: LogTransition) -> AncestorSampling:
     return AncestorSampling(taking_inputs("log_transition", log_transition, "x_next", "x"))
 
 
-def backward_sampling(log_transition: LogTransition) -> BackwardSampling:
+def backward_sampling(log_transition: Callable[..., Array]) -> BackwardSampling:
     """Trajectories by backward sampling: as `ancestor_sampling`, in a second pass over stored particles.
 
     The proposal is N. Whiteley's, in the discussion of Andrieu, Doucet and Holenstein (2010).

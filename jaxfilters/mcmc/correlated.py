@@ -70,7 +70,7 @@ class CorrelatedLikelihood:
 
         def mixed(key: AnyKey, old: Array) -> Array:
             fresh = jax.random.normal(key, old.shape, old.dtype)
-            return (rho * old + jnp.sqrt(1 - jnp.square(rho)) * fresh).astype(old.dtype)
+            return jnp.asarray(rho * old + jnp.sqrt(1 - jnp.square(rho)) * fresh, old.dtype)
 
         return jax.tree.map(mixed, keys, numbers)
 
