@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.fit.constraints import Constraint, free
+from jaxfilters.fit.constraints import Constraint, Fixed, free
 from jaxfilters.fit.parametrization import Parametrization, parametrize
 from jaxfilters.mcmc import checks
 from jaxfilters.particle.checks import check_callables, check_scalar, like
@@ -209,8 +209,15 @@ def is_admissible(parametrization: Parametrization) -> Bool[Array, ""]:
 def step_in_chart(
     key: AnyKey, parametrization: Parametrization, root: Float[Array, "d d"], theta: PyTree
 ) -> tuple[PyTree, Float[Array, ""]]:
-    """A Gaussian step in unconstrained coordinates, and the change of the log volume that they stretch."""
-    z = parametrization.unconstrain(theta)
+    """A Gaussian step in unconstrained coordinates, and the change of the log volume that they stretch.
+
+    The coordinates are about the origin of `parametrization`, except that fixed values are those of `theta`.
+    """
+    leaves, structure = jax.tree.flatten(theta)
+    triples = zip(parametrization.constraints, leaves, parametrization.leaves, strict=True)
+    origin = [leaf if isinstance(constraint, Fixed) else about for constraint, leaf, about in triples]
+    chart = Parametrization(jax.tree.unflatten(structure, origin), parametrization.constraints)
+    z = chart.unconstrain(theta)
     new = z + jnp.matmul(root, jax.random.normal(key, z.shape, z.dtype), precision="highest")
-    change = parametrization.log_volume(new) - parametrization.log_volume(z)
-    return parametrization.constrain(new), change
+    proposed = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), chart.constrain(new), theta)
+    return proposed, chart.log_volume(new) - chart.log_volume(z)

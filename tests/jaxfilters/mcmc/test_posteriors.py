@@ -21,6 +21,7 @@ PRIOR_MEAN, PRIOR_SD = -0.3, 0.7
 YS = jnp.array([0.3, -0.9, -1.4, 0.8])
 GRID = np.exp(np.linspace(PRIOR_MEAN - 7 * PRIOR_SD, PRIOR_MEAN + 7 * PRIOR_SD, 400))
 normal = jax.scipy.stats.norm.logpdf
+KEY = jax.random.key(0)
 
 
 def log_evidence_of_textbook(q, ys):
@@ -224,3 +225,29 @@ def test_a_chain_continues_where_it_stopped_and_warm_up_reaches_its_acceptance_r
     draws = [jf.mcmc.sample(jax.random.key(3), sampler, start, 200)[1] for start in (state, stored)]
     np.testing.assert_array_equal(draws[0].theta["q"], draws[1].theta["q"])
     assert abs(np.mean(draws[0].info.acceptance_probability) - 0.4) < 0.05
+
+
+@pytest.mark.system
+def test_fixed_parameters_keep_their_draw_and_float64_stays_float64(x64):
+    """A mixture over two fixed values: the share of the one that explains the reading is that of Bayes' rule.
+
+    Of 4000 particles, at four standard errors of a binomial with a quarter of them effective.
+    """
+
+    def sample(key):
+        mean_key, model_key = jax.random.split(key)
+        return {"mean": jax.random.normal(mean_key), "model": jnp.where(jax.random.bernoulli(model_key), 1, 3)}
+
+    found = jf.mcmc.tempered_smc(
+        KEY, sample, lambda theta: normal(theta["mean"]), lambda theta: normal(1.0, theta["mean"], theta["model"]),
+        num_particles=4000, num_moves=3, constraints={"mean": jf.fit.free, "model": jf.fit.fixed},
+    )  # fmt: skip
+    evidences = stats.norm.pdf(1.0, 0.0, np.sqrt(1 + np.array([1.0, 3.0]) ** 2))
+    share = evidences[0] / evidences.sum()
+    assert abs(np.mean(found.theta["model"] == 1) - share) < 4 * np.sqrt(share * (1 - share) / 1000)
+    np.testing.assert_allclose(found.log_evidence, np.log(evidences.mean()), atol=4 / np.sqrt(1000))
+    assert (found.theta["mean"].dtype, found.log_evidence.dtype) == (jnp.float64, jnp.float64)
+    sampler = jf.mcmc.pmmh(lambda key, theta: normal(1.0, theta), normal)
+    state, draws = jf.mcmc.sample(KEY, sampler, jf.mcmc.init(KEY, sampler, np.zeros(2, np.float32)), 3)
+    assert draws.theta.dtype == jnp.float32
+    assert state.point.log_likelihood.dtype == jnp.float64
