@@ -1,6 +1,7 @@
 from . import fit as fit
 from . import hmm as hmm
 from . import math as math
+from . import mcmc as mcmc
 from . import noise as noise
 from . import optimize as optimize
 from . import priors as priors

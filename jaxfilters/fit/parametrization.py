@@ -11,6 +11,9 @@ from jaxtyping import Array, Float, PyTree
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.constraints import Box, Constraint, Fixed, Interval, coordinate_bounds
 
+_SAME_COORDINATES = 1e-2
+"""Relative difference below which coordinates count as equal; another turn of a rotation differs by far more."""
+
 
 @pytree_dataclass
 class Parametrization:
@@ -34,6 +37,21 @@ class Parametrization:
             values.append(constraint.constrain(z[start:stop].reshape(shape), origin))
             start = stop
         return jax.tree.unflatten(jax.tree.structure(self.origin), values)
+
+    def log_volume(self, z: Float[Array, " d"]) -> Float[Array, ""]:
+        """Logarithm of the factor by which `constrain` stretches volume about z: the log Jacobian of a density.
+
+        Up to a constant, for sets with fewer dimensions than numbers (probabilities, symmetric matrices, quaternions)
+        the volume is that of the set itself. It is `-inf` where coordinates do not belong to one value only: rotation
+        vectors longer than half a turn.
+        """
+        total, start = jnp.zeros((), z.dtype), 0
+        for constraint, shape, origin in zip(self.constraints, self.shapes, self.leaves, strict=True):
+            stop = start + math.prod(shape)
+            if stop > start:
+                total = total + _log_volume(constraint, z[start:stop].reshape(shape), origin)
+            start = stop
+        return total
 
     def bounds(self) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
         """Lower and upper bounds of the coordinates; infinite except for boxes."""
@@ -59,6 +77,20 @@ class Parametrization:
         """The name of the leaf to which each coordinate belongs."""
         counts = [math.prod(shape) for shape in self.shapes]
         return [name for name, count in zip(leaf_names(self.origin), counts, strict=True) for _ in range(count)]
+
+
+def _log_volume(constraint: Constraint, coordinates: Array, origin: Array) -> Float[Array, ""]:
+    def constrain(coordinates: Array) -> Array:
+        return constraint.constrain(coordinates, origin)
+
+    if constraint.elementwise:
+        _, slope = jax.jvp(constrain, (coordinates,), (jnp.ones_like(coordinates),))
+        return jnp.sum(jnp.log(slope))
+    J = jax.jacfwd(lambda flat: constrain(flat.reshape(coordinates.shape)).ravel())(coordinates.ravel())
+    _, log_gram = jnp.linalg.slogdet(jnp.matmul(J.T, J, precision="highest"))
+    again = constraint.unconstrain(constrain(coordinates), origin)
+    apart = jnp.max(jnp.abs(again - coordinates) / (1 + jnp.abs(coordinates)))
+    return jnp.where(apart < _SAME_COORDINATES, 0.5 * log_gram, -jnp.inf)
 
 
 def parametrize(start: PyTree, constraints: PyTree) -> Parametrization:

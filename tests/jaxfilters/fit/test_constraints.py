@@ -70,3 +70,34 @@ def test_constraints_that_do_not_fit_are_rejected():
         parametrize({"a": 1.0}, {"a": 3})
     with pytest.raises(ValueError, match="finite bounds"):
         fit.interval(1, 1)
+
+
+VOLUMES = {
+    "positive": (fit.positive, jnp.array([0.5, 3.0]), lambda v: np.log(v).sum()),
+    "interval": (fit.interval(-1.0, 2.0), jnp.array([0.4]), lambda v: np.log((v + 1) * (2 - v) / 3).sum()),
+    "simplex": (fit.simplex, jnp.array([0.2, 0.5, 0.3]), lambda v: np.log(v).sum()),
+    "spd": (
+        fit.spd,
+        jnp.array([[2.0, 0.3], [0.3, 0.5]]),
+        # Of the lower triangle with respect to the factor L, 2^n prod L_ii^(n - i + 1), and of L_ii to its logarithm.
+        lambda v: np.log(np.diag(np.linalg.cholesky(v))) @ [3.0, 2.0],
+    ),
+    "rotation": (fit.rotation, None, lambda angle: np.log((2 - 2 * np.cos(angle)) / angle**2)),
+}
+"""Log volumes in closed form, up to a constant: the densities that change variables in textbooks."""
+
+
+@pytest.mark.parametrize("name", VOLUMES)
+def test_the_log_volume_of_coordinates_is_that_of_textbooks(name):
+    constraint, value, expected = VOLUMES[name]
+    if name == "rotation":
+        chart = parametrize(jnp.array([1.0, 0.0, 0.0, 0.0]), constraint)
+        coordinates, arguments = [jnp.array([0.0, 0.4, 0.3]), jnp.array([1.0, 2.0, 0.5])], [0.5, np.sqrt(5.25)]
+        assert chart.log_volume(jnp.array([0.0, 4.0, 0.0])) == -jnp.inf
+    else:
+        chart, arguments = parametrize(value, constraint), [np.asarray(value, float)]
+        z = chart.unconstrain(value)
+        coordinates = [z, z + 0.3 * jnp.arange(1.0, z.size + 1)]
+        arguments.append(np.asarray(chart.constrain(coordinates[1]), float))
+    difference = chart.log_volume(coordinates[1]) - chart.log_volume(coordinates[0])
+    np.testing.assert_allclose(difference, expected(arguments[1]) - expected(arguments[0]), atol=1e-4)
