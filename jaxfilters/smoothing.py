@@ -10,6 +10,8 @@ from jaxfilters.gaussian.parallel_in_time import LinearModel as LinearModel
 from jaxfilters.gaussian.parallel_in_time import parallel_kalman as parallel_kalman
 from jaxfilters.gaussian.parallel_in_time import parallel_rts as parallel_rts
 from jaxfilters.gaussian.smoothing import filter_and_smooth as filter_and_smooth
+from jaxfilters.gaussian.smoothing import lag_one_covariances as lag_one_covariances
+from jaxfilters.gaussian.smoothing import posterior_samples as posterior_samples
 from jaxfilters.gaussian.smoothing import rts as rts
 from jaxfilters.particle.fixed_lag import fixed_lag as fixed_lag
 from jaxfilters.particle.fixed_lag import fixed_lag_rts as fixed_lag_rts
