@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 from jaxfilters.filter import Filter, keep_all, run
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import factor
-from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.linearize import lower_root
 from jaxfilters.gaussian.manifold import Belief, dimension, increments, retract_belief, to_tangent
 from jaxfilters.gaussian.model import GaussianModel, model_of
@@ -189,10 +189,41 @@ def reverse_transition(model: GaussianModel, belief: Belief, control: PyTree) ->
 
 
 @jax.jit
+def smoothed_pairs(filter: Filter, beliefs: Belief, controls: PyTree) -> tuple[Array, Array, Array]:
+    """Moments of all states, the one before the first observation among them, given the whole sequence.
+
+    The states are vectors. Returns the means (t + 1, n), the covariances (t + 1, n, n), and the covariances of
+    neighbours (t, n, n), whatever the arithmetic.
+    """
+    model = model_of(filter, "filter")
+    prior = model.prior
+    if isinstance(prior, GaussianRoot):
+        prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
+    earlier = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), prior, beliefs)
+
+    def step(following: tuple[Array, Array], inputs: tuple) -> tuple[tuple, tuple]:
+        (mean, P), (belief, control) = following, inputs
+        origin, gain, rest = reverse_transition(model, belief, control)
+        cross = linalg.matmul(gain, P)
+        smoothed = belief.mean + rest.mean + factor.apply(gain, mean - origin)
+        covariance = factor.outer(cross, gain) + _covariance(rest)
+        return (smoothed, covariance), (smoothed, covariance, cross)
+
+    last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
+    end = last.mean, _covariance(last)
+    _, (means, covariances, cross) = jax.lax.scan(step, end, (earlier, controls), reverse=True)
+    return jnp.concatenate([means, end[0][None]]), jnp.concatenate([covariances, end[1][None]]), cross
+
+
+def _covariance(belief: Belief) -> Array:
+    return belief.covariance if isinstance(belief, Gaussian) else factor.outer(belief.root, belief.root)
+
+
+@jax.jit
 def _lag_one(model: GaussianModel, beliefs: Belief, smoothed: Belief, controls: PyTree) -> Array:
     def one(belief: Belief, control: PyTree, here: Belief, following: Belief) -> Array:
         origin, gain, _ = reverse_transition(model, belief, control)
-        P = following.covariance if isinstance(following, Gaussian) else factor.outer(following.root, following.root)
+        P = _covariance(following)
         if model.manifold.flat:
             return linalg.matmul(gain, P)
         manifold, zero = model.manifold, jnp.zeros(dimension(following), P.dtype)
