@@ -6,6 +6,10 @@
 | particles | `trajectories`, `backward_sampling` | `fixed_lag` |
 """
 
+from jaxfilters.gaussian.affine import parallel as parallel
+from jaxfilters.gaussian.affine import sequential as sequential
+from jaxfilters.gaussian.iterated_smoothing import IterationInfo as IterationInfo
+from jaxfilters.gaussian.iterated_smoothing import iterated as iterated
 from jaxfilters.gaussian.parallel_in_time import LinearModel as LinearModel
 from jaxfilters.gaussian.parallel_in_time import parallel_kalman as parallel_kalman
 from jaxfilters.gaussian.parallel_in_time import parallel_rts as parallel_rts
@@ -13,6 +17,7 @@ from jaxfilters.gaussian.smoothing import filter_and_smooth as filter_and_smooth
 from jaxfilters.gaussian.smoothing import lag_one_covariances as lag_one_covariances
 from jaxfilters.gaussian.smoothing import posterior_samples as posterior_samples
 from jaxfilters.gaussian.smoothing import rts as rts
+from jaxfilters.gaussian.two_filter import two_filter as two_filter
 from jaxfilters.particle.fixed_lag import fixed_lag as fixed_lag
 from jaxfilters.particle.fixed_lag import fixed_lag_rts as fixed_lag_rts
 from jaxfilters.particle.smoothing import History as History

@@ -10,6 +10,7 @@ from jaxfilters.gaussian.extended import Observation, extended_kalman
 from jaxfilters.gaussian.linearize import cubature, taylor
 from jaxfilters.gaussian.manifold import Manifold, add, displacement
 from jaxfilters.gaussian.smoothing import filter_and_smooth, lag_one_covariances, posterior_samples, rts
+from jaxfilters.gaussian.two_filter import two_filter
 from jaxfilters.particle.bootstrap import bootstrap
 
 RNG = np.random.default_rng(11)
@@ -118,6 +119,19 @@ def test_samples_and_neighbours_are_those_of_the_joint_gaussian(x64, arithmetic,
     assert abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(count)
     errors = np.sqrt((1 + np.eye(T * N)) / count)
     assert (abs(white @ white.T / count - np.eye(T * N)) / errors).max() < 4.5
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["joseph", "square_root"])
+def test_a_filter_from_each_side_finds_the_joint_gaussian(x64, name):
+    filter, controls = build(getattr(arithmetics, name)), jnp.arange(1.0, T + 1)
+    means, posterior, _ = joint_posterior()
+    ys, mask = Observation(jnp.where(SEEN, YS, jnp.nan), jnp.asarray(SEEN)), jnp.arange(T) != 3
+    _, (beliefs, _) = run(filter, KEY, ys, controls, mask=mask)
+    found = two_filter(filter, beliefs, ys, controls, mask=mask)
+    np.testing.assert_allclose(found.mean, means, atol=1e-9)
+    P = found.covariance if isinstance(found, Gaussian) else found.root @ found.root.transpose(0, 2, 1)
+    np.testing.assert_allclose(P, blocks_of(posterior, 0), atol=1e-9)
 
 
 def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
