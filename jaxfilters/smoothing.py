@@ -20,6 +20,8 @@ from jaxfilters.gaussian.smoothing import rts as rts
 from jaxfilters.gaussian.two_filter import two_filter as two_filter
 from jaxfilters.particle.fixed_lag import fixed_lag as fixed_lag
 from jaxfilters.particle.fixed_lag import fixed_lag_rts as fixed_lag_rts
+from jaxfilters.particle.paris import ParisState as ParisState
+from jaxfilters.particle.paris import paris as paris
 from jaxfilters.particle.smoothing import History as History
 from jaxfilters.particle.smoothing import backward_sampling as backward_sampling
 from jaxfilters.particle.smoothing import keep_history as keep_history
