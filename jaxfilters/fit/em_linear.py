@@ -1,6 +1,7 @@
 """Expectation-maximisation of linear Gaussian models: the M-step in closed form."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,15 +36,29 @@ def maximized(filter: Filter, found: Moments, free: tuple[str, ...], is_partial:
         free: Names of `LINEAR`.
         is_partial: Whether some frames were read in part.
     """
-    model = filter.params
-    transitions = _transitions(found)
-    F, b = regression(transitions, model.F, model.b, ("F" in free, "b" in free))
-    observations = _observations(model, found, is_partial)
-    H, d = regression(observations, model.H, model.d, ("H" in free, "d" in free))
-    Q = from_covariance(model.prior, residual_covariance(transitions, F, b)) if "Q" in free else model.Q
-    R = from_covariance(model.prior, residual_covariance(observations, H, d)) if "R" in free else model.R
-    prior = start(model.prior, found, free)
-    return replace(filter, params=replace(model, prior=prior, F=F, Q=Q, H=H, R=R, b=b, d=d))
+    model, change = filter.params, {}
+    if {"F", "Q", "b"} & set(free):
+        pairs, b = _transitions(found), _vectors(model.b, found)
+        F, b = regression(pairs, model.F, b, ("F" in free, "b" in free))
+        change |= {"F": F, "b": b, "Q": lambda: residual_covariance(pairs, F, b)}
+    if {"H", "R", "d"} & set(free):
+        readings, d = _observations(model, found, is_partial), _vectors(model.d, found)
+        H, d = regression(readings, model.H, d, ("H" in free, "d" in free))
+        change |= {"H": H, "d": d, "R": lambda: residual_covariance(readings, H, d)}
+    change = {name: value for name, value in change.items() if name in free}
+    for name in {"Q", "R"} & set(change):
+        change[name] = from_covariance(model.prior, change[name]())
+    return replace(filter, params=replace(model, prior=start(model.prior, found, free), **change))
+
+
+def estimable(model: Kalman) -> tuple[str, ...]:
+    """The names of `LINEAR` that can be estimated: not what is a function of the inputs, nor what that determines."""
+    names = {"mean", "covariance"}
+    for matrix, noise, vector in (("F", "Q", "b"), ("H", "R", "d")):
+        if not callable(getattr(model, matrix)) and not callable(getattr(model, noise)):
+            value = getattr(model, vector)
+            names |= {matrix, noise} | (set() if value is None or callable(value) else {vector})
+    return tuple(name for name in LINEAR if name in names)
 
 
 def start(prior: Belief, found: Moments, free: tuple[str, ...]) -> Belief:
@@ -64,6 +79,11 @@ def as_covariance(prior: Belief, noise: Array) -> Array:
     return noise if isinstance(prior, Gaussian) else factor.outer(noise, noise)
 
 
+def _vectors(value: Any, found: Moments) -> Array | None:
+    """A vector of the model, or that of each frame, (f, n), where it is a function of the inputs."""
+    return jax.vmap(value)(jax.tree.map(_flat, found.inputs)) if callable(value) else value
+
+
 def _transitions(found: Moments) -> Pairs:
     weight = found.inside.ravel().astype(found.mean.dtype)
     total = lambda each: jnp.tensordot(weight, _flat(each), axes=1)
@@ -78,22 +98,23 @@ def _observations(model: Kalman, found: Moments, is_partial: bool) -> Pairs:
     covariance, (k, n) = jnp.tensordot(weight, P, axes=1), model.H.shape
     if not is_partial:
         return Pairs(weight, x, y, covariance, jnp.zeros((k, n), x.dtype), jnp.zeros((k, k), x.dtype))
-    full = _imputed(model, y, read)
+    full = _imputed(model, found, y, read)
     target = full.g + jnp.einsum("fkn,fn->fk", full.G, x, precision="highest")
     cross = jnp.einsum("f,fkn,fnm->fkm", weight, full.G, P, precision="highest")
     spread = jnp.einsum("fkn,fln->kl", cross, full.G, precision="highest") + jnp.tensordot(weight, full.C, axes=1)
     return Pairs(weight, x, target, covariance, cross.sum(axis=0), spread)
 
 
-def _imputed(model: Kalman, y: Array, read: Array) -> Imputed:
-    R, d = as_covariance(model.prior, model.R), jnp.zeros(model.H.shape[0]) if model.d is None else model.d
+def _imputed(model: Kalman, found: Moments, y: Array, read: Array) -> Imputed:
+    R, d = as_covariance(model.prior, model.R), _vectors(model.d, found)
+    d = jnp.broadcast_to(jnp.zeros((), y.dtype) if d is None else d, y.shape)
 
-    def one(y: Array, read: Array) -> Imputed:
+    def one(y: Array, read: Array, d: Array) -> Imputed:
         A, C = imputation(R, read)
         rest = jnp.eye(len(y), dtype=y.dtype) - A
         return Imputed(factor.apply(A, y) + factor.apply(rest, d), linalg.matmul(rest, model.H), C)
 
-    return jax.vmap(one)(y, read)
+    return jax.vmap(one)(y, read, d)
 
 
 def _flat(array: Array) -> Array:

@@ -18,11 +18,27 @@ from jaxfilters.filter import Filter
 from jaxfilters.fit.em_linear import as_covariance, from_covariance, start
 from jaxfilters.fit.em_moments import Moments, imputation
 from jaxfilters.gaussian.arithmetic import factor
+from jaxfilters.gaussian.extended import ExtendedKalman
+from jaxfilters.gaussian.noise_models import NonAdditiveNoise, StateNoise
 from jaxfilters.math import linalg
 
 NONLINEAR = ("transition", "process_noise", "observe", "observation_noise", "mean", "covariance")
 """What can be estimated of a nonlinear model."""
 _HALVINGS = 5
+
+
+def estimable(model: ExtendedKalman) -> tuple[str, ...]:
+    """The names of `NONLINEAR` that can be estimated: noises that are matrices and additive, functions with arrays."""
+    names = {"mean", "covariance"}
+    for function, noise in (("transition", "process_noise"), ("observe", "observation_noise")):
+        callback, matrix = getattr(model, function), getattr(model, noise)
+        if isinstance(callback, NonAdditiveNoise) or isinstance(matrix, StateNoise):
+            continue
+        if not callable(matrix):
+            names.add(noise)
+        if jax.tree.leaves(callback) and (not callable(matrix) or function == "transition"):
+            names.add(function)
+    return tuple(name for name in NONLINEAR if name in names)
 
 
 def maximized(filter: Filter, found: Moments, free: tuple[str, ...], is_partial: bool) -> Filter:
@@ -82,11 +98,11 @@ def _observation_step(model, found, free):
     A, C = jax.vmap(imputation, in_axes=(None, 0))(R, read)
 
     def residual(observe: Callable, x: Array, data: tuple) -> Array:
-        y, read, A = data
-        y_hat = observe(x)
+        y, read, A, inputs = data
+        y_hat = observe(x, inputs)
         return factor.apply(A, jnp.where(read, model.residual(jnp.where(read, y, y_hat), y_hat), 0.0))
 
-    observe, data = model.observe, (y, read, A)
+    observe, data = model.observe, (y, read, A, jax.tree.map(_flat, found.inputs))
     if "observe" in free:
         among = jnp.where(read[:, :, None] & read[:, None], R, 0.0)
         observe = _improved(observe, residual, points, data, jax.vmap(factor.root)(among), weight)
@@ -133,7 +149,7 @@ def _process_noises(model, inputs, count):
     if not callable(model.process_noise):
         noise = as_covariance(model.prior, model.process_noise)
         return jnp.broadcast_to(noise, (count, *noise.shape))
-    return jax.vmap(lambda u: as_covariance(model.prior, model.process_noise_of(u)))(inputs)
+    return jax.vmap(lambda u: as_covariance(model.prior, model.process_noise_of(model.prior, u)))(inputs)
 
 
 def _neighbours(found):

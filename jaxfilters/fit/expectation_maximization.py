@@ -69,7 +69,8 @@ def em(
         lengths: Number of frames of each sequence, (s,); `None` is t for all.
         mask: False for frames without an observation, (t, s).
         free: Names of what is estimated. Of `kalman`: "F", "Q", "H", "R", "b", "d", and "mean" and "covariance" of the
-            prior; all that the filter has by default. Of a nonlinear filter: "process_noise", "observation_noise",
+            prior; all that the filter has by default, but for functions of the inputs and the noise beside a matrix
+            that is one. Of a nonlinear filter: "process_noise", "observation_noise",
             "mean" and "covariance", the default; and "transition" and "observe", whose parameters are the arrays in
             these functions, which are then pytrees (e.g. `jax.tree_util.Partial`) and share no parameter: exactly where
             the result is linear in them, else by one damped Gauss-Newton step an iteration. One sequence cannot
@@ -105,9 +106,6 @@ def em(
     checks.is_filter("model", model)
     free = _free(model, free)
     y, inside, is_partial = _data(observations, inputs, lengths, mask)
-    size = model.params.observation_noise.shape[0]
-    if y.shape[1] != size:
-        raise ValueError(f"observations must be (t, m, s) with the {size} components of the noise; got {y.shape}.")
     y = y.astype(model.params.prior.mean.dtype)
     return _em(_with_square_roots(model), key, y, inputs, inside, free, is_partial, max_iterations, tolerance)
 
@@ -138,7 +136,7 @@ def _with_square_roots(filter: Filter) -> Filter:
         return filter
     names = ("Q", "R") if isinstance(model, Kalman) else ("process_noise", "observation_noise")
     noises = {name: getattr(model, name) for name in names}
-    square = {name: noise if callable(noise) else linalg.tria(noise) for name, noise in noises.items()}
+    square = {name: linalg.tria(noise) for name, noise in noises.items() if hasattr(noise, "shape")}
     prior = GaussianRoot(model.prior.mean, linalg.tria(model.prior.root))
     return replace(filter, params=replace(model, prior=prior, **square))
 
@@ -147,18 +145,13 @@ def _free(filter: Filter, free: tuple[str, ...] | None) -> tuple[str, ...]:
     """The names of the parameters to be estimated, checked."""
     model = filter.params
     if isinstance(model, Kalman):
-        known = tuple(name for name in em_linear.LINEAR if getattr(model, name, 0) is not None)
+        known = em_linear.estimable(model)
         chosen = known if free is None else free
     elif isinstance(model, ExtendedKalman):
         if not model.manifold.flat:
             raise ValueError("model must have vectors for states; expectation-maximisation is not for manifolds.")
-        known = em_nonlinear.NONLINEAR
-        chosen = ("process_noise", "observation_noise", "mean", "covariance") if free is None else free
-        if "process_noise" in chosen and callable(model.process_noise):
-            raise ValueError('free must not hold "process_noise" where it is a function; pass it as a matrix.')
-        for name in ("transition", "observe"):
-            if name in chosen and not jax.tree.leaves(getattr(model, name)):
-                raise ValueError(f'free holds "{name}", a function without arrays: make it a pytree of its parameters.')
+        known = em_nonlinear.estimable(model)
+        chosen = tuple(name for name in known if name not in ("transition", "observe")) if free is None else free
     else:
         raise ValueError(
             f"model must be made by kalman, extended_kalman, unscented_kalman or cubature_kalman, or be a "
@@ -166,7 +159,7 @@ def _free(filter: Filter, free: tuple[str, ...] | None) -> tuple[str, ...]:
         )
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen or isinstance(free, str):
-        raise ValueError(f"free must be a tuple of names among {known}; got {free!r}.")
+        raise ValueError(f"free must be a tuple of names that can be estimated of this model, {known}; got {free!r}.")
     return tuple(chosen)
 
 

@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import Arithmetic, factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.extended import as_observation
 from jaxfilters.gaussian.linear import Kalman
 from jaxfilters.gaussian.linearize import lower_root
 from jaxfilters.gaussian.manifold import Belief
+from jaxfilters.gaussian.noise_models import Augmented, NonAdditiveNoise, no_noise
 from jaxfilters.gaussian.parallel_in_time import LinearModel, parallel_kalman, parallel_rts
 from jaxfilters.math import linalg
 
@@ -62,36 +64,57 @@ def affine_model(
     """
     earlier, here = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory) for cut in (slice(-1), slice(1, None)))
 
-    def one(before: Belief, here: Belief, observation: PyTree, control: PyTree, is_observed: Array | None):
-        y, read, R = read_components(model, observation)
+    def one(before: Belief, here: Belief, observation: PyTree, inputs: PyTree, is_observed: Array | None):
+        y, read, own_noise = read_components(observation)
         read = read if is_observed is None else read & is_observed
-        ahead, step = model.linear_transition(before, control)
+        ahead, step = model.linear_transition(before, inputs)
         b = ahead + step.value - factor.apply(step.F, before.mean)
-        H, d, added, difference = linear_observation(model, here, jnp.where(read, y, 0.0))
-        Q = model.process_noise_of(control)
-        return AffineModel(step.F, b, Q, step.residual_root, H, d, R, added, difference, read)
+        Q = model.process_noise_of(before, inputs)
+        seen = linear_observation(model, here, jnp.where(read, y, 0.0), own_noise, inputs)
+        return AffineModel(step.F, b, Q, step.residual_root, *seen, read)
 
     return jax.vmap(one)(earlier, here, observations, inputs, mask)
 
 
-def read_components(model: Any, observation: PyTree) -> tuple[Array, Array, Array]:
-    """Observation, 0 where nothing was read, which components were read, and the noise that holds for it."""
+class AffineObservation(NamedTuple):
+    """One observation as an affine function of the state; fields as of `AffineModel`."""
+
+    H: Float[Array, "m n"]
+    d: Float[Array, " m"]
+    R: Float[Array, "m _"]
+    added_R: Float[Array, "m _"]
+    y: Float[Array, " m"]
+
+
+def read_components(observation: PyTree) -> tuple[Array, Array, Array | None]:
+    """An observation, 0 where nothing was read; which components were read; and the noise of its own, if any."""
     y, mask, own_noise = as_observation(observation)
     read = jnp.isfinite(y) if mask is None else jnp.isfinite(y) & mask
-    return jnp.where(read, y, 0.0), read, model.observation_noise if own_noise is None else own_noise
+    return jnp.where(read, y, 0.0), read, own_noise
 
 
-def linear_observation(model: Any, belief: Belief, y: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
-    """The observation as an affine function over a belief: H, d, the root of its error; and y as it compares with it.
+def linear_observation(
+    model: Any, belief: Belief, y: Float[Array, " m"], own_noise: Array | None, inputs: PyTree
+) -> AffineObservation:
+    """An observation as an affine function over a belief.
 
-    Residuals that are no differences, as of angles, are linearised from the predicted observation.
+    Residuals that are no differences, as of angles, are linearised from the predicted observation; y is then the
+    residual, too.
     """
+    R = model.observation_noise_of(belief, inputs) if own_noise is None else own_noise
     if isinstance(model, Kalman):
-        d = jnp.zeros_like(y) if model.d is None else model.d
-        return model.H, d, jnp.zeros((y.size, 0), y.dtype), y
-    reference = model.observe(belief.mean)
-    found = model.linearize(lambda x: model.residual(model.observe(x), reference), belief)
-    return found.F, found.value - factor.apply(found.F, belief.mean), found.residual_root, model.residual(y, reference)
+        step = model.matrices(inputs)
+        d = jnp.zeros_like(y) if step.d is None else step.d
+        return AffineObservation(step.H, d, R, jnp.zeros((y.size, 0), y.dtype), y)
+    observe, linearize = lambda x: model.observe(x, inputs), model.linearize
+    if isinstance(model.observe, NonAdditiveNoise):
+        observe, linearize = model.observe.at(inputs, R.shape[0], y.dtype), Augmented(R, linearize)
+        R = no_noise(belief, y.size)
+    is_root = isinstance(belief, GaussianRoot)
+    reference = checks.predicted(observe(belief.mean), y, "observation_noise", R, is_root=is_root)
+    found = linearize(lambda x, *r: model.residual(observe(x, *r), reference), belief)
+    d = found.value - factor.apply(found.F, belief.mean)
+    return AffineObservation(found.F, d, R, found.residual_root, model.residual(y, reference))
 
 
 def sequential(prior: Belief, model: AffineModel, arithmetic: Arithmetic) -> tuple[Belief, Array]:

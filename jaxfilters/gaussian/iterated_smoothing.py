@@ -97,7 +97,7 @@ def iterated(
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
         >>> distance = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
-        >>> filter = jf.extended_kalman(prior, lambda x, u: x, 0.1 * jnp.eye(2), distance, 0.01 * jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(2), distance, 0.01 * jnp.eye(1))
         >>> smoothed, info = jf.smoothing.iterated(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)), iterations=5)
         >>> smoothed.mean.shape, bool((info.reached <= info.cost).all())
         ((10, 2), True)
@@ -152,12 +152,12 @@ def _iterated(
 
 def _with_first(model: ExtendedKalman, start: Belief, inputs: PyTree) -> Belief:
     """The beliefs with that of the state before the first observation."""
-    first, control = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (start, inputs))
+    first, inputs = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (start, inputs))
     prior = model.prior
     if isinstance(prior, GaussianRoot):
         prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
         start = GaussianRoot(start.mean, jax.vmap(linalg.tria)(start.root))
-    origin, gain, rest = reverse_transition(model, prior, control)
+    origin, gain, rest = reverse_transition(model, prior, inputs)
     before = replace(prior, mean=prior.mean + rest.mean + factor.apply(gain, first.mean - origin))
     return jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), before, start)
 
@@ -168,11 +168,12 @@ def _cost(model: ExtendedKalman, trajectory: Belief, affine: AffineModel, observ
     root_P = lower_root(model.prior)
     root_Q, root_R = noise_root(affine.Q, None, affine.added_Q), noise_root(affine.R, affine.read, affine.added_R)
 
-    def one(before: Belief, here: Belief, observation: PyTree, control: PyTree, read: Array, roots: tuple) -> Array:
-        ahead, step = model.linear_transition(before, control)
+    def one(before: Belief, here: Belief, observation: PyTree, inputs: PyTree, read: Array, roots: tuple) -> Array:
+        ahead, step = model.linear_transition(before, inputs)
         surprise = linalg.solve_triangular(roots[0], here.mean - ahead - step.value)
-        H, d, _, difference = linear_observation(model, here, read_components(model, observation)[0])
-        residual = jnp.where(read, difference - factor.apply(H, here.mean) - d, 0.0)
+        y, _, own_noise = read_components(observation)
+        linear = linear_observation(model, here, jnp.where(read, y, 0.0), own_noise, inputs)
+        residual = jnp.where(read, linear.y - factor.apply(linear.H, here.mean) - linear.d, 0.0)
         return jnp.sum(surprise**2) + jnp.sum(linalg.solve_triangular(roots[1], residual) ** 2)
 
     def cost(means: Array) -> Array:

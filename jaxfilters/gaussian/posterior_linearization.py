@@ -48,7 +48,7 @@ def posterior_linearization(inner: Filter, iterations: int = 5) -> Filter:
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
         >>> distance = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
-        >>> inner = jf.cubature_kalman(prior, lambda x, u: x, 0.1 * jnp.eye(2), distance, 1e-4 * jnp.eye(1))
+        >>> inner = jf.cubature_kalman(prior, lambda x: x, 0.1 * jnp.eye(2), distance, 1e-4 * jnp.eye(1))
         >>> last, _ = jf.run(jf.posterior_linearization(inner), jax.random.key(0), 5.0 * jnp.ones((10, 1)))
         >>> last.mean.shape
         (2,)
@@ -63,27 +63,30 @@ def posterior_linearization(inner: Filter, iterations: int = 5) -> Filter:
     return Filter(replace(inner.params, iterations=iterations), inner.init, inner.predict, _update)
 
 
-def _update(model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
+def _update(
+    model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree, inputs: PyTree
+) -> tuple[Belief, KalmanInfo]:
     del key
     checks.state(belief, model.prior)
-    y, read, R = read_components(model, observation)
+    y, read, own_noise = read_components(observation)
     root_P = lower_root(belief)
 
     def improve(at: Belief, _: None) -> tuple[Belief, KalmanInfo]:
-        H, d, added, difference = linear_observation(model, at, y)
-        y_hat = factor.apply(H, belief.mean) + d
-        target, report = model.arithmetic.update(belief, difference, H, R, y_hat, read, added)
-        root_R = model.arithmetic.noise_root(R, read, added)
+        linear = linear_observation(model, at, y, own_noise, inputs)
+        y_hat = factor.apply(linear.H, belief.mean) + linear.d
+        target, report = model.arithmetic.update(belief, linear.y, linear.H, linear.R, y_hat, read, linear.added_R)
+        root_R = model.arithmetic.noise_root(linear.R, read, linear.added_R)
 
         def cost(length: Array) -> Array:
             here = replace(at, mean=at.mean + length * (target.mean - at.mean))
-            H, d, _, difference = linear_observation(model, here, y)
-            residual = jnp.where(read, difference - factor.apply(H, here.mean) - d, 0.0)
+            linear = linear_observation(model, here, y, own_noise, inputs)
+            residual = jnp.where(read, linear.y - factor.apply(linear.H, here.mean) - linear.d, 0.0)
             away = linalg.solve_triangular(root_P, here.mean - belief.mean)
             return 0.5 * (jnp.sum(away**2) + jnp.sum(linalg.solve_triangular(root_R, residual) ** 2))
 
         lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=y.dtype), 0.0)
         costs = jax.lax.map(cost, lengths)
+        # The first that does not raise the cost; none where the cost is not a number.
         length = lengths[jnp.argmax((costs <= costs[-1]).at[-1].set(True))]
         moved = jnp.where(length > 0, at.mean + length * (target.mean - at.mean), at.mean)
         return replace(target, mean=moved), report

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from jaxfilters._renamed import takes_inputs
 from jaxfilters.filter import Filter, keep_all, run
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import factor
@@ -21,8 +22,9 @@ from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, Mask
 
 
+@takes_inputs
 def filter_and_smooth(
-    filter: Filter, key: AnyKey, observations: PyTree, controls: PyTree = None, *, mask: Mask | None = None
+    filter: Filter, key: AnyKey, observations: PyTree, inputs: PyTree = None, *, mask: Mask | None = None
 ) -> tuple[Belief, PyTree]:
     """Smoothed beliefs given the whole sequence, time first, and the infos of the filter.
 
@@ -32,7 +34,7 @@ def filter_and_smooth(
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         key: Random key; the filter ignores it.
         observations: Observations, time first, as for `jf.run`.
-        controls: Known inputs, time first, or `None`.
+        inputs: Known inputs, time first, or `None`.
         mask: False for frames without an observation, (t,).
 
     Returns:
@@ -44,11 +46,12 @@ def filter_and_smooth(
     """
     checks.is_filter("filter", filter)
     model_of(filter, "filter")
-    _, (beliefs, infos) = run(filter, key, observations, controls, mask=mask, collect=keep_all)
-    return rts(filter, beliefs, controls), infos
+    _, (beliefs, infos) = run(filter, key, observations, inputs, mask=mask, collect=keep_all)
+    return rts(filter, beliefs, inputs), infos
 
 
-def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
+@takes_inputs
+def rts(filter: Filter, beliefs: Belief, inputs: PyTree = None) -> Belief:
     """Rauch-Tung-Striebel smoother: beliefs given the whole sequence, from those of the filter.
 
     Each belief is conditioned on the smoothed one of the next frame (S. Särkkä, "Bayesian Filtering and Smoothing",
@@ -59,13 +62,13 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         beliefs: The states that `jf.run` collects, time first, with leaves (t, n) and (t, d, d); or those of a wrapper
             of the filter, such as `constrained`.
-        controls: The controls of that run, time first.
+        inputs: The inputs of that run, time first.
 
     Returns:
         The smoothed beliefs, time first; the last is that of the filter.
 
     Raises:
-        ValueError: If `filter` is another kind of filter, `beliefs` have other shapes than its states, or `controls`
+        ValueError: If `filter` is another kind of filter, `beliefs` have other shapes than its states, or `inputs`
             another length than `beliefs`.
         TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
 
@@ -74,17 +77,17 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> filter = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
         >>> _, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)))
         >>> smoothed = jf.smoothing.rts(filter, beliefs)
         >>> bool((smoothed.covariance[:-1] < beliefs.covariance[:-1]).all())
         True
     """
-    model, _ = _checked(filter, beliefs, controls)
-    return _backward(model, beliefs, controls)
+    model, _ = _checked(filter, beliefs, inputs)
+    return _backward(model, beliefs, inputs)
 
 
-def lag_one_covariances(filter: Filter, beliefs: Belief, smoothed: Belief, controls: PyTree = None) -> Array:
+def lag_one_covariances(filter: Filter, beliefs: Belief, smoothed: Belief, inputs: PyTree = None) -> Array:
     r"""Covariances of neighbouring states given the whole sequence, Cov(x_t, x_t+1 | y_1:T).
 
     They are $G_t P_{t+1}$ with the smoother's gain $G_t$ and the smoothed covariance $P_{t+1}$ (S. Särkkä and
@@ -95,7 +98,7 @@ def lag_one_covariances(filter: Filter, beliefs: Belief, smoothed: Belief, contr
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         beliefs: The states that `jf.run` collects, time first.
         smoothed: What `rts` made of them.
-        controls: The controls of that run, time first.
+        inputs: The inputs of that run, time first.
 
     Returns:
         Covariances (t - 1, d, d), the earlier state along the rows, the later along the columns; on a manifold, of
@@ -115,14 +118,14 @@ def lag_one_covariances(filter: Filter, beliefs: Belief, smoothed: Belief, contr
         >>> jf.smoothing.lag_one_covariances(filter, beliefs, jf.smoothing.rts(filter, beliefs)).shape
         (4, 1, 1)
     """
-    model, length = _checked(filter, beliefs, controls)
+    model, length = _checked(filter, beliefs, inputs)
     if checks.beliefs("smoothed", smoothed, model.prior) != length:
         raise ValueError(f"smoothed must be as long as beliefs, {length}; got {smoothed.mean.shape[0]}.")
-    return _lag_one(model, beliefs, smoothed, controls)
+    return _lag_one(model, beliefs, smoothed, inputs)
 
 
 def posterior_samples(
-    filter: Filter, key: AnyKey, beliefs: Belief, controls: PyTree = None, *, num_samples: int
+    filter: Filter, key: AnyKey, beliefs: Belief, inputs: PyTree = None, *, num_samples: int
 ) -> Array:
     """Joint samples of all states given the whole sequence, by backward sampling.
 
@@ -136,7 +139,7 @@ def posterior_samples(
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         key: Random key.
         beliefs: The states that `jf.run` collects, time first.
-        controls: The controls of that run, time first.
+        inputs: The inputs of that run, time first.
         num_samples: Number of sampled sequences of states.
 
     Returns:
@@ -156,40 +159,40 @@ def posterior_samples(
         >>> jf.smoothing.posterior_samples(filter, jax.random.key(1), beliefs, num_samples=100).shape
         (5, 1, 100)
     """
-    model, _ = _checked(filter, beliefs, controls)
+    model, _ = _checked(filter, beliefs, inputs)
     checks.count("num_samples", num_samples)
-    return _sampled(model, key, beliefs, controls, num_samples)
+    return _sampled(model, key, beliefs, inputs, num_samples)
 
 
-def _checked(filter: Filter, beliefs: Belief, controls: PyTree) -> tuple[GaussianModel, int]:
+def _checked(filter: Filter, beliefs: Belief, inputs: PyTree) -> tuple[GaussianModel, int]:
     """The model of a filter, and the number of frames."""
     checks.is_filter("filter", filter)
     model = model_of(filter, "filter")
     length = checks.beliefs("beliefs", beliefs, model.prior)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(controls)}
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(inputs)}
     if not lengths <= {(length,)}:
-        raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
+        raise ValueError(f"inputs must be as long as beliefs, {length}; got {sorted(lengths)}.")
     return model, length
 
 
-def _pairs(beliefs: Belief, controls: PyTree) -> tuple[Belief, PyTree]:
-    """Every belief but the last, with the control of the step that follows it."""
-    return jax.tree.map(lambda leaf: leaf[:-1], beliefs), jax.tree.map(lambda leaf: leaf[1:], controls)
+def _pairs(beliefs: Belief, inputs: PyTree) -> tuple[Belief, PyTree]:
+    """Every belief but the last, with the inputs of the step that follows it."""
+    return jax.tree.map(lambda leaf: leaf[:-1], beliefs), jax.tree.map(lambda leaf: leaf[1:], inputs)
 
 
-def reverse_transition(model: GaussianModel, belief: Belief, control: PyTree) -> tuple[Array, Array, Belief]:
+def reverse_transition(model: GaussianModel, belief: Belief, inputs: PyTree) -> tuple[Array, Array, Belief]:
     """A state given the next one: as increments, it is a gain times that from the origin, plus an independent belief.
 
     Returns:
         The origin of the next state's increments; the gain; and the belief.
     """
-    origin, ahead = model.linear_transition(belief, control)
-    noise = model.process_noise_of(control)
+    origin, ahead = model.linear_transition(belief, inputs)
+    noise = model.process_noise_of(belief, inputs)
     return origin, *model.arithmetic.backward(increments(belief), ahead.F, noise, ahead.value, ahead.residual_root)
 
 
 @jax.jit
-def smoothed_pairs(filter: Filter, beliefs: Belief, controls: PyTree) -> tuple[Array, Array, Array]:
+def smoothed_pairs(filter: Filter, beliefs: Belief, inputs: PyTree) -> tuple[Array, Array, Array]:
     """Moments of all states, the one before the first observation among them, given the whole sequence.
 
     The states are vectors. Returns the means (t + 1, n), the covariances (t + 1, n, n), and the covariances of
@@ -201,9 +204,9 @@ def smoothed_pairs(filter: Filter, beliefs: Belief, controls: PyTree) -> tuple[A
         prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
     earlier = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), prior, beliefs)
 
-    def step(following: tuple[Array, Array], inputs: tuple) -> tuple[tuple, tuple]:
-        (mean, P), (belief, control) = following, inputs
-        origin, gain, rest = reverse_transition(model, belief, control)
+    def step(following: tuple[Array, Array], frame: tuple) -> tuple[tuple, tuple]:
+        (mean, P), (belief, inputs) = following, inputs
+        origin, gain, rest = reverse_transition(model, belief, inputs)
         cross = linalg.matmul(gain, P)
         smoothed = belief.mean + rest.mean + factor.apply(gain, mean - origin)
         covariance = factor.outer(cross, gain) + _covariance(rest)
@@ -211,7 +214,7 @@ def smoothed_pairs(filter: Filter, beliefs: Belief, controls: PyTree) -> tuple[A
 
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
     end = last.mean, _covariance(last)
-    _, (means, covariances, cross) = jax.lax.scan(step, end, (earlier, controls), reverse=True)
+    _, (means, covariances, cross) = jax.lax.scan(step, end, (earlier, inputs), reverse=True)
     return jnp.concatenate([means, end[0][None]]), jnp.concatenate([covariances, end[1][None]]), cross
 
 
@@ -220,9 +223,9 @@ def _covariance(belief: Belief) -> Array:
 
 
 @jax.jit
-def _lag_one(model: GaussianModel, beliefs: Belief, smoothed: Belief, controls: PyTree) -> Array:
-    def one(belief: Belief, control: PyTree, here: Belief, following: Belief) -> Array:
-        origin, gain, _ = reverse_transition(model, belief, control)
+def _lag_one(model: GaussianModel, beliefs: Belief, smoothed: Belief, inputs: PyTree) -> Array:
+    def one(belief: Belief, inputs: PyTree, here: Belief, following: Belief) -> Array:
+        origin, gain, _ = reverse_transition(model, belief, inputs)
         P = _covariance(following)
         if model.manifold.flat:
             return linalg.matmul(gain, P)
@@ -232,28 +235,28 @@ def _lag_one(model: GaussianModel, beliefs: Belief, smoothed: Belief, controls: 
         off = jax.jacfwd(lambda delta: manifold.local(origin, manifold.retract(following.mean, delta)))(zero)
         return linalg.matmul(linalg.matmul(onto, linalg.matmul(gain, off)), P)
 
-    earlier, following = _pairs(beliefs, controls)
+    earlier, following = _pairs(beliefs, inputs)
     here, ahead = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], smoothed) for cut in (slice(-1), slice(1, None)))
     return jax.lax.map(lambda each: one(*each), (earlier, following, here, ahead))
 
 
 @partial(jax.jit, static_argnames="num_samples")
-def _sampled(model: GaussianModel, key: AnyKey, beliefs: Belief, controls: PyTree, num_samples: int) -> Array:
+def _sampled(model: GaussianModel, key: AnyKey, beliefs: Belief, inputs: PyTree, num_samples: int) -> Array:
     manifold, length = model.manifold, beliefs.mean.shape[0]
     local, retract = (jax.vmap(f, in_axes=(None, -1), out_axes=-1) for f in (manifold.local, manifold.retract))
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
     width = lower_root(last).shape[0]
     noise = jax.random.normal(key, (length, width, num_samples), beliefs.mean.dtype)
 
-    def step(following: Array, inputs: tuple) -> tuple[Array, Array]:
-        (belief, control), noise = inputs
-        origin, gain, rest = reverse_transition(model, belief, control)
+    def step(following: Array, frame: tuple) -> tuple[Array, Array]:
+        (belief, inputs), noise = frame
+        origin, gain, rest = reverse_transition(model, belief, inputs)
         deltas = rest.mean[:, None] + _times(gain, local(origin, following)) + _times(lower_root(rest), noise)
         samples = retract(belief.mean, deltas)
         return samples, samples
 
     end = retract(last.mean, _times(lower_root(last), noise[-1]))
-    _, earlier = jax.lax.scan(step, end, (_pairs(beliefs, controls), noise[:-1]), reverse=True)
+    _, earlier = jax.lax.scan(step, end, (_pairs(beliefs, inputs), noise[:-1]), reverse=True)
     return jnp.concatenate([earlier, end[None]])
 
 
@@ -262,17 +265,17 @@ def _times(A: Array, columns: Array) -> Array:
 
 
 @jax.jit
-def _backward(model: GaussianModel, beliefs: Belief, controls: PyTree) -> Belief:
-    def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
-        belief, control = inputs
-        origin, ahead = model.linear_transition(belief, control)
+def _backward(model: GaussianModel, beliefs: Belief, inputs: PyTree) -> Belief:
+    def step(following: Belief, frame: tuple) -> tuple[Belief, Belief]:
+        belief, inputs = frame
+        origin, ahead = model.linear_transition(belief, inputs)
         next_belief = to_tangent(model.manifold, origin, following)
-        noise = model.process_noise_of(control)
+        noise = model.process_noise_of(belief, inputs)
         delta = model.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed
 
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
-    _, smoothed = jax.lax.scan(step, last, (earlier, jax.tree.map(lambda leaf: leaf[1:], controls)), reverse=True)
+    _, smoothed = jax.lax.scan(step, last, (earlier, jax.tree.map(lambda leaf: leaf[1:], inputs)), reverse=True)
     return jax.tree.map(lambda most, end: jnp.concatenate([most, end[None]]), smoothed, last)

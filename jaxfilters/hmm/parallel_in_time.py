@@ -79,7 +79,8 @@ def parallel_posterior(model: HiddenMarkovModel, log_likelihoods: Float[Array, "
     following = _normalized(emission[1:] * beta[1:])
     pairs = ahead.matrix[:-1, :, None] * A * following[:, None]
     totals = pairs.sum(axis=(1, 2), keepdims=True)
-    transitions = jnp.where(totals > 0, pairs / jnp.where(totals > 0, totals, 1.0), 0.0).sum(axis=0)
+    transitions = jnp.where(totals > 0, pairs / jnp.where(totals > 0, totals, 1.0), 0.0)
+    transitions = transitions if A.ndim == 3 else transitions.sum(axis=0)
     total = jnp.log(ahead.matrix[-1].sum()) + ahead.log_scale[-1]
     possible = total > -jnp.inf
     return Posterior(total, jnp.where(possible, states, 0.0), jnp.where(possible, transitions, 0.0))
@@ -94,7 +95,7 @@ def parallel_viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t 
     """
     _check(model, log_likelihoods)
     frames = usable(log_likelihoods)
-    first = jnp.broadcast_to(model.log_initial + frames[0], (1, *model.log_transition.shape))
+    first = jnp.broadcast_to(model.log_initial + frames[0], (1, *[len(model.log_initial)] * 2))
     elements = jnp.concatenate([first, model.log_transition + frames[1:, None]])
     scores = jax.lax.associative_scan(_best, elements)[:, 0]
     reached = scores[:-1, :, None] + model.log_transition
@@ -121,10 +122,10 @@ def _ahead(model: HiddenMarkovModel, log_likelihoods: Array) -> _Run:
     frames = usable(log_likelihoods)
     peaks = _peaks(frames)
     emission = jnp.exp(frames - peaks[:, None])
-    runs = _runs(jnp.exp(model.log_transition), emission, peaks)
     # The first frame has no state before it: every row of its matrix is the same.
-    start = jnp.broadcast_to(jnp.exp(model.log_initial) * emission[0], runs.matrix.shape[1:])
-    runs = _rescaled(_Run(runs.matrix.at[0].set(start), runs.log_scale.at[0].set(peaks[0])))
+    first = jnp.broadcast_to(jnp.exp(model.log_initial) * emission[0], (1, *[len(model.log_initial)] * 2))
+    later = _runs(jnp.exp(model.log_transition), emission[1:], peaks[1:])
+    runs = jax.tree.map(lambda one, many: jnp.concatenate([one, many]), _rescaled(_Run(first, peaks[:1])), later)
     found = jax.lax.associative_scan(_joined, runs)
     return _Run(found.matrix[:, 0], found.log_scale)
 

@@ -23,7 +23,7 @@ from jaxfilters.particle.backward_draws import draw_backward_by_rejection, take
 from jaxfilters.particle.bootstrap import Bootstrap
 from jaxfilters.particle.differentiable_resampling import Transport
 from jaxfilters.particle.smoothing import LogTransition
-from jaxfilters.typing import AnyKey, as_pytree
+from jaxfilters.typing import AnyKey, as_pytree, taking_inputs
 
 
 class ParisState(NamedTuple):
@@ -74,8 +74,8 @@ def paris(
     Args:
         inner: Filter made by `bootstrap` without tempering, resampling by choice of ancestors.
         initial: `x -> h_0` of the state before the first observation: floating-point numbers and arrays.
-        increment: `(x, x_next, inputs) -> h`, a pytree like that of `initial`.
-        log_transition: `(x_next, x, inputs) -> log p(x_next | x)`, a scalar.
+        increment: `(x, x_next) -> h`, a pytree like that of `initial`; or with the inputs of the step after them.
+        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar; or with the inputs of the step after them.
         log_bound: An upper bound of `log_transition` over all states. If a density is found above it, the estimates
             are NaN from then on.
         num_draws: Draws from the backward kernel for each particle; 2 or more keep the variance from growing with the
@@ -93,11 +93,11 @@ def paris(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
-        ...     lambda key: jnp.zeros(1), lambda e, x, u: 0.9 * x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     lambda key: jnp.zeros(1), lambda e, x: 0.9 * x + e, lambda x, y: -jnp.sum((x - y) ** 2),
         ...     num_particles=100, noise=jf.StandardNormal(1),
         ... )
-        >>> log_transition = lambda x_next, x, u: jax.scipy.stats.norm.logpdf(x_next - 0.9 * x).sum()
-        >>> product = lambda x, x_next, u: x[0] * x_next[0]
+        >>> log_transition = lambda x_next, x: jax.scipy.stats.norm.logpdf(x_next - 0.9 * x).sum()
+        >>> product = lambda x, x_next: x[0] * x_next[0]
         >>> smoother = jf.smoothing.paris(pf, lambda x: 0.0, product, log_transition, log_bound=-0.918)
         >>> last, infos = jf.run(smoother, jax.random.key(0), jnp.ones((5, 1)), collect=jf.keep_info)
         >>> last.estimate.shape
@@ -110,9 +110,9 @@ def paris(
     checks.check_num_particles(max_candidates, name="max_candidates")
     if not isinstance(inner.params, Bootstrap) or isinstance(inner.params.scheme, Transport):
         raise ValueError("inner must be made by bootstrap with a scheme of jf.resampling, which chooses ancestors.")
-    params = Paris(
-        inner, as_pytree(initial), as_pytree(increment), as_pytree(log_transition), log_bound, num_draws, max_candidates
-    )
+    increment = taking_inputs("increment", increment, "x", "x_next")
+    density = taking_inputs("log_transition", log_transition, "x_next", "x")
+    params = Paris(inner, as_pytree(initial), increment, density, log_bound, num_draws, max_candidates)
     return Filter(params, _init, _predict, _update)
 
 
@@ -123,22 +123,22 @@ def _init(model: Paris, key: AnyKey) -> ParisState:
     return ParisState(inner, statistics, jnp.ones((), bool))
 
 
-def _predict(model: Paris, key: AnyKey, state: ParisState, control: PyTree) -> ParisState:
+def _predict(model: Paris, key: AnyKey, state: ParisState, inputs: PyTree) -> ParisState:
     inner_key, draw_key = jax.random.split(key)
     before = state.inner
-    inner = model.inner.predict(model.inner.params, inner_key, before, control)
+    inner = model.inner.predict(model.inner.params, inner_key, before, inputs)
 
     def draw(key: AnyKey) -> tuple[PyTree, Array]:
         chosen, below = draw_backward_by_rejection(
             key,
-            lambda x_next, x: model.log_transition(x_next, x, control),
+            lambda x_next, x: model.log_transition(x_next, x, inputs),
             model.log_bound,
             inner.particles,
             before.particles,
             before.log_weights,
             model.max_candidates,
         )
-        step = jax.vmap(lambda x, x_next: model.increment(x, x_next, control), in_axes=-1, out_axes=-1)
+        step = jax.vmap(lambda x, x_next: model.increment(x, x_next, inputs), in_axes=-1, out_axes=-1)
         added = step(take(before.particles, chosen), inner.particles)
         added = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), added)
         checks.like("the result of increment", added, state.statistics, "what initial returns, for all particles")
@@ -150,6 +150,8 @@ def _predict(model: Paris, key: AnyKey, state: ParisState, control: PyTree) -> P
     return ParisState(inner, statistics, is_bounded)
 
 
-def _update(model: Paris, key: AnyKey, state: ParisState, observation: PyTree) -> tuple[ParisState, PyTree]:
-    inner, info = model.inner.update(model.inner.params, key, state.inner, observation)
+def _update(
+    model: Paris, key: AnyKey, state: ParisState, observation: PyTree, inputs: PyTree
+) -> tuple[ParisState, PyTree]:
+    inner, info = model.inner.update(model.inner.params, key, state.inner, observation, inputs)
     return state._replace(inner=inner), info

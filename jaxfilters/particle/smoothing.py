@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int32, PyTree
 
+from jaxfilters._renamed import takes_inputs
 from jaxfilters.particle import checks
 from jaxfilters.particle.backward_draws import draw_backward, draw_backward_by_rejection, draw_index, take
-from jaxfilters.typing import AnyKey
+from jaxfilters.typing import AnyKey, taking_inputs
 
 
 class History(NamedTuple):
@@ -32,7 +33,7 @@ class History(NamedTuple):
 class LogTransition(Protocol):
     r"""Evaluate $\log p(x_t \mid x_{t-1}, u_t)$ up to a constant; `-inf` means impossible."""
 
-    def __call__(self, x_next: PyTree, x: PyTree, control: PyTree, /) -> Float[Array, ""]: ...
+    def __call__(self, x_next: PyTree, x: PyTree, inputs: PyTree, /) -> Float[Array, ""]: ...
 
 
 def keep_history(state: PyTree, info: PyTree) -> History:
@@ -61,7 +62,7 @@ def trajectories(history: History) -> PyTree:
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
-        ...     lambda key: jnp.zeros(1), lambda e, x, u: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
         ...     num_particles=100, noise=jf.StandardNormal(1),
         ... )
         >>> _, history = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.smoothing.keep_history)
@@ -83,11 +84,12 @@ def _trajectories(history: History) -> PyTree:
     return _along(history.particles, chosen)
 
 
+@takes_inputs
 def backward_sampling(
     key: AnyKey,
     history: History,
     log_transition: LogTransition,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     num_paths: int,
     log_bound: float | Float[Array, ""] | None = None,
@@ -105,8 +107,9 @@ def backward_sampling(
     Args:
         key: Random key.
         history: Ensembles that `run` collected with `keep_history`.
-        log_transition: `(x_next, x, control) -> log p(x_next | x)`, a scalar. Compared by identity.
-        controls: The controls of `run`, with time as the first axis.
+        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar, or with the inputs of the step after them.
+            Compared by identity.
+        inputs: The inputs of `run`, with time as the first axis.
         num_paths: Number of trajectories.
         log_bound: An upper bound of `log_transition` over all states, for rejection. A trajectory on which a density
             is found above it is NaN.
@@ -117,7 +120,7 @@ def backward_sampling(
 
     Raises:
         TypeError: If `history` is not a `History` or `log_transition` is not callable.
-        ValueError: If `num_paths < 1` or `max_candidates < 1`, `log_bound` is not finite, `controls` has another
+        ValueError: If `num_paths < 1` or `max_candidates < 1`, `log_bound` is not finite, `inputs` has another
             length than `history`, or `log_transition` does not return a scalar.
     """
     checks.check_history(history)
@@ -126,21 +129,21 @@ def backward_sampling(
     checks.check_num_particles(max_candidates, name="max_candidates")
     if log_bound is not None:
         checks.check_scalar("log_bound", log_bound, "finite", np.isfinite)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(controls):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         if jnp.shape(leaf)[:1] != history.log_weights.shape[:1]:
             raise ValueError(
-                f"controls{jax.tree_util.keystr(path)} must have as many frames as history, "
+                f"inputs{jax.tree_util.keystr(path)} must have as many frames as history, "
                 f"{history.log_weights.shape[0]}; got the shape {jnp.shape(leaf)}."
             )
-    transition = jax.tree_util.Partial(log_transition)
+    transition = taking_inputs("log_transition", log_transition, "x_next", "x")
     if log_bound is None:
-        return _simulate(key, history, transition, controls, jnp.zeros(num_paths))
-    return _simulate_by_rejection(key, history, transition, controls, log_bound, num_paths, max_candidates)
+        return _simulate(key, history, transition, inputs, jnp.zeros(num_paths))
+    return _simulate_by_rejection(key, history, transition, inputs, log_bound, num_paths, max_candidates)
 
 
 @jax.jit
 def _simulate(
-    key: AnyKey, history: History, log_transition: LogTransition, controls: PyTree, paths: Float[Array, " m"]
+    key: AnyKey, history: History, log_transition: LogTransition, inputs: PyTree, paths: Float[Array, " m"]
 ) -> PyTree:
     length = history.log_weights.shape[0]
     points = jax.random.uniform(key, (length, paths.size), history.log_weights.dtype)
@@ -148,15 +151,15 @@ def _simulate(
     chosen = jax.vmap(draw_index, in_axes=(None, 0))(last.log_weights, points[-1])
     end = take(last.particles, chosen)
 
-    def step(following: PyTree, inputs: tuple) -> tuple[PyTree, Array]:
-        particles, log_weights, control, points = inputs
+    def step(following: PyTree, frame: tuple) -> tuple[PyTree, Array]:
+        particles, log_weights, inputs, points = frame
 
-        density = lambda x_next, x: log_transition(x_next, x, control)
+        density = lambda x_next, x: log_transition(x_next, x, inputs)
         chosen = draw_backward(density, following, particles, log_weights, points)
         return take(particles, chosen), chosen
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], (history.particles, history.log_weights))
-    following = jax.tree.map(lambda leaf: leaf[1:], controls)
+    following = jax.tree.map(lambda leaf: leaf[1:], inputs)
     _, before = jax.lax.scan(step, end, (*earlier, following, points[:-1]), reverse=True)
     return _along(history.particles, jnp.concatenate([before, chosen[None]]))
 
@@ -166,7 +169,7 @@ def _simulate_by_rejection(
     key: AnyKey,
     history: History,
     log_transition: LogTransition,
-    controls: PyTree,
+    inputs: PyTree,
     log_bound: Array | float,
     num_paths: int,
     max_candidates: int,
@@ -176,10 +179,10 @@ def _simulate_by_rejection(
     points = jax.random.uniform(end_key, (num_paths,), last.log_weights.dtype)
     chosen = jax.vmap(draw_index, in_axes=(None, 0))(last.log_weights, points)
 
-    def step(state: tuple, inputs: tuple) -> tuple[tuple, Array]:
+    def step(state: tuple, frame: tuple) -> tuple[tuple, Array]:
         following, bounded = state
-        key, particles, log_weights, control = inputs
-        density = lambda x_next, x: log_transition(x_next, x, control)
+        key, particles, log_weights, inputs = frame
+        density = lambda x_next, x: log_transition(x_next, x, inputs)
         chosen, below = draw_backward_by_rejection(
             key, density, log_bound, following, particles, log_weights, max_candidates
         )
@@ -188,7 +191,7 @@ def _simulate_by_rejection(
     earlier = jax.tree.map(lambda leaf: leaf[:-1], (history.particles, history.log_weights))
     keys = jax.random.split(key, len(history.log_weights) - 1)
     start = take(last.particles, chosen), jnp.ones(num_paths, bool)
-    inputs = (keys, *earlier, jax.tree.map(lambda leaf: leaf[1:], controls))
+    inputs = (keys, *earlier, jax.tree.map(lambda leaf: leaf[1:], inputs))
     (_, bounded), before = jax.lax.scan(step, start, inputs, reverse=True)
     paths = _along(history.particles, jnp.concatenate([before, chosen[None]]))
     return jax.tree.map(lambda leaf: jnp.where(bounded, leaf, jnp.nan) if is_float(leaf) else leaf, paths)

@@ -156,7 +156,7 @@ def test_sigma_points_are_exact_for_linear_functions(x64):
     found = jf.fit.em(filter, KEY, ys, lengths=LENGTHS, free=free, max_iterations=2)
     np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-10)
     model, named = found.fitted.params, parameters(expected.fitted)
-    values = dict(zip("FbHd", (*model.transition.args, *model.observe.args), strict=True))
+    values = dict(zip("FbHd", (*model.transition.args, *model.observe.callback.args), strict=True))
     values |= dict(Q=model.process_noise, R=model.observation_noise, mean=model.prior.mean)
     for name, value in values.items():
         np.testing.assert_allclose(value, named[name], atol=1e-8, err_msg=name)

@@ -17,9 +17,9 @@ Q = np.diag([0.01, 0.01, 0.05, 0.05, 0.02])
 R = np.diag([0.05, 0.05]) ** 2
 
 
-def move(x, control, xp=jnp):
+def move(x, inputs=None, *, xp=jnp):
     """Coordinated turn: position, velocity and turn rate."""
-    del control
+    del inputs
     w = x[4]
     # sin(w) / w and (1 - cos(w)) / w, with their limits at 0.
     s, c = xp.sinc(w * DT / np.pi) * DT, xp.sinc(w * DT / 2 / np.pi) ** 2 * w * DT**2 / 2
@@ -35,11 +35,11 @@ def move(x, control, xp=jnp):
     )
 
 
-def bearings(x, xp=jnp):
+def bearings(x, *, xp=jnp):
     return xp.arctan2(x[1] - SENSORS[:, 1], x[0] - SENSORS[:, 0])
 
 
-def wrapped(y, y_hat, xp=jnp):
+def wrapped(y, y_hat, *, xp=jnp):
     return xp.mod(y - y_hat + np.pi, 2 * np.pi) - np.pi
 
 
@@ -47,8 +47,8 @@ def simulated(seed):
     rng = np.random.default_rng(seed)
     x, ys = rng.multivariate_normal(MEAN, P), []
     for _ in range(T):
-        x = move(x, None, np) + rng.multivariate_normal(np.zeros(5), Q)
-        ys.append(wrapped(bearings(x, np) + rng.multivariate_normal(np.zeros(2), R), 0.0, np))
+        x = move(x, xp=np) + rng.multivariate_normal(np.zeros(5), Q)
+        ys.append(wrapped(bearings(x, xp=np) + rng.multivariate_normal(np.zeros(2), R), 0.0, xp=np))
     return np.array(ys)
 
 
@@ -58,8 +58,8 @@ def most_probable(ys, start):
 
     def residuals(flat):
         xs = flat.reshape(T + 1, 5)
-        steps = [roots[1] @ (xs[t + 1] - move(xs[t], None, np)) for t in range(T)]
-        readings = [roots[2] @ wrapped(ys[t], bearings(xs[t + 1], np), np) for t in range(T)]
+        steps = [roots[1] @ (xs[t + 1] - move(xs[t], xp=np)) for t in range(T)]
+        readings = [roots[2] @ wrapped(ys[t], bearings(xs[t + 1], xp=np), xp=np) for t in range(T)]
         return np.concatenate([roots[0] @ (xs[0] - MEAN), *steps, *readings])
 
     found = least_squares(residuals, start.ravel(), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-10)

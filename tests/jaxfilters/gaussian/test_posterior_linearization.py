@@ -10,7 +10,7 @@ MEAN, P, R = np.array([1.0, 1.0]), np.diag([0.3, 0.2]), np.array([[0.01]])
 Y = np.array([1.6])
 
 
-def distance(x, xp=jnp):
+def distance(x, *, xp=jnp):
     return xp.sqrt(x[:1] ** 2 + x[1:] ** 2)
 
 
@@ -26,7 +26,7 @@ def regressed(mean, C):
     """Kalman update of the prior with the observation regressed on sigma points of a belief, in numpy."""
     offsets = np.sqrt(2) * np.linalg.cholesky(C).T
     points = np.concatenate([mean + offsets, mean - offsets])
-    values = np.array([distance(x, np) for x in points])
+    values = np.array([distance(x, xp=np) for x in points])
     y_hat = values.mean(axis=0)
     cross = (points - mean).T @ (values - y_hat) / len(points)
     H = cross.T @ np.linalg.inv(C)

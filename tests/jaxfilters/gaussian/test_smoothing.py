@@ -23,8 +23,8 @@ SEEN = np.array([[1, 1], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]], bool)
 KEY = jax.random.key(0)
 
 
-def transition(x, control):
-    return F @ x + control * DRIFT
+def transition(x, inputs):
+    return F @ x + inputs * DRIFT
 
 
 def observe(x):
@@ -87,9 +87,9 @@ CURVED = Manifold(add, displacement)
 )
 def test_smoothed_beliefs_are_those_of_the_joint_gaussian(x64, arithmetic, options):
     ys = Observation(jnp.where(SEEN, YS, jnp.nan), jnp.asarray(SEEN))
-    controls = jnp.arange(1.0, T + 1)
+    inputs = jnp.arange(1.0, T + 1)
     means, posterior, log_evidence = joint_posterior()
-    beliefs, infos = filter_and_smooth(build(arithmetic, **options), KEY, ys, controls)
+    beliefs, infos = filter_and_smooth(build(arithmetic, **options), KEY, ys, inputs)
     np.testing.assert_allclose(beliefs.mean, means, atol=1e-9)
     found = beliefs.covariance if isinstance(beliefs, Gaussian) else beliefs.root @ beliefs.root.transpose(0, 2, 1)
     np.testing.assert_allclose(found, blocks_of(posterior, 0), atol=1e-9)
@@ -107,13 +107,13 @@ def test_samples_and_neighbours_are_those_of_the_joint_gaussian(x64, arithmetic,
 
     Their 18 means and 171 covariances are tested at 4.5 standard errors: a false alarm has a probability of 1.3e-3.
     """
-    filter, controls, count = build(arithmetic, **options), jnp.arange(1.0, T + 1), 4000
+    filter, inputs, count = build(arithmetic, **options), jnp.arange(1.0, T + 1), 4000
     means, posterior, _ = joint_posterior()
     ys = Observation(jnp.where(SEEN, YS, jnp.nan), jnp.asarray(SEEN))
-    _, (beliefs, _) = run(filter, KEY, ys, controls)
-    found = lag_one_covariances(filter, beliefs, rts(filter, beliefs, controls), controls)
+    _, (beliefs, _) = run(filter, KEY, ys, inputs)
+    found = lag_one_covariances(filter, beliefs, rts(filter, beliefs, inputs), inputs)
     np.testing.assert_allclose(found, blocks_of(posterior, 1), atol=1e-9)
-    samples = np.asarray(posterior_samples(filter, KEY, beliefs, controls, num_samples=count))
+    samples = np.asarray(posterior_samples(filter, KEY, beliefs, inputs, num_samples=count))
     assert samples.shape == (T, N, count)
     white = np.linalg.solve(np.linalg.cholesky(posterior), samples.reshape(T * N, count) - means.reshape(-1, 1))
     assert abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(count)
@@ -124,11 +124,11 @@ def test_samples_and_neighbours_are_those_of_the_joint_gaussian(x64, arithmetic,
 @pytest.mark.system
 @pytest.mark.parametrize("name", ["joseph", "square_root"])
 def test_a_filter_from_each_side_finds_the_joint_gaussian(x64, name):
-    filter, controls = build(getattr(arithmetics, name)), jnp.arange(1.0, T + 1)
+    filter, inputs = build(getattr(arithmetics, name)), jnp.arange(1.0, T + 1)
     means, posterior, _ = joint_posterior()
     ys, mask = Observation(jnp.where(SEEN, YS, jnp.nan), jnp.asarray(SEEN)), jnp.arange(T) != 3
-    _, (beliefs, _) = run(filter, KEY, ys, controls, mask=mask)
-    found = two_filter(filter, beliefs, ys, controls, mask=mask)
+    _, (beliefs, _) = run(filter, KEY, ys, inputs, mask=mask)
+    found = two_filter(filter, beliefs, ys, inputs, mask=mask)
     np.testing.assert_allclose(found.mean, means, atol=1e-9)
     P = found.covariance if isinstance(found, Gaussian) else found.root @ found.root.transpose(0, 2, 1)
     np.testing.assert_allclose(P, blocks_of(posterior, 0), atol=1e-9)
@@ -136,9 +136,9 @@ def test_a_filter_from_each_side_finds_the_joint_gaussian(x64, name):
 
 def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
     kept = np.arange(T) != 3
-    filter, controls = build(arithmetics.joseph), jnp.arange(1.0, T + 1)
+    filter, inputs = build(arithmetics.joseph), jnp.arange(1.0, T + 1)
     masked, infos = filter_and_smooth(
-        filter, KEY, Observation(jnp.asarray(YS), jnp.asarray(SEEN)), controls, mask=jnp.asarray(kept)
+        filter, KEY, Observation(jnp.asarray(YS), jnp.asarray(SEEN)), inputs, mask=jnp.asarray(kept)
     )
     np.testing.assert_allclose(masked.mean, joint_posterior()[0], atol=1e-9)
     assert infos.log_evidence[3] == 0
@@ -147,18 +147,18 @@ def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
 @pytest.mark.system
 def test_the_smoother_differentiates(x64):
     filter = build(arithmetics.joseph)
-    ys, controls = jnp.asarray(YS), jnp.ones(T)
+    ys, inputs = jnp.asarray(YS), jnp.ones(T)
 
     def first_mean(scale):
-        _, (beliefs, _) = run(filter, KEY, scale * ys, controls)
-        return rts(filter, beliefs, controls).mean[0, 0]
+        _, (beliefs, _) = run(filter, KEY, scale * ys, inputs)
+        return rts(filter, beliefs, inputs).mean[0, 0]
 
     slope = jax.jit(jax.grad(first_mean))(1.0)
     np.testing.assert_allclose(slope, (first_mean(1 + 1e-6) - first_mean(1 - 1e-6)) / 2e-6, rtol=1e-6)
 
 
 def test_other_filters_and_lengths_are_rejected():
-    def unused(*_):
+    def unused(x, y):
         return jnp.zeros(())
 
     with pytest.raises(ValueError, match="made by kalman or extended_kalman"):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +34,11 @@ def build():
 
 
 @pytest.mark.system
-def test_it_is_the_sequential_result(x64):
+@pytest.mark.parametrize("varying", [False, True])
+def test_it_is_the_sequential_result(x64, varying):
     model, scores = build(), jnp.asarray(SCORES)
+    if varying:
+        model = replace(model, log_transition=jnp.log(RNG.dirichlet(np.ones(Q), (T - 1, Q))))
     found, expected = PARALLEL(model, scores), SEQUENTIAL(model, scores)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9, rtol=1e-10), found, expected)
 
