@@ -128,26 +128,24 @@ def _iterated(
     iterations: int,
     smoother: Smoother,
 ) -> tuple[Belief, IterationInfo]:
-    linearized = lambda trajectory: affine_model(model, trajectory, observations, inputs, mask)
-    smoothed = lambda affine: smoother(model.prior, affine, model.arithmetic)
-
-    def improve(trajectory: Belief, _: None) -> tuple[Belief, tuple]:
-        affine = linearized(trajectory)
-        target, _ = smoothed(affine)
+    def improve(trajectory: Belief, index: Array) -> tuple[Belief, tuple]:
+        affine = affine_model(model, trajectory, observations, inputs, mask)
+        target, log_evidence = smoother(model.prior, affine, model.arithmetic)
         step = target.mean - trajectory.mean
         cost = _cost(model, trajectory, affine, observations, inputs)
         lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype), 0.0)
         costs = jax.lax.map(lambda length: cost(trajectory.mean + length * step), lengths)
         best = jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
-        moved = jnp.where(lengths[best] > 0, trajectory.mean + lengths[best] * step, trajectory.mean)
+        # The last pass gives the covariances and the evidence about the trajectory, and takes no step.
+        length = jnp.where(index < iterations, lengths[best], 0.0)
+        moved = jnp.where(length > 0, trajectory.mean + length * step, trajectory.mean)
         # Covariances are those about the trajectory, also where no step lowers the cost.
-        return replace(target, mean=moved), (costs[-1], costs[best], lengths[best])
+        return replace(target, mean=moved), (costs[-1], costs[best], length, log_evidence)
 
-    trajectory, course = jax.lax.scan(improve, _with_first(model, start, inputs), None, length=iterations)
-    final, log_evidence = smoothed(linearized(trajectory))
-    # The last pass gives the covariances about the trajectory; its means may be a step that raises the cost.
-    final = replace(final, mean=trajectory.mean)
-    return jax.tree.map(lambda leaf: leaf[1:], final), IterationInfo(*course, log_evidence)
+    first = _with_first(model, start, inputs)
+    final, (*course, log_evidence) = jax.lax.scan(improve, first, jnp.arange(iterations + 1))
+    info = IterationInfo(*(each[:-1] for each in course), log_evidence[-1])
+    return jax.tree.map(lambda leaf: leaf[1:], final), info
 
 
 def _with_first(model: ExtendedKalman, start: Belief, inputs: PyTree) -> Belief:

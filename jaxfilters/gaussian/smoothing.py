@@ -205,7 +205,7 @@ def smoothed_pairs(filter: Filter, beliefs: Belief, inputs: PyTree) -> tuple[Arr
     earlier = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), prior, beliefs)
 
     def step(following: tuple[Array, Array], frame: tuple) -> tuple[tuple, tuple]:
-        (mean, P), (belief, inputs) = following, inputs
+        (mean, P), (belief, inputs) = following, frame
         origin, gain, rest = reverse_transition(model, belief, inputs)
         cross = linalg.matmul(gain, P)
         smoothed = belief.mean + rest.mean + factor.apply(gain, mean - origin)
