@@ -2,8 +2,12 @@
 
 | belief | whole sequences | with a fixed delay |
 |---|---|---|
-| Gaussian | `rts`, `filter_and_smooth`; `parallel_kalman` with `parallel_rts`, parallel in time | `fixed_lag_rts` |
+| Gaussian | `rts`, `filter_and_smooth`, `two_filter` | `fixed_lag_rts` |
+| Gaussian, neighbouring states and samples | `lag_one_covariances`, `posterior_samples` | |
+| Gaussian, strongly nonlinear models | `iterated`, `sequential` or `parallel` in time | |
+| linear Gaussian, parallel in time | `parallel_kalman` with `parallel_rts` | |
 | particles | `trajectories`, `backward_sampling` | `fixed_lag` |
+| particles, sums over time | | `paris`, as frames arrive |
 """
 
 from jaxfilters.gaussian.affine import parallel as parallel
