@@ -8,7 +8,7 @@ from jaxfilters.benchmarks.scenarios import smoothers
 @pytest.mark.system
 def test_without_peers_it_times_this_library(monkeypatch):
     monkeypatch.setattr(peers, "installed", list)
-    found = smoothers.run(quick=True, seed=0, out=None, sizes=smoothers.Sizes(8, 50, 5))
+    found = smoothers.run(quick=True, seed=0, out=None, sizes=smoothers.Sizes(8, 2, 50, 5))
     assert {f"{name}_ms_ours" for name in ("parallel_smoother", "posterior_samples", "em", "backward_sampling")} <= set(
         found
     )
