@@ -40,6 +40,7 @@ from .gaussian.imm import imm as imm
 from .gaussian.linear import kalman as kalman
 from .gaussian.mixture import mixture_moments as mixture_moments
 from .gaussian.noise_models import NonAdditiveNoise as NonAdditiveNoise
+from .gaussian.posterior_linearization import posterior_linearization as posterior_linearization
 from .gaussian.robust import robust as robust
 from .gaussian.sigma_point import cubature_kalman as cubature_kalman
 from .gaussian.sigma_point import unscented_kalman as unscented_kalman

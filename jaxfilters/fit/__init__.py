@@ -27,6 +27,8 @@ from jaxfilters.fit.density import fresh_keys as fresh_keys
 from jaxfilters.fit.density import log_evidence as log_evidence
 from jaxfilters.fit.density import over_sequences as over_sequences
 from jaxfilters.fit.density import with_prior as with_prior
+from jaxfilters.fit.expectation_maximization import EM as EM
+from jaxfilters.fit.expectation_maximization import em as em
 from jaxfilters.fit.maximum import maximize as maximize
 from jaxfilters.fit.methods import adam as adam
 from jaxfilters.fit.methods import bfgs as bfgs

@@ -219,6 +219,12 @@ def residual_of(residual: Callable) -> Callable:
     return checked
 
 
+def count(name: str, value: Any) -> None:
+    """Raise an error unless `value` is a Python integer of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1; got {value!r}.")
+
+
 def probability(name: str, value: Any) -> None:
     """Raise an error unless `value` is one number in (0, 1)."""
     if jnp.shape(value) != ():

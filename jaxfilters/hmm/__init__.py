@@ -36,6 +36,9 @@ from jaxfilters.hmm.networks import threshold_model as threshold_model
 from jaxfilters.hmm.online import ChainInfo as ChainInfo
 from jaxfilters.hmm.online import ChainState as ChainState
 from jaxfilters.hmm.online import online as online
+from jaxfilters.hmm.parallel_in_time import parallel_forward as parallel_forward
+from jaxfilters.hmm.parallel_in_time import parallel_posterior as parallel_posterior
+from jaxfilters.hmm.parallel_in_time import parallel_viterbi as parallel_viterbi
 from jaxfilters.hmm.recursions import Filtered as Filtered
 from jaxfilters.hmm.recursions import Posterior as Posterior
 from jaxfilters.hmm.recursions import backward as backward

@@ -5,15 +5,17 @@ particles cost next to nothing, but in early frames they coincide in a few parti
 trajectories that need not be ancestral, for which it evaluates the density of the transition.
 """
 
+from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int32, PyTree
 
-from jaxfilters import weights
 from jaxfilters._renamed import takes_inputs
 from jaxfilters.particle import checks
+from jaxfilters.particle.backward_draws import draw_backward, draw_backward_by_rejection, draw_index, take
 from jaxfilters.typing import AnyKey, taking_inputs
 
 
@@ -84,14 +86,23 @@ def _trajectories(history: History) -> PyTree:
 
 @takes_inputs
 def backward_sampling(
-    key: AnyKey, history: History, log_transition: LogTransition, inputs: PyTree = None, *, num_paths: int
+    key: AnyKey,
+    history: History,
+    log_transition: LogTransition,
+    inputs: PyTree = None,
+    *,
+    num_paths: int,
+    log_bound: float | Float[Array, ""] | None = None,
+    max_candidates: int = 32,
 ) -> PyTree:
     """Draw equally weighted trajectories from the smoothing distribution.
 
     From the last frame to the first, a particle is drawn with probability proportional to its weight times the density
     of the transition to the next state of the trajectory (S. Godsill, A. Doucet and M. West, "Monte Carlo smoothing for
     nonlinear time series", Journal of the American Statistical Association 99, 2004, algorithm 1). Every frame costs n
-    densities for every trajectory.
+    densities for every trajectory; with `log_bound` it costs a few, whatever n is, by rejection (R. Douc, A. Garivier,
+    E. Moulines and J. Olsson, "Sequential Monte Carlo smoothing for general state space hidden Markov models", Annals
+    of Applied Probability 21(6), 2011, section 4), for samples of the same distribution.
 
     Args:
         key: Random key.
@@ -100,27 +111,34 @@ def backward_sampling(
             Compared by identity.
         inputs: The inputs of `run`, with time as the first axis.
         num_paths: Number of trajectories.
+        log_bound: An upper bound of `log_transition` over all states, for rejection. A trajectory on which a density
+            is found above it is NaN.
+        max_candidates: Candidates of the rejection sampler before a draw takes n densities. It changes the time alone.
 
     Returns:
         States along the trajectories, leaves `(t, ..., num_paths)`.
 
     Raises:
         TypeError: If `history` is not a `History` or `log_transition` is not callable.
-        ValueError: If `num_paths < 1`, `inputs` has another length than `history`, or `log_transition` does not
-            return a scalar.
+        ValueError: If `num_paths < 1` or `max_candidates < 1`, `log_bound` is not finite, `inputs` has another
+            length than `history`, or `log_transition` does not return a scalar.
     """
     checks.check_history(history)
     checks.check_callables(log_transition=log_transition)
     checks.check_num_particles(num_paths, name="num_paths")
+    checks.check_num_particles(max_candidates, name="max_candidates")
+    if log_bound is not None:
+        checks.check_scalar("log_bound", log_bound, "finite", np.isfinite)
     for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         if jnp.shape(leaf)[:1] != history.log_weights.shape[:1]:
             raise ValueError(
                 f"inputs{jax.tree_util.keystr(path)} must have as many frames as history, "
                 f"{history.log_weights.shape[0]}; got the shape {jnp.shape(leaf)}."
             )
-    return _simulate(
-        key, history, taking_inputs("log_transition", log_transition, "x_next", "x"), inputs, jnp.zeros(num_paths)
-    )
+    transition = taking_inputs("log_transition", log_transition, "x_next", "x")
+    if log_bound is None:
+        return _simulate(key, history, transition, inputs, jnp.zeros(num_paths))
+    return _simulate_by_rejection(key, history, transition, inputs, log_bound, num_paths, max_candidates)
 
 
 @jax.jit
@@ -130,20 +148,15 @@ def _simulate(
     length = history.log_weights.shape[0]
     points = jax.random.uniform(key, (length, paths.size), history.log_weights.dtype)
     last = jax.tree.map(lambda leaf: leaf[-1], history)
-    chosen = jax.vmap(_draw_index, in_axes=(None, 0))(last.log_weights, points[-1])
-    end = _of(last.particles, chosen)
+    chosen = jax.vmap(draw_index, in_axes=(None, 0))(last.log_weights, points[-1])
+    end = take(last.particles, chosen)
 
     def step(following: PyTree, frame: tuple) -> tuple[PyTree, Array]:
         particles, log_weights, inputs, points = frame
 
-        def one(x_next: PyTree, point: Array) -> Array:
-            def log_density(x: PyTree) -> Array:
-                return checks.scalar_log_density("log_transition", log_transition(x_next, x, inputs))
-
-            return _draw_index(log_weights + jax.vmap(log_density, in_axes=-1)(particles), point)
-
-        chosen = jax.vmap(one, in_axes=(-1, 0))(following, points)
-        return _of(particles, chosen), chosen
+        density = lambda x_next, x: log_transition(x_next, x, inputs)
+        chosen = draw_backward(density, following, particles, log_weights, points)
+        return take(particles, chosen), chosen
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], (history.particles, history.log_weights))
     following = jax.tree.map(lambda leaf: leaf[1:], inputs)
@@ -151,17 +164,43 @@ def _simulate(
     return _along(history.particles, jnp.concatenate([before, chosen[None]]))
 
 
-def _draw_index(log_weights: Array, point: Array) -> Array:
-    """The index at which the cumulative sum of the weights exceeds the fraction `point` of the total."""
-    totals = jnp.cumsum(weights.relative(log_weights))
-    index = jnp.sum(totals <= point * totals[-1], dtype=jnp.int32)
-    # Rounding may make the point equal to the total, which belongs to the last particle with any weight.
-    return jnp.minimum(index, jnp.argmax(totals == totals[-1]).astype(jnp.int32))
+@partial(jax.jit, static_argnames=("num_paths", "max_candidates"))
+def _simulate_by_rejection(
+    key: AnyKey,
+    history: History,
+    log_transition: LogTransition,
+    inputs: PyTree,
+    log_bound: Array | float,
+    num_paths: int,
+    max_candidates: int,
+) -> PyTree:
+    end_key, key = jax.random.split(key)
+    last = jax.tree.map(lambda leaf: leaf[-1], history)
+    points = jax.random.uniform(end_key, (num_paths,), last.log_weights.dtype)
+    chosen = jax.vmap(draw_index, in_axes=(None, 0))(last.log_weights, points)
+
+    def step(state: tuple, frame: tuple) -> tuple[tuple, Array]:
+        following, bounded = state
+        key, particles, log_weights, inputs = frame
+        density = lambda x_next, x: log_transition(x_next, x, inputs)
+        chosen, below = draw_backward_by_rejection(
+            key, density, log_bound, following, particles, log_weights, max_candidates
+        )
+        return (take(particles, chosen), bounded & below), chosen
+
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], (history.particles, history.log_weights))
+    keys = jax.random.split(key, len(history.log_weights) - 1)
+    start = take(last.particles, chosen), jnp.ones(num_paths, bool)
+    inputs = (keys, *earlier, jax.tree.map(lambda leaf: leaf[1:], inputs))
+    (_, bounded), before = jax.lax.scan(step, start, inputs, reverse=True)
+    paths = _along(history.particles, jnp.concatenate([before, chosen[None]]))
+    return jax.tree.map(lambda leaf: jnp.where(bounded, leaf, jnp.nan) if is_float(leaf) else leaf, paths)
+
+
+def is_float(leaf: Array) -> bool:
+    """Whether an array holds floating-point numbers."""
+    return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def _along(particles: PyTree, chosen: Int32[Array, "t m"]) -> PyTree:
-    return jax.vmap(_of)(particles, chosen)
-
-
-def _of(particles: PyTree, chosen: Int32[Array, " m"]) -> PyTree:
-    return jax.tree.map(lambda leaf: jnp.take(leaf, chosen, axis=-1, mode="clip"), particles)
+    return jax.vmap(take)(particles, chosen)

@@ -75,6 +75,7 @@ EXACT = {
     "extended_kalman": extended,
     "unscented_kalman": lambda noise: jf.unscented_kalman(PRIOR, move, Q, observe, covariance(noise)),
     "cubature_kalman": lambda noise: jf.cubature_kalman(PRIOR, move, Q, observe, covariance(noise)),
+    "posterior_linearization": lambda noise: jf.posterior_linearization(extended(noise), iterations=2),
     "gaussian_sum": lambda noise: jf.gaussian_sum(extended(noise), capacity=2),
     "constrained": lambda noise: jf.constrained(
         extended(noise), jf.TruncateEachStep(SPACIOUS, jf.constraints.cut.sequential_intervals)

@@ -1,4 +1,4 @@
-"""Kalman filter atoms in three arithmetics with the same verbs: `predict`, `update`, `rts`, `noise_root`.
+"""Kalman filter atoms in three arithmetics with the same verbs: `predict`, `update`, `rts`, `backward`, `noise_root`.
 
 `joseph` keeps covariances and is the default; `square_root` keeps roots of them and stays right in float32 where a
 covariance is too ill-conditioned to be written down; `fast` keeps covariances and subtracts. Choose by passing the
@@ -29,6 +29,9 @@ class Arithmetic(Protocol):
 
     @property
     def rts(self) -> Callable[..., Any]: ...
+
+    @property
+    def backward(self) -> Callable[..., Any]: ...
 
     @property
     def noise_root(self) -> Callable[..., Any]: ...

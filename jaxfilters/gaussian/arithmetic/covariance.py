@@ -261,6 +261,19 @@ def rts(
     return Gaussian(belief.mean + found.shift, found.covariance + factor.turned(found.gain, following.covariance))
 
 
+def backward(
+    form: Form,
+    belief: Gaussian,
+    F: Float[Array, "k n"],
+    Q: Float[Array, "k k"],
+    b: Float[Array, " k"] | float,
+    added_root: Float[Array, "k _"] | None,
+) -> tuple[Float[Array, "n k"], Gaussian]:
+    """State given the next one, as a linear function of it: `backward` of the arithmetic that has this form."""
+    found = condition(form, belief.covariance, F, total(Q, added_root), -factor.apply(F, belief.mean) - b)
+    return found.gain, Gaussian(belief.mean + found.shift, found.covariance)
+
+
 def among(mask: Bool[Array, " m"] | None, R: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """The rows and columns of R, zero where masked; all of R without a mask."""
     return R if mask is None else jnp.where(mask[:, None] & mask, R, 0.0)

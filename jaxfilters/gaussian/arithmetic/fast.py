@@ -43,6 +43,17 @@ def rts(
     return covariance.rts(_form, belief, following, F, Q, b, added_root)
 
 
+def backward(
+    belief: Gaussian,
+    F: Float[Array, "k n"],
+    Q: Float[Array, "k k"],
+    b: Float[Array, " k"] | float = 0.0,
+    added_root: Float[Array, "k _"] | None = None,
+) -> tuple[Float[Array, "n k"], Gaussian]:
+    """State given the next one as a linear function of it; as `joseph.backward`."""
+    return covariance.backward(_form, belief, F, Q, b, added_root)
+
+
 def _form(P, H, R, gain, W):
     del H, R, gain
     return P - factor.outer(W, W)

@@ -57,6 +57,20 @@ def rts(
     return covariance.rts(_form, belief, following, F, Q, b, added_root)
 
 
+def backward(
+    belief: Gaussian,
+    F: Float[Array, "k n"],
+    Q: Float[Array, "k k"],
+    b: Float[Array, " k"] | float = 0.0,
+    added_root: Float[Array, "k _"] | None = None,
+) -> tuple[Float[Array, "n k"], Gaussian]:
+    """State given the next one, x': the gain G and the belief N(g, C), so that x is N(g + G x', C).
+
+    The next step is `x' = F x + b + q`, q ~ N(0, Q), as for `rts`.
+    """
+    return covariance.backward(_form, belief, F, Q, b, added_root)
+
+
 def _form(P, H, R, gain, W):
     del W
     return factor.turned(covariance.kept(gain, H), P) + factor.turned(gain, R)

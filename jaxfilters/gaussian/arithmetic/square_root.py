@@ -83,6 +83,23 @@ def rts(
     return GaussianRoot(mean, linalg.tria(jnp.hstack([known, linalg.matmul(gain, following.root)])))
 
 
+def backward(
+    belief: GaussianRoot,
+    F: Float[Array, "k n"],
+    root_Q: Float[Array, "k _"],
+    b: Float[Array, " k"] | float = 0.0,
+    added_root: Float[Array, "k _"] | None = None,
+) -> tuple[Float[Array, "n k"], GaussianRoot]:
+    """State given the next one, x': the gain G and the belief N(g, C), so that x is N(g + G x', C).
+
+    The next step is `x' = F x + b + root_Q q`, q ~ N(0, I), as for `rts`.
+    """
+    noise = root_Q if added_root is None else jnp.hstack([root_Q, added_root])
+    root, cross, known = _conditioned(linalg.matmul(F, belief.root), noise, belief.root)
+    gain = linalg.solve_triangular(root, cross.T, transpose=True).T
+    return gain, GaussianRoot(belief.mean - factor.apply(gain, factor.apply(F, belief.mean) + b), known)
+
+
 def noise_root(
     root_R: Float[Array, "m _"], mask: Bool[Array, " m"] | None = None, added_root: Float[Array, "m _"] | None = None
 ) -> Float[Array, "m m"]:

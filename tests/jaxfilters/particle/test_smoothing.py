@@ -56,8 +56,13 @@ def filtered(key, num_particles, ys, inputs):
     return run(pf, key, ys, inputs, collect=keep_history)[1]
 
 
+# A bound above the maximum of the density: candidates are refused more often, and the result is the same.
+LOG_BOUND = float(norm.logpdf(0.0, 0.0, PROCESS_STD)) + 0.5
+
+
 @pytest.mark.system
-def test_both_smoothers_agree_with_the_joint_gaussian():
+@pytest.mark.parametrize("options", [{}, {"log_bound": LOG_BOUND, "max_candidates": 3}], ids=["all", "rejection"])
+def test_both_smoothers_agree_with_the_joint_gaussian(options):
     # Means over independent runs; their bias, O(1/N), is far below four standard errors of the mean.
     ys, inputs = simulate(0)
     mean, covariance = joint_posterior(np.asarray(ys, float), np.asarray(inputs, float))
@@ -67,7 +72,7 @@ def test_both_smoothers_agree_with_the_joint_gaussian():
     def smoothed(key):
         filter_key, path_key = jax.random.split(key)
         history = filtered(filter_key, 200, ys, inputs)
-        paths = backward_sampling(path_key, history, log_transition, inputs, num_paths=100)
+        paths = backward_sampling(path_key, history, log_transition, inputs, num_paths=100, **options)
         traced = weights.mean(trajectories(history), history.log_weights[-1])
         # The covariance of neighbours is that of whole paths, not of frames.
         neighbours = jnp.mean(paths[1:] * paths[:-1], axis=-1)
