@@ -45,8 +45,12 @@ from .particle import sharding as sharding
 from .particle.adaptive import adaptive_diffusion as adaptive_diffusion
 from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
-from .particle.guided import Guidance as Guidance
-from .particle.guided import guided as guided
+from .particle.auxiliary import Proposal as Proposal
+from .particle.auxiliary import auxiliary as auxiliary
+from .particle.auxiliary import guided as guided
+from .particle.guided_rao_blackwell import Guidance as Guidance
+from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
+from .particle.locally_optimal import locally_optimal as locally_optimal
 from .particle.mixed_model import LinearObservation as LinearObservation
 from .particle.mixed_model import MixedDynamics as MixedDynamics
 from .particle.partitioned import Partitions as Partitions

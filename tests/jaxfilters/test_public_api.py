@@ -95,7 +95,7 @@ SAMPLED = {
     "rao_blackwell_shared": lambda noise: jf.rao_blackwell_shared(
         *rao_blackwell_model(noise), num_particles=COUNT, noise_dim=1
     ),
-    "guided": lambda noise: jf.guided(
+    "guided_rao_blackwell": lambda noise: jf.guided_rao_blackwell(
         jf.rao_blackwell_shared(*rao_blackwell_model(noise), num_particles=COUNT, noise_dim=1),
         lambda particles, log_weights, y: jf.Guidance(y, 1 / covariance(noise)),
     ),

@@ -84,7 +84,7 @@ def depends_on_x(x, u):
 
 def run_guided(point=lambda y: y, information=ONE, **options):
     guide = lambda particles, log_weights, y: jf.Guidance(point(y), information)
-    return jf.run(jf.guided(marginal(jf.rao_blackwell_shared), guide, **options), KEY, YS)
+    return jf.run(jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), guide, **options), KEY, YS)
 
 
 def run_adaptive(prior=lambda key: jnp.zeros(2), log_likelihood=lambda x, y: -jnp.sum(x**2, axis=0), **options):
@@ -134,7 +134,7 @@ def not_shared():
 
 
 def unguided():
-    return jf.guided(marginal(jf.rao_blackwell_shared), lambda particles, log_weights, y: y)
+    return jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), lambda particles, log_weights, y: y)
 
 
 NAN = float("nan")
@@ -227,8 +227,8 @@ PARTICLE = [
     Case("guide sign", lambda: run_guided(information=-jnp.eye(1)), ("information", "-1")),
     Case("guide local", lambda: run_guided(local=lambda x, other: 0.0), ("local", "()", "(1,)")),
     Case("guide share", lambda: run_guided(prior_share=1.0), ("prior_share", "1.0")),
-    Case("guide kind", lambda: jf.guided(marginal(), lambda *a: None), ("inner", "rao_blackwell_shared")),
-    Case("guide no function", lambda: jf.guided(marginal(jf.rao_blackwell_shared), 0), ("guide", "0")),
+    Case("guide kind", lambda: jf.guided_rao_blackwell(marginal(), lambda *a: None), ("inner", "rao_blackwell_shared")),
+    Case("guide no function", lambda: jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), 0), ("guide", "0")),
     Case("guide result", lambda: jf.run(unguided(), KEY, YS), ("guide", "Guidance")),
     # Adaptive diffusion and partitions.
     Case(
