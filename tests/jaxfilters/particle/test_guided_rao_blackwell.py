@@ -99,7 +99,11 @@ def test_an_unseen_frame_is_a_plain_prediction():
     ys = jnp.asarray(simulate(), dtype=float)
     mask = jnp.arange(len(ys)) % 3 != 1
     state, infos = run(
-        guided_rao_blackwell(make_inner(), look), jax.random.key(2), jnp.where(mask, ys, jnp.nan), mask=mask, collect=keep_info
+        guided_rao_blackwell(make_inner(), look),
+        jax.random.key(2),
+        jnp.where(mask, ys, jnp.nan),
+        mask=mask,
+        collect=keep_info,
     )
     assert np.all(np.isfinite(infos.log_evidence))
     assert np.all(np.isfinite(state.ensemble.particles))
