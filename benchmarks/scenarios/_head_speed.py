@@ -13,13 +13,13 @@ from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
-from jaxfilters.trackers.head import learning
-from jaxfilters.trackers.head.estimate import refined
-from jaxfilters.trackers.head.registration import register
-from jaxfilters.trackers.head.search import Searches, at, searches
-from jaxfilters.trackers.head.state import POSE, HeadOptions, HeadState
-from jaxfilters.trackers.head.track import SHARPENING, advance, begin
-from jaxfilters.trackers.head.ways import WAYS
+from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.estimate import refined
+from jaxfilters.trackers.head.common.search import Searches, at, searches
+from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState
+from jaxfilters.trackers.head.stereo.registration import register
+from jaxfilters.trackers.head.stereo.track import SHARPENING, advance, begin
+from jaxfilters.trackers.head.stereo.ways import WAYS
 
 BATCH = 8
 """Frames in one call."""

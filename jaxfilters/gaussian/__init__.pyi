@@ -8,6 +8,7 @@ from . import gaussian_sum as gaussian_sum
 from . import linear as linear
 from . import linearize as linearize
 from . import manifold as manifold
+from . import noise_models as noise_models
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust
 from . import sigma_point as sigma_point

@@ -56,17 +56,17 @@ def _init(model: HiddenMarkovModel, key: AnyKey) -> ChainState:
     return ChainState(model.log_initial, jnp.zeros((), bool))
 
 
-def _predict(model: HiddenMarkovModel, key: AnyKey, state: ChainState, control: PyTree) -> ChainState:
-    del key, control
+def _predict(model: HiddenMarkovModel, key: AnyKey, state: ChainState, inputs: PyTree) -> ChainState:
+    del key, inputs
     arriving = state.log_probabilities[:, None] + model.log_transition
     _, ahead = jax.vmap(weights.normalize, in_axes=1)(arriving)
     return ChainState(jnp.where(state.started, ahead, state.log_probabilities), jnp.ones((), bool))
 
 
 def _update(
-    model: HiddenMarkovModel, key: AnyKey, state: ChainState, observation: PyTree
+    model: HiddenMarkovModel, key: AnyKey, state: ChainState, observation: PyTree, inputs: PyTree
 ) -> tuple[ChainState, ChainInfo]:
-    del key
+    del key, inputs
     log_likelihood = observation if model.emission is None else model.emission.log_likelihood(observation)
     if jnp.shape(log_likelihood) != model.log_initial.shape:
         name = "observation, without an emission," if model.emission is None else "emission.log_likelihood"
