@@ -44,11 +44,11 @@ from .particle import proposals as proposals
 from .particle import resampling as resampling
 from .particle import sharding as sharding
 from .particle.adaptive import adaptive_diffusion as adaptive_diffusion
-from .particle.bootstrap import ParticleState as ParticleState
-from .particle.bootstrap import bootstrap as bootstrap
 from .particle.auxiliary import Proposal as Proposal
 from .particle.auxiliary import auxiliary as auxiliary
 from .particle.auxiliary import guided as guided
+from .particle.bootstrap import ParticleState as ParticleState
+from .particle.bootstrap import bootstrap as bootstrap
 from .particle.guided_rao_blackwell import Guidance as Guidance
 from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
 from .particle.locally_optimal import locally_optimal as locally_optimal

@@ -47,6 +47,7 @@ from jaxfilters.typing import (
     SampleTransition,
     Temper,
     as_pytree,
+    taking_inputs,
 )
 
 _LOWEST_FIRST_STAGE = -50.0
@@ -77,9 +78,9 @@ class Proposal(NamedTuple):
     r"""A proposal $q(x_t \mid x_{t-1}, y_t)$ given by two functions of one particle; a plain pair will do as well."""
 
     sample: Callable[..., PyTree]
-    """`(randomness, x, y, inputs) -> x_next`, where `randomness` is what the filter's `noise` draws."""
+    """`(randomness, x, y[, inputs]) -> x_next`, where `randomness` is what the filter's `noise` draws."""
     log_density: Callable[..., Array]
-    """`(x_next, x, y, inputs) -> log q(x_next | x, y)`, a scalar, normalised."""
+    """`(x_next, x, y[, inputs]) -> log q(x_next | x, y)`, a scalar, normalised."""
 
 
 class AuxiliaryState(NamedTuple):
@@ -153,10 +154,10 @@ def guided(
 
     Args:
         sample_prior: `key -> x`; or one of `jaxfilters.priors`, which draw all particles at once, twice as fast.
-        sample_transition: `(randomness, x, inputs) -> x`, one step of the model; it moves the particles in frames
+        sample_transition: `(randomness, x[, inputs]) -> x`, one step of the model; it moves the particles in frames
             without an observation.
-        log_likelihood: `(x, y) -> log p(y | x)`, a scalar.
-        log_transition: `(x_next, x, inputs) -> log p(x_next | x)`, a scalar, normalised.
+        log_likelihood: `(x, y[, inputs]) -> log p(y | x)`, a scalar.
+        log_transition: `(x_next, x[, inputs]) -> log p(x_next | x)`, a scalar, normalised.
         proposal: A pair `(sample, log_density)`, see `Proposal`; or one of `jaxfilters.proposals`: `linearized`, which
             is optimal where the observation is linear, or `laplace`.
         num_particles: Number n of particles.
@@ -177,10 +178,10 @@ def guided(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> from jax.scipy.stats import norm
-        >>> move = lambda noise, x, inputs: 0.9 * x + 0.5 * noise
-        >>> log_transition = lambda x_next, x, inputs: norm.logpdf(x_next, 0.9 * x, 0.5).sum()
+        >>> move = lambda noise, x: 0.9 * x + 0.5 * noise
+        >>> log_transition = lambda x_next, x: norm.logpdf(x_next, 0.9 * x, 0.5).sum()
         >>> log_likelihood = lambda x, y: norm.logpdf(y, x, 0.1).sum()
-        >>> near_y = (lambda noise, x, y, inputs: y + 0.2 * noise, lambda z, x, y, inputs: norm.logpdf(z, y, 0.2).sum())
+        >>> near_y = (lambda noise, x, y: y + 0.2 * noise, lambda z, x, y: norm.logpdf(z, y, 0.2).sum())
         >>> pf = jf.guided(
         ...     lambda key: jnp.zeros(1), move, log_likelihood, log_transition=log_transition, proposal=near_y,
         ...     num_particles=1000, noise=jf.StandardNormal(1),
@@ -221,9 +222,9 @@ def auxiliary(
     Args:
         sample_prior: As for `guided`, like all arguments that are not described here.
         sample_transition: One step of the model.
-        log_likelihood: `(x, y) -> log p(y | x)`.
-        log_first_stage: `(x, y, inputs) -> log eta`, a scalar, where x is the state of the step before. NaN, `+inf` and
-            what is below e^-50 of the largest count as e^-50 of it, so that no particle is excluded.
+        log_likelihood: `(x, y[, inputs]) -> log p(y | x)`.
+        log_first_stage: `(x, y[, inputs]) -> log eta`, a scalar, where x is the state of the step before. NaN, `+inf`
+            and what is below e^-50 of the largest count as e^-50 of it, so that no particle is excluded.
         log_transition: Density of the transition; needed where a proposal is given.
         proposal: `None` proposes by the transition.
         num_particles: Number n of particles.
@@ -243,11 +244,11 @@ def auxiliary(
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
-        >>> move = lambda noise, x, inputs: 0.9 * x + 0.1 * noise
+        >>> move = lambda noise, x: 0.9 * x + 0.1 * noise
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2)
         >>> pf = jf.auxiliary(
         ...     lambda key: jnp.zeros(1), move, log_likelihood, num_particles=1000, noise=jf.StandardNormal(1),
-        ...     log_first_stage=lambda x, y, inputs: log_likelihood(0.9 * x, y),
+        ...     log_first_stage=lambda x, y: log_likelihood(0.9 * x, y),
         ... )
         >>> state, infos = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.keep_info)
         >>> bool((infos.effective_sample_size > 900).all())
@@ -279,11 +280,11 @@ def _build(
     checks.check_ensemble(num_particles, ess_threshold, scheme, temper)
     params = Auxiliary(
         as_pytree(sample_prior),
-        as_pytree(sample_transition),
-        None if log_transition is None else as_pytree(log_transition),
-        as_pytree(log_likelihood),
+        taking_inputs("sample_transition", sample_transition, "randomness", "x"),
+        None if log_transition is None else taking_inputs("log_transition", log_transition, "x_next", "x"),
+        taking_inputs("log_likelihood", log_likelihood, "x", "y"),
         None if proposal is None else _as_proposal(proposal, noise),
-        None if log_first_stage is None else as_pytree(log_first_stage),
+        None if log_first_stage is None else taking_inputs("log_first_stage", log_first_stage, "x", "y"),
         as_pytree(temper or no_tempering),
         ess_threshold,
         num_particles,
@@ -300,7 +301,11 @@ def _as_proposal(proposal: Any, noise: DrawNoise) -> EnsembleProposal:
         raise TypeError(f"proposal must be a pair (sample, log_density) or one of jf.proposals; got {proposal!r}.")
     sample, log_density = proposal
     checks.check_callables(**{"sample of proposal": sample, "log_density of proposal": log_density})
-    return _FromPair(as_pytree(sample), as_pytree(log_density), noise)
+    return _FromPair(
+        taking_inputs("sample of proposal", sample, "randomness", "x", "y"),
+        taking_inputs("log_density of proposal", log_density, "x_next", "x", "y"),
+        noise,
+    )
 
 
 def _init(model: Auxiliary, key: AnyKey) -> AuxiliaryState:
@@ -324,13 +329,13 @@ def _moved(model: Auxiliary, key: AnyKey, particles: PyTree, inputs: PyTree) -> 
 
 
 def _update(
-    model: Auxiliary, key: AnyKey, state: AuxiliaryState, observation: PyTree, inputs: PyTree = None
+    model: Auxiliary, key: AnyKey, state: AuxiliaryState, observation: PyTree, inputs: PyTree
 ) -> tuple[AuxiliaryState, ParticleInfo]:
     resample_key, draw_key = jax.random.split(key)
     parents, log_weights, ancestors = _select(model, resample_key, state, observation, inputs)
     particles, log_ratio = _propose(model, draw_key, parents, observation, inputs)
     log_likelihood = checks.checked_log_likelihood(model.log_likelihood)
-    log_factor = jax.vmap(log_likelihood, in_axes=(-1, None))(particles, observation) + log_ratio
+    log_factor = jax.vmap(log_likelihood, in_axes=(-1, None, None))(particles, observation, inputs) + log_ratio
     log_weights, info = reweight(log_weights, log_factor, ancestors, model.temper)
     return AuxiliaryState(particles, log_weights, ancestors, parents), info
 

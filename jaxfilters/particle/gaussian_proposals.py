@@ -24,7 +24,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.linearize import Linearize, taylor
 from jaxfilters.math.linalg import cholesky, matmul, safe_norm, solve_triangular
 from jaxfilters.particle import checks
-from jaxfilters.typing import AnyKey, LogLikelihood, as_pytree
+from jaxfilters.typing import AnyKey, LogLikelihood, only_inputs, taking_inputs
 
 Covariance = Array | Callable[[PyTree], Array]
 _LONGEST_STEP = 2.0
@@ -71,19 +71,20 @@ class LinearizedProposal:
 
     def posterior(self, x: Array, y: Array, inputs: PyTree) -> tuple[Whitened, Float[Array, ""]]:
         """The approximate posterior of one particle, and its evidence."""
-        ahead, root = prediction(self, x, inputs)
+        ahead, root = predicted = prediction(self, x, inputs)
         checks.check_shape("observation", y, jnp.shape(self.observation_noise)[:1], "that of observation_noise")
-        found = self._linearized(ahead, root, y, jnp.zeros_like(ahead), root)
+        found = self._linearized(predicted, y, inputs, jnp.zeros_like(ahead), root)
         for _ in range(self.iterations - 1):
             posterior, _ = found
             inverse = solve_triangular(posterior.precision_root, jnp.eye(ahead.size, dtype=ahead.dtype))
-            found = self._linearized(ahead, root, y, posterior.center, matmul(root, inverse.T))
+            found = self._linearized(predicted, y, inputs, posterior.center, matmul(root, inverse.T))
         return found
 
-    def _linearized(self, ahead, root, y, center, spread):
+    def _linearized(self, predicted, y, inputs, center, spread):
         """The posterior with the observation linearised about `ahead + root @ center`, for that spread about it."""
+        ahead, root = predicted
         about = Gaussian(ahead + root @ center, matmul(spread, spread.T))
-        linear = self.linearize(self.observe, about)
+        linear = self.linearize(lambda state: self.observe(state, inputs), about)
         checks.check_shape("the result of observe", linear.value, y.shape, "that of the observation")
         R = self.observation_noise + matmul(linear.residual_root, linear.residual_root.T)
         # Components without a reading say nothing.
@@ -129,7 +130,7 @@ class LaplaceProposal:
         """The Gaussian at the mode of the posterior of one particle, and Laplace's approximation of its evidence."""
         ahead, root = prediction(self, x, inputs)
         log_likelihood = checks.checked_log_likelihood(self.log_likelihood)
-        fit = lambda z: log_likelihood(ahead + root @ z, y)
+        fit = lambda z: log_likelihood(ahead + root @ z, y, inputs)
 
         def newton(_, z: Array) -> Array:
             precision_root = _precision_root(fit, z)
@@ -145,9 +146,9 @@ class LaplaceProposal:
 
 
 def linearized(
-    transition: Callable[[Array, PyTree], Array],
+    transition: Callable[..., Array],
     process_noise: Covariance,
-    observe: Callable[[Array], Array],
+    observe: Callable[..., Array],
     observation_noise: Float[Array, "m m"],
     *,
     linearize: Linearize = taylor,
@@ -161,9 +162,9 @@ def linearized(
     adapted. Components of y that are NaN are left out.
 
     Args:
-        transition: `(x, inputs) -> x`, f, without noise; (n,) to (n,).
+        transition: `(x[, inputs]) -> x`, f, without noise; (n,) to (n,).
         process_noise: Covariance of q, (n, n), maybe singular; or a function `inputs -> covariance`.
-        observe: `x -> y`, h, without noise; (n,) to (m,).
+        observe: `(x[, inputs]) -> y`, h, without noise; (n,) to (m,).
         observation_noise: Covariance of r, (m, m), positive definite.
         linearize: `jf.linearize.taylor`, `second_order`, `cubature` or `unscented(...)`.
         iterations: How often h is linearised: 1 at the prediction; more, each about the posterior of the one before, as
@@ -183,7 +184,7 @@ def linearized(
     Example:
         >>> import jax.numpy as jnp, jaxfilters as jf
         >>> one = jnp.eye(1)
-        >>> optimal = jf.proposals.linearized(lambda x, inputs: 0.9 * x, one, lambda x: x, one)
+        >>> optimal = jf.proposals.linearized(lambda x: 0.9 * x, one, lambda x: x, one)
         >>> log_predictive = optimal.log_predictive(jnp.ones(1), jnp.zeros(1), None)
         >>> bool(jnp.isclose(log_predictive, jf.Gaussian(0.9 * jnp.ones(1), 2 * one).logpdf(jnp.zeros(1))))
         True
@@ -192,9 +193,9 @@ def linearized(
     checks.check_callables(observe=observe, linearize=linearize)
     checks.check_covariance("observation_noise", observation_noise)
     return LinearizedProposal(
-        as_pytree(transition),
-        as_pytree(process_noise) if callable(process_noise) else process_noise,
-        as_pytree(observe),
+        taking_inputs("transition", transition, "x"),
+        only_inputs("process_noise", process_noise) if callable(process_noise) else process_noise,
+        taking_inputs("observe", observe, "x"),
         observation_noise,
         float(prior_share),
         linearize,
@@ -203,7 +204,7 @@ def linearized(
 
 
 def laplace(
-    transition: Callable[[Array, PyTree], Array],
+    transition: Callable[..., Array],
     process_noise: Covariance,
     log_likelihood: LogLikelihood,
     *,
@@ -216,9 +217,9 @@ def laplace(
     deviations of q long; directions in which the log-likelihood is convex keep the spread of the transition.
 
     Args:
-        transition: `(x, inputs) -> x`, f, without noise; (n,) to (n,).
+        transition: `(x[, inputs]) -> x`, f, without noise; (n,) to (n,).
         process_noise: Covariance of q, (n, n), maybe singular; or a function `inputs -> covariance`.
-        log_likelihood: `(x, y) -> log p(y | x)`, a scalar, twice differentiable in x.
+        log_likelihood: `(x, y[, inputs]) -> log p(y | x)`, a scalar, twice differentiable in x.
         iterations: Steps of Newton's method, at least 1.
         prior_share: As for `linearized`.
 
@@ -232,14 +233,19 @@ def laplace(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> poisson = lambda x, y: jax.scipy.stats.poisson.logpmf(y, jnp.exp(x[0]))
-        >>> proposal = jf.proposals.laplace(lambda x, inputs: 0.9 * x, 0.1 * jnp.eye(1), poisson)
+        >>> proposal = jf.proposals.laplace(lambda x: 0.9 * x, 0.1 * jnp.eye(1), poisson)
         >>> proposal.posterior(jnp.zeros(1), jnp.array(3), None)[0].center.shape
         (1,)
     """
     _check(transition, process_noise, iterations, prior_share)
     checks.check_callables(log_likelihood=log_likelihood)
-    noise = as_pytree(process_noise) if callable(process_noise) else process_noise
-    return LaplaceProposal(as_pytree(transition), noise, as_pytree(log_likelihood), float(prior_share), iterations)
+    return LaplaceProposal(
+        taking_inputs("transition", transition, "x"),
+        only_inputs("process_noise", process_noise) if callable(process_noise) else process_noise,
+        taking_inputs("log_likelihood", log_likelihood, "x", "y"),
+        float(prior_share),
+        iterations,
+    )
 
 
 def _check(transition, process_noise, iterations, prior_share):

@@ -27,9 +27,9 @@ from jaxfilters.typing import ResamplingScheme
 
 def locally_optimal(
     prior: Gaussian,
-    transition: Callable[[Array, PyTree], Array],
+    transition: Callable[..., Array],
     process_noise: Array | Callable[[PyTree], Array],
-    observe: Callable[[Array], Float[Array, " m"]],
+    observe: Callable[..., Float[Array, " m"]],
     observation_noise: Float[Array, "m m"],
     *,
     num_particles: int,
@@ -48,9 +48,9 @@ def locally_optimal(
 
     Args:
         prior: Belief before the first observation, with a mean (n,) and a covariance (n, n).
-        transition: `(x, inputs) -> x`, f, without noise.
+        transition: `(x[, inputs]) -> x`, f, without noise.
         process_noise: Covariance of q, (n, n), or a function `inputs -> covariance`.
-        observe: `x -> y`, h, without noise; (n,) to (m,).
+        observe: `(x[, inputs]) -> y`, h, without noise; (n,) to (m,).
         observation_noise: Covariance of r, (m, m), positive definite.
         num_particles: Number of particles.
         linearize: How each particle linearises h, as for `jf.proposals.linearized`.
@@ -69,7 +69,7 @@ def locally_optimal(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> wave = lambda x, inputs: x + jnp.sin(x)
+        >>> wave = lambda x: x + jnp.sin(x)
         >>> pf = jf.locally_optimal(prior, wave, 0.1 * jnp.eye(1), lambda x: x**2, jnp.eye(1), num_particles=500)
         >>> state, infos = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.keep_info)
         >>> infos.log_evidence.shape
@@ -119,9 +119,9 @@ class AdditiveGaussian:
         ahead, root = prediction(self.proposal, x, inputs)
         return logpdf(x_next - ahead, root)
 
-    def log_likelihood(self, x: Float[Array, " n"], y: Float[Array, " m"]) -> Float[Array, ""]:
+    def log_likelihood(self, x: Float[Array, " n"], y: Float[Array, " m"], inputs: PyTree) -> Float[Array, ""]:
         """Log density of the components of an observation that are finite."""
         read = jnp.isfinite(y)
         R = jnp.where(read[:, None] & read, self.proposal.observation_noise, 0.0)
-        error = jnp.where(read, jnp.where(read, y, 0.0) - self.proposal.observe(x), 0.0)
+        error = jnp.where(read, jnp.where(read, y, 0.0) - self.proposal.observe(x, inputs), 0.0)
         return logpdf(error, cholesky(R))

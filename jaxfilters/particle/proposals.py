@@ -3,10 +3,10 @@ r"""Proposals of particle filters.
 `linearized` and `laplace` propose from the observation, for `jf.guided` and `jf.auxiliary`. The others are for the
 argument `proposal` of Rao-Blackwellized filters, and say how the increment of the nonlinear state is drawn.
 
-Such a proposal draws $\delta = z - A_n m$, the deviation of the increment $z$ from its prediction by the mean $m$ of the
-linear state. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, where $P$ is the covariance of the
+Such a proposal draws $\delta = z - A_n m$, the deviation of the increment $z$ from its prediction by the mean $m$ of
+the linear state. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, where $P$ is the covariance of the
 linear state (T. Schön, F. Gustafsson and P.-J. Nordlund, "Marginalized particle filters for mixed linear/nonlinear
-state-space models", IEEE Transactions on Signal Processing 53, 2005). Each proposal is
+state-space models", IEEE Transactions on Signal Processing 53, 2005). Each is
 `(noise, N, Q_n) -> (delta, log_correction)`, where `noise` is standard normal and `log_correction` is the logarithm of
 the ratio of this density to the one that was drawn from, to be added to the log weight.
 """

@@ -137,11 +137,11 @@ def metropolis(num_steps: int) -> Metropolis:
     """Build Metropolis resampling, which compares weights in pairs and never sums them.
 
     In every place a Metropolis chain starts from its own particle, and proposes another one `num_steps` times. The
-    ancestors are biased: with w the normalised weights, the distribution of each is at most (1 - 1 / (n max w))^num_steps
-    away from w in total variation (L. Murray, A. Lee and P. Jacob, "Parallel resampling in the particle filter",
-    Journal of Computational and Graphical Statistics 25, 2016, section 3), so that the evidence of a filter is not
-    unbiased. A particle without weight is left at the first proposal; with few steps it may come from another one such.
-    The indices are not sorted.
+    ancestors are biased: with normalised weights w, the distribution of each differs from w by at most
+    (1 - 1 / (n max w))^num_steps in total variation (L. Murray, A. Lee and P. Jacob, "Parallel resampling in the
+    particle filter", Journal of Computational and Graphical Statistics 25, 2016, section 3), so that the evidence of a
+    filter is not unbiased. A particle without weight is left at the first proposal; with few steps, it may be for
+    another one without. The indices are not sorted.
 
     Args:
         num_steps: Number of steps, at least 1; `metropolis_steps` says how many a bias needs.
