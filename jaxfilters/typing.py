@@ -196,8 +196,6 @@ def only_inputs(name: str, callback: Callable) -> Callable:
 def _longer_form(name: str, callback: Callable, shorter: tuple[str, ...], longer: tuple[str, ...] = ()) -> bool:
     """Whether the signature of a function has the longer list of arguments, one more than the shorter one, if any."""
     expected = f"{name} must take " + " or ".join(f"({', '.join(form)})" for form in (shorter, longer) if form)
-    if not callable(callback):
-        raise TypeError(f"{name} must be a function; got a {type(callback).__name__}.")
     try:
         signature = inspect.signature(callback)
     except (TypeError, ValueError) as error:

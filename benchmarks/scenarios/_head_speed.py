@@ -151,8 +151,9 @@ def _searched(search: Searches, state: HeadState, images: Array, key: Array, *, 
     chosen, deviation = (search.layered, model.deviation) if layered else (search.rigid, 0 * model.deviation)
     filter = at(chosen, model, model.templates, deviation)
     predict_key, update_key = jax.random.split(key)
-    moved = filter.predict(filter.params, predict_key, state.search, jnp.ones_like(state.time))
-    return filter.update(filter.params, update_key, moved, images)[0]
+    steps = jnp.ones_like(state.time)
+    moved = filter.predict(filter.params, predict_key, state.search, steps)
+    return filter.update(filter.params, update_key, moved, images, steps)[0]
 
 
 def _refined(rig, state: HeadState, images: Array, search):

@@ -34,7 +34,8 @@ def online(model: HiddenMarkovModel) -> Filter:
     """The exact filter of the hidden state, for `jaxfilters.run`.
 
     Args:
-        model: The model. Observations are those of `model.emission`; without one, log-likelihoods (Q,).
+        model: The model. Observations are those of `model.emission`; without one, log-likelihoods (Q,). Transitions
+            that are a function of the inputs get those of `jf.run`; those of the first frame are not used.
 
     Raises:
         ValueError: If `log_initial` and `log_transition` are not (Q,) and (Q, Q).
@@ -47,7 +48,8 @@ def online(model: HiddenMarkovModel) -> Filter:
         >>> states.log_probabilities.shape
         (5, 2)
     """
-    check_model(model)
+    if not callable(model.log_transition):
+        check_model(model)
     return Filter(model, _init, _predict, _update)
 
 
@@ -57,8 +59,8 @@ def _init(model: HiddenMarkovModel, key: AnyKey) -> ChainState:
 
 
 def _predict(model: HiddenMarkovModel, key: AnyKey, state: ChainState, inputs: PyTree) -> ChainState:
-    del key, inputs
-    arriving = state.log_probabilities[:, None] + model.log_transition
+    del key
+    arriving = state.log_probabilities[:, None] + model.transition_of(inputs)
     _, ahead = jax.vmap(weights.normalize, in_axes=1)(arriving)
     return ChainState(jnp.where(state.started, ahead, state.log_probabilities), jnp.ones((), bool))
 

@@ -255,7 +255,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     filter = hypotheses(_filter(setup, _first_belief(state.bank)), setup.hand, capacity=capacity, start=None)
     elapsed = (time - state.time) / FRAME_INTERVAL
     predicted = filter.predict(filter.params, predict_key, state.bank, elapsed)
-    bank, info = filter.update(filter.params, update_key, predicted, Look(frame.y, frame.mask, frame.std))
+    bank, info = filter.update(filter.params, update_key, predicted, Look(frame.y, frame.mask, frame.std), elapsed)
     measured = jnp.any(frame.mask)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components)
     told = report_of(best)

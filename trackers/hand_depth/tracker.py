@@ -322,12 +322,13 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
     filter = _filter(setup, open_palm(jnp.zeros(3)), state.scale)
-    predicted = filter.predict(filter.params, predict_key, state.ensemble, time - state.time)
+    elapsed = time - state.time
+    predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
     expected, _ = pose_moments(*_particles(predicted))
     image = look(setup.camera, _filled(frame, state.missing_is_background), expected, state.scale, setup.stride)
 
     def update(ensemble: Any) -> tuple[Any, ParticleInfo]:
-        return filter.update(filter.params, update_key, ensemble, image)
+        return filter.update(filter.params, update_key, ensemble, image, elapsed)
 
     def coast(ensemble: Any) -> tuple[Any, ParticleInfo]:
         _, info = jax.eval_shape(update, ensemble)

@@ -46,8 +46,11 @@ class FaceLikelihood:
     sigma: float | Float[Array, ""] = 3.0
     """Standard deviation of the sum of the scores."""
 
-    def __call__(self, particles: Float[Array, "d n"], images: Num[Array, "C rows cols"]) -> Float[Array, " n"]:
-        """Log weights."""
+    def __call__(
+        self, particles: Float[Array, "d n"], images: Num[Array, "C rows cols"], inputs: Array | None = None
+    ) -> Float[Array, " n"]:
+        """Log weights; the inputs, which are the time since the last frame, do not matter."""
+        del inputs
 
         def project(x: Array) -> Array:
             return project_shape(self.rig, shape(self.model, x[POSE:]), x[:POSE])[0]

@@ -137,7 +137,7 @@ def _searched(
         filter = at(filter, state.model, templates, deviation)
         predict_key, update_key = jax.random.split(key)
         search = filter.predict(filter.params, predict_key, state.search, steps)
-        return filter.update(filter.params, update_key, search, images)
+        return filter.update(filter.params, update_key, search, images, steps)
 
     if not options.is_published:
         return run(searches.rigid, jnp.zeros_like(state.model.deviation))

@@ -145,7 +145,7 @@ def _step(
         filter = at(filter, model, looks, deviation)
         predict_key, update_key = jax.random.split(search_key)
         search = filter.predict(filter.params, predict_key, state.search, steps)
-        return filter.update(filter.params, update_key, search, images)
+        return filter.update(filter.params, update_key, search, images, steps)
 
     search, info = way.search(run, searches, model)
     estimate, search = way.estimate(search, state, model, images, rig, moved, steps, options)
