@@ -59,6 +59,8 @@ from .particle.partitioned import batch_log_likelihood as batch_log_likelihood
 from .particle.rao_blackwell import rao_blackwell as rao_blackwell
 from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
 from .particle.tempering import AdaptiveTempering as AdaptiveTempering
+from .particle.twisted import IteratedAuxiliary as IteratedAuxiliary
+from .particle.twisted import iterated_auxiliary as iterated_auxiliary
 from .particle.weighting import ParticleInfo as ParticleInfo
 
 __version__: str

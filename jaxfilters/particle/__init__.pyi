@@ -15,4 +15,5 @@ from . import resampling as resampling
 from . import sharding as sharding
 from . import smoothing as smoothing
 from . import tempering as tempering
+from . import twisted as twisted
 from . import weighting as weighting

@@ -63,7 +63,7 @@ class LinearizedProposal:
 
     def draw(self, randomness: Array, x: Array, y: Array, inputs: PyTree) -> tuple[Array, Float[Array, ""]]:
         """A sample, and the logarithm of its density."""
-        return _draw(self.posterior(x, y, inputs)[0], randomness, self.prior_share)
+        return draw_whitened(self.posterior(x, y, inputs)[0], randomness, self.prior_share)
 
     def log_predictive(self, x: Array, y: Array, inputs: PyTree) -> Float[Array, ""]:
         """Approximation of log p(y | x of the step before), exact for linear observations: a first stage."""
@@ -120,7 +120,7 @@ class LaplaceProposal:
 
     def draw(self, randomness: Array, x: Array, y: PyTree, inputs: PyTree) -> tuple[Array, Float[Array, ""]]:
         """A sample, and the logarithm of its density."""
-        return _draw(self.posterior(x, y, inputs)[0], randomness, self.prior_share)
+        return draw_whitened(self.posterior(x, y, inputs)[0], randomness, self.prior_share)
 
     def log_predictive(self, x: Array, y: PyTree, inputs: PyTree) -> Float[Array, ""]:
         """Laplace's approximation of log p(y | x of the step before): a first stage."""
@@ -285,7 +285,8 @@ def _noise(key: AnyKey, particles: Array, prior_share: float) -> Array:
     return standard_normal(key, (size + (prior_share > 0), count), particles.dtype)
 
 
-def _draw(posterior: Whitened, randomness: Array, prior_share: float) -> tuple[Array, Float[Array, ""]]:
+def draw_whitened(posterior: Whitened, randomness: Array, prior_share: float) -> tuple[Array, Float[Array, ""]]:
+    """A sample of the approximation of a posterior mixed with the transition, and its log density."""
     ahead, root, center, precision_root = posterior
     noise = randomness[: center.size]
     z = center + solve_triangular(precision_root, noise, transpose=True)

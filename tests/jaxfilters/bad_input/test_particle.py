@@ -84,6 +84,11 @@ def run_laplace(Q=ONE, log_likelihood=log_likelihood, transition=lambda x: x, **
     return run_proposed(proposal=proposal)
 
 
+def run_twisted(ys=YS, inputs=None, prior=jf.Gaussian(jnp.zeros(1), ONE), **options):  # noqa: B008
+    model = {"transition": lambda x: x, "process_noise": ONE, "log_likelihood": log_likelihood, "num_particles": 8}
+    return jf.iterated_auxiliary(key=KEY, prior=prior, observations=ys, inputs=inputs, **model | options)
+
+
 def tempered(ess_fraction):
     return lambda: run_bootstrap(temper=jf.AdaptiveTempering(ess_fraction))
 
@@ -261,6 +266,15 @@ PARTICLE = [
     Case("laplace Q sign", lambda: run_laplace(-ONE), ("process_noise", "-1")),
     Case("laplace likelihood", lambda: run_laplace(log_likelihood=lambda x, y: x), ("log_likelihood", "(1,)")),
     Case("laplace rounds", lambda: run_laplace(iterations=True), ("iterations", "True")),
+    Case("twisted few", lambda: run_twisted(num_particles=3), ("num_particles", "4", "3")),
+    Case("twisted rounds", lambda: run_twisted(iterations=0), ("iterations", "0")),
+    Case("twisted prior", lambda: run_twisted(prior=jnp.zeros(1)), ("prior", "Gaussian")),
+    Case("twisted Q", lambda: run_twisted(process_noise=Q), ("process_noise", "(2, 2)", "(1, 1)")),
+    Case("twisted Q of inputs", lambda: run_twisted(process_noise=lambda u: Q), ("process_noise", "(2, 2)")),
+    Case("twisted likelihood", lambda: run_twisted(log_likelihood=lambda x, y: x), ("log_likelihood", "(1,)")),
+    Case("twisted transition", lambda: run_twisted(transition=lambda x: x[0]), ("transition", "()", "(1,)")),
+    Case("twisted inputs", lambda: run_twisted(inputs=jnp.zeros(4)), ("inputs", "3, 4")),
+    Case("twisted nothing", lambda: run_twisted(ys=jnp.zeros((0, 1))), ("observations", "0")),
     # Rao-Blackwellized filters.
     Case("RB likelihood (1,)", lambda: run_marginal(likelihood=vector_log_likelihood), ("log_likelihood", "(1,)")),
     Case("RB A_n", lambda: run_marginal(A_n=jnp.ones((2, 2))), ("A_n", "(2, 2)", "(1, 2)", "noise_dim")),
