@@ -285,19 +285,27 @@ def _noise(key: AnyKey, particles: Array, prior_share: float) -> Array:
     return standard_normal(key, (size + (prior_share > 0), count), particles.dtype)
 
 
-def draw_whitened(posterior: Whitened, randomness: Array, prior_share: float) -> tuple[Array, Float[Array, ""]]:
-    """A sample of the approximation of a posterior mixed with the transition, and its log density."""
+def draw_whitened(
+    posterior: Whitened, randomness: Float[Array, " m"], prior_share: float | Float[Array, ""]
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """A sample of a posterior mixed with the transition, and its log density.
+
+    Args:
+        posterior: The approximate posterior of one particle.
+        randomness: Standard normal numbers, (n,), and one more that chooses the component where there is a mixture.
+        prior_share: Fraction of the transition, below 1; no mixture without the additional number.
+    """
     ahead, root, center, precision_root = posterior
     noise = randomness[: center.size]
     z = center + solve_triangular(precision_root, noise, transpose=True)
-    log_density = -0.5 * jnp.sum(noise**2) + jnp.sum(jnp.log(jnp.diagonal(precision_root)))
-    if prior_share > 0:
+    log_determinant = jnp.sum(jnp.log(jnp.diagonal(precision_root)))
+    log_density = log_determinant - 0.5 * jnp.sum(noise**2)
+    if randomness.size > center.size:
         plain = jax.scipy.stats.norm.cdf(randomness[-1]) < prior_share
         z = jnp.where(plain, noise, z)
-        log_guided = jnp.sum(jnp.log(jnp.diagonal(precision_root)))
-        log_guided = log_guided - 0.5 * jnp.sum((precision_root.T @ (z - center)) ** 2)
+        log_guided = log_determinant - 0.5 * jnp.sum((precision_root.T @ (z - center)) ** 2)
         log_prior = -0.5 * jnp.sum(z**2)
-        log_density = jnp.logaddexp(math.log(prior_share) + log_prior, math.log1p(-prior_share) + log_guided)
+        log_density = jnp.logaddexp(jnp.log(prior_share) + log_prior, jnp.log1p(-prior_share) + log_guided)
     # From a density of z to that of x, over the directions with noise: those without have the same in the transition.
     diagonal = jnp.diagonal(root)
     fixed = diagonal == 0
