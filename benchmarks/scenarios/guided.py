@@ -76,7 +76,7 @@ def accuracy(seed: int) -> dict[str, Metric]:
     keys = jax.random.split(jax.random.key(seed), KEYS)
     found = {}
     for name, filter in filters(FEW).items():
-        estimates = jax.jit(jax.vmap(partial(log_evidence, filter, ys)))(keys)
+        estimates = jax.jit(jax.vmap(partial(estimate, filter, ys)))(keys)
         rmse = float(np.sqrt(np.mean((np.asarray(estimates) - truth) ** 2)))
         found[f"log_evidence_rmse_{name}"] = Metric(rmse, "", "lower")
     return found
@@ -90,7 +90,7 @@ def exact(ys: Float[Array, "t 1"]) -> float:
     return float(jaxfilters.log_evidence(filter, jax.random.key(0), ys))
 
 
-def log_evidence(filter: Filter, ys: Float[Array, "t 1"], key: AnyKey) -> Array:
+def estimate(filter: Filter, ys: Float[Array, "t 1"], key: AnyKey) -> Array:
     """Estimate of a particle filter."""
     return jaxfilters.log_evidence(filter, key, ys)
 
@@ -140,9 +140,9 @@ def log_first_stage(x: Array, y: Array) -> Array:
 
 def contests(num_particles: int, ys: Float[Array, "t 1"]) -> dict[str, dict[str, OfKey]]:
     """Filter -> library -> log evidence with a key; this library first."""
-    run = jax.jit(log_evidence)
+    compiled = jax.jit(estimate)
     found: dict[str, dict[str, OfKey]] = {
-        name: {"ours": partial(run, filter, ys)}
+        name: {"ours": partial(compiled, filter, ys)}
         for name, filter in filters(num_particles).items()
         if name != "bootstrap"
     }

