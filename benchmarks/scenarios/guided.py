@@ -76,7 +76,7 @@ def accuracy(seed: int) -> dict[str, Metric]:
     keys = jax.random.split(jax.random.key(seed), KEYS)
     found = {}
     for name, filter in filters(FEW).items():
-        estimates = jax.jit(jax.vmap(partial(estimate, filter, ys)))(keys)
+        estimates = jax.jit(jax.vmap(partial(estimate, filter=filter, ys=ys)))(keys)
         rmse = float(np.sqrt(np.mean((np.asarray(estimates) - truth) ** 2)))
         found[f"log_evidence_rmse_{name}"] = Metric(rmse, "", "lower")
     return found
@@ -90,7 +90,7 @@ def exact(ys: Float[Array, "t 1"]) -> float:
     return float(jaxfilters.log_evidence(filter, jax.random.key(0), ys))
 
 
-def estimate(filter: Filter, ys: Float[Array, "t 1"], key: AnyKey) -> Array:
+def estimate(key: AnyKey, filter: Filter, ys: Float[Array, "t 1"]) -> Array:
     """Estimate of a particle filter."""
     return jaxfilters.log_evidence(filter, key, ys)
 
@@ -142,7 +142,7 @@ def contests(num_particles: int, ys: Float[Array, "t 1"]) -> dict[str, dict[str,
     """Filter -> library -> log evidence with a key; this library first."""
     compiled = jax.jit(estimate)
     found: dict[str, dict[str, OfKey]] = {
-        name: {"ours": partial(compiled, filter, ys)}
+        name: {"ours": partial(compiled, filter=filter, ys=ys)}
         for name, filter in filters(num_particles).items()
         if name != "bootstrap"
     }

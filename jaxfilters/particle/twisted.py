@@ -157,8 +157,7 @@ def iterated_auxiliary(
     """Estimate the evidence of a whole sequence by the iterated auxiliary particle filter.
 
     For `x' = f(x) + q` with Gaussian q and any likelihood. Each run twists the model by what the run before found of
-    the observations to come; on linear Gaussian models
-    one iteration leaves hardly any variance. The estimate of every
+    the observations to come; on linear Gaussian models one iteration leaves hardly any variance. The estimate of every
     run is unbiased, because its twisting functions come from independent particles. Results are differentiable with
     respect to parameters; the twisting functions count as constants.
 
@@ -232,15 +231,15 @@ def iterated_auxiliary(
     zeros = jnp.zeros((length + 1, size), prior.mean.dtype)
     plain = Twisting(zeros, jnp.zeros((length + 1, size, size), zeros.dtype), zeros, zeros[:, 0], zeros[:, 0])
 
-    def refined_by(twisting: Twisting, key: AnyKey) -> tuple[Twisting, Array]:
+    def refined_by(twisting: Twisting, run_key: AnyKey) -> tuple[Twisting, Array]:
         steps = _StepInputs(inputs, twisting, is_first)
-        found = _run(filter, key, observations, steps)
+        found = _run(run_key, filter, observations, steps)
         refined = _fitted(model, found.history.particles, observations, steps, prior_share)
         return jax.lax.stop_gradient(refined), found.log_evidence
 
     *keys, last_key = jax.random.split(key, iterations + 1)
     twisting, estimates = jax.lax.scan(refined_by, plain, jnp.stack(keys))
-    found = _run(filter, last_key, observations, _StepInputs(inputs, twisting, is_first))
+    found = _run(last_key, filter, observations, _StepInputs(inputs, twisting, is_first))
     history = jax.tree.map(lambda leaf: leaf[1:], found.history)
     return IteratedAuxiliary(found.log_evidence, jnp.append(estimates, found.log_evidence), history)
 
@@ -250,7 +249,7 @@ class _Found(NamedTuple):
     history: History
 
 
-def _run(filter: Filter, key: AnyKey, observations: PyTree, steps: _StepInputs) -> _Found:
+def _run(key: AnyKey, filter: Filter, observations: PyTree, steps: _StepInputs) -> _Found:
     _, (history, log_evidence) = run(filter, key, observations, steps, collect=_keep)
     return _Found(log_evidence.sum(), history)
 
