@@ -50,10 +50,14 @@ from .particle import proposals as proposals
 from .particle import resampling as resampling
 from .particle import sharding as sharding
 from .particle.adaptive import adaptive_diffusion as adaptive_diffusion
+from .particle.auxiliary import Proposal as Proposal
+from .particle.auxiliary import auxiliary as auxiliary
+from .particle.auxiliary import guided as guided
 from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
-from .particle.guided import Guidance as Guidance
-from .particle.guided import guided as guided
+from .particle.guided_rao_blackwell import Guidance as Guidance
+from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
+from .particle.locally_optimal import locally_optimal as locally_optimal
 from .particle.mixed_model import LinearObservation as LinearObservation
 from .particle.mixed_model import MixedDynamics as MixedDynamics
 from .particle.partitioned import Partitions as Partitions
@@ -63,6 +67,8 @@ from .particle.rao_blackwell import rao_blackwell_shared as rao_blackwell_shared
 from .particle.switching import SwitchingState as SwitchingState
 from .particle.switching import switching as switching
 from .particle.tempering import AdaptiveTempering as AdaptiveTempering
+from .particle.twisted import IteratedAuxiliary as IteratedAuxiliary
+from .particle.twisted import iterated_auxiliary as iterated_auxiliary
 from .particle.weighting import ParticleInfo as ParticleInfo
 
 __version__: str

@@ -16,6 +16,8 @@ at the end:
 | `sample_transition` | `(randomness, x)` | `(randomness, x, inputs)` |
 | `log_likelihood` | `(x, y)` | `(x, y, inputs)` |
 | `log_transition` | `(x_next, x)` | `(x_next, x, inputs)` |
+| `log_first_stage` | `(x, y)` | `(x, y, inputs)` |
+| `sample`, `log_density` of a proposal | `(randomness, x, y)`, `(x_next, x, y)` | `(..., inputs)` |
 | `process_noise`, `observation_noise` | an array | `(inputs)`, or `(x, inputs)` where the noise depends on the state |
 
 Its signature decides, once, when the filter is built. The argument may have any name if it has no default value, and

@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxfilters
@@ -14,6 +15,7 @@ from jaxfilters.trackers.app import cli
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
+COMING_FROM = sorted((DOCS / "coming_from").glob("*.md"))
 MANUALS = {
     "track hand-depth": "trackers/hand_depth.md",
     "track articulated": "trackers/articulated.md",
@@ -84,6 +86,11 @@ def code_of(page):
     return re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
 
 
+def sides_of(page):
+    """(library, code) of every block of Python on a page; library is empty where it is this one."""
+    return re.findall(r"```python ?(\w*)\n(.*?)```", page.read_text(), re.DOTALL)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("page", [page for page in PAGES if code_of(page)], ids=name_of)
 def test_the_code_of_a_page_runs(page):
@@ -93,6 +100,43 @@ def test_the_code_of_a_page_runs(page):
             pytest.importorskip(library, reason=f"the rest of {page.name} needs the extra mcmc")
         exec(compile(block, str(page), "exec"), names)
     assert len(names) > 2
+
+
+ERRORS = {
+    "cuthbert": {"particle_filter.build_filter": 0.5},
+    "particles": {"logLt": 0.3, "theirs = np": 0.3},
+    "filterpy": {"bincount": 0.05},
+    "blackjax": {"getattr": 0.02, "draws": 0.25},
+}
+"""Largest absolute differences of what is random: about five standard errors of what a block with these words has."""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.system
+@pytest.mark.parametrize("page", COMING_FROM, ids=name_of)
+def test_the_code_of_both_libraries_finds_the_same(page):
+    """Where the other library is installed; the page before runs ours in any case."""
+    peer = page.stem
+    pytest.importorskip(peer)
+    names, theirs, compared = {"__name__": peer}, None, 0
+    for library, code in sides_of(page):
+        names.pop("theirs", None), names.pop("ours", None)
+        exec(compile(code, str(page), "exec"), names)
+        if library:
+            assert library == peer
+            theirs = (names["theirs"], code) if "theirs" in names else None
+        elif "ours" in names and theirs is not None:
+            expected, of = theirs
+            atol = max((error for words, error in ERRORS.get(peer, {}).items() if words in of), default=2e-3)
+            check_same(names["ours"], expected, atol)
+            theirs, compared = None, compared + 1
+    assert compared >= 4
+
+
+def check_same(ours, theirs, atol):
+    ours, theirs = ((one if isinstance(one, tuple) else (one,)) for one in (ours, theirs))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(np.squeeze(a), np.squeeze(b), rtol=2e-3, atol=atol)
 
 
 def test_links_lead_somewhere():

@@ -33,7 +33,7 @@ from jaxfilters.models.hand.surface import CapsuleHand, HandSurface
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, INITIAL_VELOCITY_STD, START
 from jaxfilters.noise import StandardNormal
 from jaxfilters.particle.bootstrap import bootstrap
-from jaxfilters.particle.proposals import Proposal, exact
+from jaxfilters.particle.proposals import IncrementProposal, exact
 from jaxfilters.particle.rao_blackwell import condition_on_increment, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.trackers.hand_depth.tracker import pose_moments
@@ -106,7 +106,7 @@ def particle_filter(setting: Setting, num_particles: int, pose_variance_rate: Ar
     )
 
 
-def rao_blackwellized(setting: Setting, num_particles: int, proposal: Proposal = exact) -> Filter:
+def rao_blackwellized(setting: Setting, num_particles: int, proposal: IncrementProposal = exact) -> Filter:
     """Particle filter on the pose whose velocity is integrated out."""
     return rao_blackwell_shared(
         _sample_prior,

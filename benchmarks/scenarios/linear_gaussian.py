@@ -26,7 +26,7 @@ from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.noise import StandardNormal
 from jaxfilters.particle.bootstrap import ParticleState, bootstrap
-from jaxfilters.particle.proposals import Proposal, exact, plug_in, plug_in_corrected
+from jaxfilters.particle.proposals import IncrementProposal, exact, plug_in, plug_in_corrected
 from jaxfilters.particle.rao_blackwell import MixedDynamics, RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey
@@ -110,7 +110,7 @@ def filters(num_particles: int = NUM_PARTICLES) -> dict[str, Filter]:
     return {p.__name__: _rao_blackwellized(p, num_particles) for p in PROPOSALS} | {"joint_pf": joint}
 
 
-def _rao_blackwellized(proposal: Proposal, num_particles: int) -> Filter:
+def _rao_blackwellized(proposal: IncrementProposal, num_particles: int) -> Filter:
     return rao_blackwell_shared(
         _sample_pose_prior,
         Gaussian(jnp.zeros(1), PRIOR_VELOCITY * jnp.eye(1)),

@@ -19,7 +19,7 @@ Digits = tuple[Array, ...]
 
 
 def positions(
-    weights: Float[Array, "rows 32"], total: int | Float[Array, ""]
+    weights: Float[Array, "rows 32"], total: int | Float[Array, ""], most: int | None = None
 ) -> tuple[Int[Array, "rows 32"], Float[Array, "rows 32"]]:
     """The cumulative sum of weights, row by row, scaled to end at `total`, as integers and fractions in [0, 1].
 
@@ -28,18 +28,20 @@ def positions(
 
     Args:
         weights: (rows, 32), not negative.
-        total: An integer from 0 to the number of weights.
+        total: An integer from 0 to `most`.
+        most: By default `total` where that is a Python number.
 
     Raises:
-        ValueError: If there are more than 2**23 weights in float32 (2**52 in float64), whose sums are not exact.
+        ValueError: If there are more than 2**23 weights or draws in float32 (2**52 in float64): sums are not exact.
     """
     mantissa = jnp.finfo(weights.dtype).nmant
-    high_bits = mantissa - (weights.size - 1).bit_length()
+    largest = max(weights.size, int(total) if most is None else most)
+    high_bits = mantissa - (largest - 1).bit_length()
     low_bits = mantissa + 1 - ROW.bit_length()
     if high_bits < 0:
         raise ValueError(
             f"log_weights: at most 2**{mantissa} particles can be resampled in {weights.dtype.name}; "
-            f"got {weights.size}. Use a wider float type."
+            f"got {largest}. Use a wider float type."
         )
     unit, low_unit = 2.0**high_bits, 2.0**low_bits
     digits = _digits(weights, total * unit, low_unit)

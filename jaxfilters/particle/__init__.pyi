@@ -1,9 +1,12 @@
 from . import adaptive as adaptive
+from . import auxiliary as auxiliary
 from . import bootstrap as bootstrap
 from . import checks as checks
 from . import differentiable_resampling as differentiable_resampling
 from . import fixed_lag as fixed_lag
-from . import guided as guided
+from . import gaussian_proposals as gaussian_proposals
+from . import guided_rao_blackwell as guided_rao_blackwell
+from . import locally_optimal as locally_optimal
 from . import mixed_model as mixed_model
 from . import partitioned as partitioned
 from . import proposals as proposals
@@ -13,4 +16,5 @@ from . import sharding as sharding
 from . import smoothing as smoothing
 from . import switching as switching
 from . import tempering as tempering
+from . import twisted as twisted
 from . import weighting as weighting

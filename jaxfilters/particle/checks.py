@@ -160,9 +160,14 @@ def _kind(value: Any) -> str:
     return f"an array of shape {value.shape}" if isinstance(value, jax.Array) else f"a {type(value).__name__}"
 
 
+def ensemble_size(particles: PyTree) -> int:
+    """Number of particles of an ensemble, which is the last axis of every leaf."""
+    return jax.tree.leaves(particles)[0].shape[-1]
+
+
 def checked_noise(noise: PyTree, particles: PyTree) -> PyTree:
     """The noise of an ensemble, each leaf of which must have the ensemble axis of `particles` last."""
-    count = jax.tree.leaves(particles)[0].shape[-1]
+    count = ensemble_size(particles)
     for leaf in jax.tree.leaves(noise):
         if jnp.shape(leaf)[-1:] != (count,):
             raise ValueError(f"noise must draw leaves of shape (..., {count}); got {jnp.shape(leaf)}.")

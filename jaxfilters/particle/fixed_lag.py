@@ -66,7 +66,7 @@ def fixed_lag(inner: Filter, lag: int) -> Filter:
 
     Args:
         inner: Particle filter whose state, or its field `ensemble`, has `particles`, `log_weights` and `ancestors`,
-            like those of `bootstrap`, `rao_blackwell`, `adaptive_diffusion` and `guided`.
+            like those of `bootstrap`, `rao_blackwell`, `adaptive_diffusion` and `guided_rao_blackwell`.
         lag: Number of frames that the smoothed belief is behind, at least 1.
 
     Returns:

@@ -1,9 +1,12 @@
-r"""Proposals of a Rao-Blackwellized particle filter: how the increment of the nonlinear state is drawn.
+r"""Proposals of particle filters.
 
-A proposal draws $\delta = z - A_n m$, the deviation of the increment $z$ from its prediction by the mean $m$ of the
-linear state. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, where $P$ is the covariance of the
+`linearized` and `laplace` propose from the observation, for `jf.guided` and `jf.auxiliary`. The others are for the
+argument `proposal` of Rao-Blackwellized filters, and say how the increment of the nonlinear state is drawn.
+
+Such a proposal draws $\delta = z - A_n m$, the deviation of the increment $z$ from its prediction by the mean $m$ of
+the linear state. Given the past, $\delta \sim N(0, N)$ with $N = A_n P A_n^T + Q_n$, where $P$ is the covariance of the
 linear state (T. Schön, F. Gustafsson and P.-J. Nordlund, "Marginalized particle filters for mixed linear/nonlinear
-state-space models", IEEE Transactions on Signal Processing 53, 2005). Each proposal is
+state-space models", IEEE Transactions on Signal Processing 53, 2005). Each is
 `(noise, N, Q_n) -> (delta, log_correction)`, where `noise` is standard normal and `log_correction` is the logarithm of
 the ratio of this density to the one that was drawn from, to be added to the log weight.
 """
@@ -14,10 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters.math.linalg import cholesky, solve_triangular
+from jaxfilters.particle.gaussian_proposals import laplace as laplace
+from jaxfilters.particle.gaussian_proposals import linearized as linearized
 
 
 @runtime_checkable
-class Proposal(Protocol):
+class IncrementProposal(Protocol):
     """Draw the deviation `(n,)` of the increment from standard normal noise; returns it and its log correction."""
 
     def __call__(

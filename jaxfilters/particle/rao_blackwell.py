@@ -35,7 +35,7 @@ from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transport
 from jaxfilters.particle.mixed_model import LinearObservation as LinearObservation
 from jaxfilters.particle.mixed_model import MixedDynamics as MixedDynamics
-from jaxfilters.particle.proposals import Proposal, exact
+from jaxfilters.particle.proposals import IncrementProposal, exact
 from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import no_tempering
 from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
@@ -73,7 +73,7 @@ class RaoBlackwell:
     ess_threshold: ArrayLike
     num_particles: int = field(metadata={"static": True})
     noise: StandardNormal = field(metadata={"static": True})
-    proposal: Proposal = field(metadata={"static": True})
+    proposal: IncrementProposal = field(metadata={"static": True})
     scheme: ResamplingScheme | EnsembleScheme = field(metadata={"static": True})
     covariance_axis: int | None = field(metadata={"static": True})
     """Ensemble axis of the covariance: -1, or `None` where it is shared."""
@@ -94,7 +94,7 @@ def rao_blackwell(
     noise_dim: int,
     observe: Callable[..., LinearObservation] | None = None,
     retract: Callable[[PyTree, Array], PyTree] = add,
-    proposal: Proposal = exact,
+    proposal: IncrementProposal = exact,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
     ess_threshold: ArrayLike = 0.5,
     temper: Temper | None = None,
@@ -149,7 +149,7 @@ def rao_blackwell_shared(
     noise_dim: int,
     observe: Callable[..., LinearObservation] | None = None,
     retract: Callable[[PyTree, Array], PyTree] = add,
-    proposal: Proposal = exact,
+    proposal: IncrementProposal = exact,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
     ess_threshold: ArrayLike = 0.5,
     temper: Temper | None = None,
@@ -201,7 +201,7 @@ def _build(
     ess_threshold: ArrayLike,
     num_particles: int,
     noise_dim: int,
-    proposal: Proposal,
+    proposal: IncrementProposal,
     scheme: ResamplingScheme | EnsembleScheme,
 ) -> Filter:
     sample_prior, linear_prior, dynamics, retract, condition, temper = callbacks
@@ -229,7 +229,7 @@ def _build(
 
 
 class Increments(NamedTuple):
-    """How one prediction moved the particles: what `guided` needs to draw the increments again."""
+    """How one prediction moved the particles: what `guided_rao_blackwell` needs to draw the increments again."""
 
     origin: PyTree
     """The next nonlinear state for a zero increment, `f_n`; leaves `(..., k)` for k particles."""

@@ -69,6 +69,19 @@ def rao_blackwell_model(noise):
     return prior, jf.Gaussian(PRIOR.mean[1:], PRIOR.covariance[1:, 1:]), dynamics, likelihood
 
 
+def linear(noise):
+    return move, Q, observe, covariance(noise)
+
+
+def guided_model(noise):
+    return sample_prior, sample_transition, log_likelihood_of(noise)
+
+
+def log_transition(x_next, x):
+    return jf.Gaussian(move(x, None), Q).logpdf(x_next)
+
+
+SIZES = {"num_particles": COUNT, "noise": jf.StandardNormal(2)}
 SPACIOUS = jf.constraints.linear_constraints(jnp.eye(2), lower=jnp.full(2, -1e3), upper=jnp.full(2, 1e3))
 EXACT = {
     "kalman": lambda noise: jf.kalman(PRIOR, F, Q, H, covariance(noise)),
@@ -97,11 +110,18 @@ SAMPLED = {
     "bootstrap": lambda noise: jf.bootstrap(
         sample_prior, sample_transition, log_likelihood_of(noise), num_particles=COUNT, noise=jf.StandardNormal(2)
     ),
+    "guided": lambda noise: jf.guided(
+        *guided_model(noise), log_transition=log_transition, proposal=jf.proposals.linearized(*linear(noise)), **SIZES
+    ),
+    "auxiliary": lambda noise: jf.auxiliary(
+        *guided_model(noise), log_first_stage=lambda x, y: log_likelihood_of(2 * noise)(move(x, None), y), **SIZES
+    ),
+    "locally_optimal": lambda noise: jf.locally_optimal(PRIOR, *linear(noise), num_particles=COUNT),
     "rao_blackwell": lambda noise: jf.rao_blackwell(*rao_blackwell_model(noise), num_particles=COUNT, noise_dim=1),
     "rao_blackwell_shared": lambda noise: jf.rao_blackwell_shared(
         *rao_blackwell_model(noise), num_particles=COUNT, noise_dim=1
     ),
-    "guided": lambda noise: jf.guided(
+    "guided_rao_blackwell": lambda noise: jf.guided_rao_blackwell(
         jf.rao_blackwell_shared(*rao_blackwell_model(noise), num_particles=COUNT, noise_dim=1),
         lambda particles, log_weights, y: jf.Guidance(y, 1 / covariance(noise)),
     ),

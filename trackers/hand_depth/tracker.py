@@ -47,7 +47,7 @@ from jaxfilters.models.hand.skeleton import (
 from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
-from jaxfilters.particle.guided import Guidance, GuidedState, guided
+from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
@@ -257,7 +257,7 @@ def _filter(setup: _Setup, pose: Array, scale: Array) -> Filter:
     )
     if not setup.config.guide:
         return inner
-    return guided(inner, jax.tree_util.Partial(_look, likelihood.geometry), local=local, prior_share=0.1)
+    return guided_rao_blackwell(inner, jax.tree_util.Partial(_look, likelihood.geometry), local=local, prior_share=0.1)
 
 
 def _sample_about(pose: Array, key: Array) -> Array:

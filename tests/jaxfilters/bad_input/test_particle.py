@@ -54,6 +54,41 @@ def run_bootstrap(prior=prior, move=move, log_likelihood=log_likelihood, ys=YS, 
     return jf.run(jf.bootstrap(prior, move, log_likelihood, noise=noise, **options), KEY, ys)
 
 
+def log_transition(x_next, x):
+    return -jnp.sum((x_next - x) ** 2)
+
+
+def log_q(x_next, x, y):
+    return -jnp.sum((x_next - y) ** 2)
+
+
+def run_proposed(sample=lambda noise, x, y: y + noise, density=log_q, proposal=None, **options):
+    proposal = (sample, density) if proposal is None else proposal
+    options = {"num_particles": 8, "noise": NORMAL, "log_transition": log_transition} | options
+    return jf.run(jf.guided(prior, move, log_likelihood, proposal=proposal, **options), KEY, YS)
+
+
+def run_auxiliary(log_first_stage=log_likelihood, **options):
+    options = {"num_particles": 8, "noise": NORMAL} | options
+    return jf.run(jf.auxiliary(prior, move, log_likelihood, log_first_stage=log_first_stage, **options), KEY, YS)
+
+
+def run_optimal(ys=YS, **options):
+    model = {"prior": jf.Gaussian(jnp.zeros(1), ONE), "transition": lambda x: x, "process_noise": ONE}
+    model |= {"observe": lambda x: x, "observation_noise": ONE, "num_particles": 8} | options
+    return jf.run(jf.locally_optimal(**model), KEY, ys)
+
+
+def run_laplace(Q=ONE, log_likelihood=log_likelihood, transition=lambda x: x, **options):
+    proposal = jf.proposals.laplace(transition, Q, log_likelihood, **options)
+    return run_proposed(proposal=proposal)
+
+
+def run_twisted(ys=YS, inputs=None, prior=jf.Gaussian(jnp.zeros(1), ONE), **options):  # noqa: B008
+    model = {"transition": lambda x: x, "process_noise": ONE, "log_likelihood": log_likelihood, "num_particles": 8}
+    return jf.iterated_auxiliary(key=KEY, prior=prior, observations=ys, inputs=inputs, **model | options)
+
+
 def tempered(ess_fraction):
     return lambda: run_bootstrap(temper=jf.AdaptiveTempering(ess_fraction))
 
@@ -84,7 +119,7 @@ def depends_on_x(x, u):
 
 def run_guided(point=lambda y: y, information=ONE, **options):
     guide = lambda particles, log_weights, y: jf.Guidance(point(y), information)
-    return jf.run(jf.guided(marginal(jf.rao_blackwell_shared), guide, **options), KEY, YS)
+    return jf.run(jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), guide, **options), KEY, YS)
 
 
 def run_adaptive(prior=lambda key: jnp.zeros(2), log_likelihood=lambda x, y: -jnp.sum(x**2, axis=0), **options):
@@ -134,7 +169,7 @@ def not_shared():
 
 
 def unguided():
-    return jf.guided(marginal(jf.rao_blackwell_shared), lambda particles, log_weights, y: y)
+    return jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), lambda particles, log_weights, y: y)
 
 
 NAN = float("nan")
@@ -188,6 +223,59 @@ PARTICLE = [
     Case("prior (3,)", lambda: jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(3), Q)), ("belief", "(3,)", "(2, 2)")),
     Case("prior ints", lambda: jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2, int), Q)), ("belief.mean", "int32")),
     Case("prior of noise", lambda: jf.priors.from_noise(lambda e: e, 3), ("noise", "3")),
+    Case("resampling, no draws", lambda: jf.resampling.ssp(KEY, jnp.zeros(3), 0), ("num_samples", "0")),
+    Case("resampling, half a draw", lambda: jf.resampling.residual(KEY, jnp.zeros(3), 2.5), ("num_samples", "2.5")),
+    Case("killing, square", lambda: jf.resampling.killing(KEY, jnp.zeros((3, 3))), ("log_weights", "3")),
+    Case("metropolis 0", lambda: jf.resampling.metropolis(0), ("num_steps", "0")),
+    Case("metropolis, integers", lambda: jf.resampling.metropolis(3)(KEY, jnp.arange(3)), ("log_weights",)),
+    Case("metropolis steps", lambda: jf.resampling.metropolis_steps(0.5, 0.1), ("largest", "0.5")),
+    Case("metropolis bias", lambda: jf.resampling.metropolis_steps(2.0, 1.0), ("bias", "1.0")),
+    # Proposals and first stages.
+    Case("proposal of one", lambda: run_proposed(proposal=log_q), ("proposal", "pair", "log_q")),
+    Case("proposal of three", lambda: run_proposed(proposal=(log_q, log_q, log_q)), ("proposal", "pair")),
+    Case("proposal number", lambda: run_proposed(sample=0.0), ("sample of proposal", "0.0")),
+    Case("proposal arguments", lambda: run_proposed(density=lambda x: 0.0), ("log_density of proposal", "x_next")),
+    Case("proposal state", lambda: run_proposed(lambda e, x, y: x[0]), ("sample of proposal", "()", "(1,)")),
+    Case("proposal vector", lambda: run_proposed(density=lambda a, x, y: x), ("log_density of proposal", "(1,)")),
+    Case("no transition density", lambda: run_proposed(log_transition=None), ("log_transition", "None")),
+    Case("transition vector", lambda: run_proposed(log_transition=lambda a, x: x), ("log_transition", "(1,)")),
+    Case("guided noise", lambda: run_proposed(noise=lambda key, n: jnp.zeros(1)), ("noise", "8", "(1,)")),
+    Case(
+        "guided, a filter",
+        lambda: jf.guided(filter_of(), 0, 0, log_transition=0, proposal=0, num_particles=8),
+        ("guided_rao_blackwell",),
+    ),
+    Case("guided threshold", lambda: run_proposed(ess_threshold=-1.0), ("ess_threshold", "-1.0")),
+    Case("no first stage", lambda: run_auxiliary(None), ("log_first_stage", "None")),
+    Case("first stage vector", lambda: run_auxiliary(lambda x, y: x - y), ("log_first_stage", "(1,)")),
+    Case("half a proposal", lambda: run_auxiliary(log_transition=log_transition), ("proposal", "log_transition")),
+    Case(
+        "auxiliary transport",
+        lambda: run_auxiliary(scheme=jf.differentiable_resampling.transport()),
+        ("scheme", "transport"),
+    ),
+    Case("optimal R sign", lambda: run_optimal(observation_noise=-ONE), ("observation_noise", "-1")),
+    Case("optimal Q (2, 2)", lambda: run_optimal(process_noise=Q), ("process_noise", "(2, 2)", "(1, 1)")),
+    Case("optimal Q of inputs", lambda: run_optimal(process_noise=lambda u: Q), ("process_noise", "(2, 2)")),
+    Case("optimal wide y", lambda: run_optimal(jnp.zeros((3, 2))), ("observation", "(2,)", "(1,)")),
+    Case("optimal observe", lambda: run_optimal(observe=lambda x: jnp.append(x, x)), ("observe", "(2,)", "(1,)")),
+    Case("optimal transition", lambda: run_optimal(transition=lambda x: x[0]), ("transition", "()", "(1,)")),
+    Case("optimal share", lambda: run_optimal(prior_share=1.0), ("prior_share", "1.0")),
+    Case("optimal rounds", lambda: run_optimal(iterations=0), ("iterations", "0")),
+    Case("optimal prior", lambda: run_optimal(prior=jnp.zeros(1)), ("prior", "Gaussian")),
+    Case("laplace Q sign", lambda: run_laplace(-ONE), ("process_noise", "-1")),
+    Case("laplace likelihood", lambda: run_laplace(log_likelihood=lambda x, y: x), ("log_likelihood", "(1,)")),
+    Case("laplace rounds", lambda: run_laplace(iterations=True), ("iterations", "True")),
+    Case("twisted few", lambda: run_twisted(num_particles=3), ("num_particles", "4", "3")),
+    Case("twisted rounds", lambda: run_twisted(iterations=0), ("iterations", "0")),
+    Case("twisted share", lambda: run_twisted(prior_share=0.0), ("prior_share", "0.0")),
+    Case("twisted prior", lambda: run_twisted(prior=jnp.zeros(1)), ("prior", "Gaussian")),
+    Case("twisted Q", lambda: run_twisted(process_noise=Q), ("process_noise", "(2, 2)", "(1, 1)")),
+    Case("twisted Q of inputs", lambda: run_twisted(process_noise=lambda u: Q), ("process_noise", "(2, 2)")),
+    Case("twisted likelihood", lambda: run_twisted(log_likelihood=lambda x, y: x), ("log_likelihood", "(1,)")),
+    Case("twisted transition", lambda: run_twisted(transition=lambda x: x[0]), ("transition", "()", "(1,)")),
+    Case("twisted inputs", lambda: run_twisted(inputs=jnp.zeros(4)), ("inputs", "3, 4")),
+    Case("twisted nothing", lambda: run_twisted(ys=jnp.zeros((0, 1))), ("observations", "0")),
     # Rao-Blackwellized filters.
     Case("RB likelihood (1,)", lambda: run_marginal(likelihood=vector_log_likelihood), ("log_likelihood", "(1,)")),
     Case("RB A_n", lambda: run_marginal(A_n=jnp.ones((2, 2))), ("A_n", "(2, 2)", "(1, 2)", "noise_dim")),
@@ -227,8 +315,8 @@ PARTICLE = [
     Case("guide sign", lambda: run_guided(information=-jnp.eye(1)), ("information", "-1")),
     Case("guide local", lambda: run_guided(local=lambda x, other: 0.0), ("local", "()", "(1,)")),
     Case("guide share", lambda: run_guided(prior_share=1.0), ("prior_share", "1.0")),
-    Case("guide kind", lambda: jf.guided(marginal(), lambda *a: None), ("inner", "rao_blackwell_shared")),
-    Case("guide no function", lambda: jf.guided(marginal(jf.rao_blackwell_shared), 0), ("guide", "0")),
+    Case("guide kind", lambda: jf.guided_rao_blackwell(marginal(), lambda *a: None), ("inner", "rao_blackwell_shared")),
+    Case("guide no function", lambda: jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), 0), ("guide", "0")),
     Case("guide result", lambda: jf.run(unguided(), KEY, YS), ("guide", "Guidance")),
     # Adaptive diffusion and partitions.
     Case(

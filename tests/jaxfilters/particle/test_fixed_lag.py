@@ -16,7 +16,7 @@ from jaxfilters.particle.adaptive import adaptive_diffusion
 from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.differentiable_resampling import transport
 from jaxfilters.particle.fixed_lag import fixed_lag, fixed_lag_rts
-from jaxfilters.particle.guided import Guidance, guided
+from jaxfilters.particle.guided_rao_blackwell import Guidance, guided_rao_blackwell
 from jaxfilters.particle.partitioned import Partitions, batch_log_likelihood, consecutive
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell_shared
 from jaxfilters.particle.smoothing import keep_history, trajectories
@@ -134,7 +134,7 @@ def looked_at(num_particles):
     start, linear = gaussian_prior(Gaussian(jnp.zeros(1), jnp.eye(1))), Gaussian(jnp.zeros(1), jnp.eye(1))
     log_likelihood = lambda x, y: norm.logpdf(y[0], x[0], 0.4)
     inner = rao_blackwell_shared(start, linear, drift, log_likelihood, num_particles=num_particles, noise_dim=1)
-    return guided(inner, lambda particles, log_weights, y: Guidance(y, jnp.eye(1) / 0.16))
+    return guided_rao_blackwell(inner, lambda particles, log_weights, y: Guidance(y, jnp.eye(1) / 0.16))
 
 
 @pytest.mark.system

@@ -13,9 +13,14 @@ SCHEMES = {
     "stratified": jax.jit(resampling.stratified),
     "multinomial": jax.jit(resampling.multinomial),
     "residual": jax.jit(resampling.residual),
+    "ssp": jax.jit(resampling.ssp),
+    "killing": jax.jit(resampling.killing),
 }
+IN_PLACE = {"killing"}
+"""Schemes whose indices are not sorted, because ancestors stay where they are."""
 # How far a count may lie from n w_i.
 SPREAD = {"systematic": (-1, 1), "stratified": (-2, 2), "multinomial": (-np.inf, np.inf), "residual": (-1, np.inf)}
+SPREAD |= {"ssp": (-1, 1), "killing": (-np.inf, np.inf)}
 # 32 numbers a row, 1024 two levels of rows.
 SIZES = [1, 32, 33, 1025]
 
@@ -38,6 +43,15 @@ def normalised(log_weights):
     return w / w.sum()
 
 
+def check_counts(ancestors, expected):
+    """A z-test at 4 sigma of the mean counts of many runs: 40 of them fail by chance once in 400."""
+    counts = np.apply_along_axis(np.bincount, 1, np.asarray(ancestors), minlength=expected.size)
+    # No integer of that mean has a smaller variance; a rare particle may have none in the sample.
+    part = expected % 1
+    variance = np.maximum(counts.var(axis=0, ddof=1), np.maximum(part * (1 - part), 1e-10))
+    assert (abs(counts.mean(axis=0) - expected) < 4 * np.sqrt(variance / len(counts))).all()
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("name", SCHEMES)
@@ -46,7 +60,7 @@ def test_ancestors_are_sorted_weighted_indices_with_the_counts_of_their_scheme(n
     ancestors = np.asarray(SCHEMES[name](jax.random.key(n), log_weights))
     assert ancestors.shape == (n,)
     assert ancestors.dtype == np.int32
-    assert (np.diff(ancestors) >= 0).all()
+    assert name in IN_PLACE or (np.diff(ancestors) >= 0).all()
     assert np.isfinite(np.asarray(log_weights)[ancestors]).all()
     deviation = np.bincount(ancestors, minlength=n) - n * normalised(log_weights)
     low, high = SPREAD[name]
@@ -59,11 +73,7 @@ def test_counts_are_unbiased(scheme):
     n, runs = 40, 3000
     log_weights = uneven(n, seed=2, scale=1.5)
     ancestors = jax.jit(jax.vmap(scheme, (0, None)))(jax.random.split(jax.random.key(7), runs), log_weights)
-    counts = np.apply_along_axis(np.bincount, 1, np.asarray(ancestors), minlength=n)
-    expected = n * normalised(log_weights)
-    # Where every run gives the same count it must be the expected one; elsewhere a z-test of the mean.
-    error = np.sqrt(np.maximum(counts.var(axis=0, ddof=1), 1e-10) / runs)
-    assert (abs(counts.mean(axis=0) - expected) < 4 * error).all()
+    check_counts(ancestors, n * normalised(log_weights))
 
 
 def test_draws_that_should_be_independent_have_the_multinomial_variance():
@@ -76,6 +86,64 @@ def test_draws_that_should_be_independent_have_the_multinomial_variance():
     # Each entry of a sample covariance has variance near (c_ii c_jj + c_ij^2) / runs, more for rare particles.
     sigma = np.sqrt((np.outer(np.diag(covariance), np.diag(covariance)) + covariance**2) / runs) + 4 / runs
     assert (abs(np.cov(counts.T) - covariance) < 5 * sigma).all()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("num_samples", [7, 100])
+@pytest.mark.parametrize("name", sorted(set(SCHEMES) - IN_PLACE))
+def test_another_number_of_particles_has_unbiased_counts(name, num_samples):
+    log_weights = uneven(40, seed=2, scale=1.5)
+    draw = jax.jit(jax.vmap(lambda key: getattr(resampling, name)(key, log_weights, num_samples)))
+    ancestors = np.asarray(draw(jax.random.split(jax.random.key(4), 2000)))
+    assert ancestors.shape == (2000, num_samples)
+    check_counts(ancestors, num_samples * normalised(log_weights))
+    low, high = SPREAD[name]
+    counts = np.apply_along_axis(np.bincount, 1, ancestors, minlength=40) - num_samples * normalised(log_weights)
+    assert (counts > low - 1e-3).all()
+    assert (counts < high + 1e-3).all()
+
+
+def test_ssp_copies_are_negatively_correlated():
+    # Those of systematic resampling are not: alternating weights are copied together (Gerber et al. 2019, section 2).
+    w = np.tile([0.4, 0.6], 10) / 10
+    log_weights = jnp.log(jnp.asarray(w, jnp.float32))
+    keys = jax.random.split(jax.random.key(5), 3000)
+    spread = {}
+    for name in ("ssp", "systematic"):
+        ancestors = np.asarray(jax.vmap(SCHEMES[name], (0, None))(keys, log_weights))
+        spread[name] = (ancestors % 2).sum(axis=1).var()
+    # The number of copies of one half of the particles: below the 20 * 0.24 = 2.4 * 2 of independent copies.
+    assert spread["ssp"] < 2.4 * 1.1
+    assert spread["systematic"] > 5 * 2.4
+
+
+def test_killing_leaves_survivors_in_their_places():
+    log_weights = uneven(1000, scale=0.1)
+    ancestors = np.asarray(SCHEMES["killing"](jax.random.key(0), log_weights))
+    alive = np.asarray(log_weights) > -np.inf
+    kept = ancestors == np.arange(1000)
+    chance = np.exp(np.asarray(log_weights) - float(log_weights.max()))
+    assert not kept[~alive].any()
+    # A sum of independent draws with these chances, at 4 standard deviations, and a replacement in place now and then.
+    assert abs(kept.sum() - chance.sum()) < 4 * np.sqrt((chance * (1 - chance)).sum()) + 4
+
+
+@pytest.mark.parametrize("num_steps", [1, 6])
+def test_metropolis_has_the_distribution_of_its_chain_within_the_published_bound(num_steps):
+    w = np.array([0.05, 0.3, 0.1, 0.2, 0.35])
+    kernel = np.minimum(1, w / w[:, None]) / 5
+    np.fill_diagonal(kernel, 0)
+    np.fill_diagonal(kernel, 1 - kernel.sum(axis=1))
+    exact = np.linalg.matrix_power(kernel, num_steps)
+    runs = 20_000
+    scheme = jax.jit(jax.vmap(resampling.metropolis(num_steps), (0, None)))
+    ancestors = np.asarray(scheme(jax.random.split(jax.random.key(3), runs), jnp.log(jnp.asarray(w, jnp.float32))))
+    found = np.stack([np.bincount(ancestors[:, i], minlength=5) for i in range(5)]) / runs
+    # 25 frequencies at 4 sigma: fails by chance once in 600.
+    assert (abs(found - exact) <= 4 * np.sqrt(exact * (1 - exact) / runs)).all()
+    bound = (1 - 1 / (5 * w.max())) ** num_steps
+    assert (0.5 * abs(exact - w).sum(axis=1) <= bound).all()
+    assert resampling.metropolis_steps(5 * w.max(), bound * 1.001) == num_steps
 
 
 @pytest.mark.system

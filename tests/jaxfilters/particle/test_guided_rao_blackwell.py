@@ -11,7 +11,7 @@ from jaxfilters.filter import keep_info, log_evidence, run
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.particle.differentiable_resampling import soft
-from jaxfilters.particle.guided import Guidance, draw, guided
+from jaxfilters.particle.guided_rao_blackwell import Guidance, draw, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell, rao_blackwell_shared
 from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import AdaptiveTempering
@@ -81,7 +81,7 @@ def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
     # z-test at 4 sigma over 600 runs of the unbiased evidence: fails by chance once in 16000.
     ys = simulate()
     keys = jax.random.split(jax.random.key(1), 600)
-    pf = guided(make_inner(scheme=scheme), guide)
+    pf = guided_rao_blackwell(make_inner(scheme=scheme), guide)
     estimates = jax.vmap(log_evidence, in_axes=(None, 0, None))(pf, keys, jnp.asarray(ys, dtype=float))
     ratio = np.exp(np.asarray(estimates, np.float64) - exact_log_evidence(ys))
     assert abs((ratio.mean() - 1) / (ratio.std(ddof=1) / np.sqrt(ratio.size))) < 4
@@ -90,7 +90,7 @@ def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
 @pytest.mark.system
 def test_a_good_guide_keeps_more_particles_alive():
     ys = jnp.asarray(simulate(), dtype=float)
-    with_guide = run(guided(make_inner(), look), jax.random.key(2), ys, collect=keep_info)[1]
+    with_guide = run(guided_rao_blackwell(make_inner(), look), jax.random.key(2), ys, collect=keep_info)[1]
     without = run(make_inner(), jax.random.key(2), ys, collect=keep_info)[1]
     assert with_guide.effective_sample_size.mean() > 3 * without.effective_sample_size.mean()
 
@@ -99,7 +99,11 @@ def test_an_unseen_frame_is_a_plain_prediction():
     ys = jnp.asarray(simulate(), dtype=float)
     mask = jnp.arange(len(ys)) % 3 != 1
     state, infos = run(
-        guided(make_inner(), look), jax.random.key(2), jnp.where(mask, ys, jnp.nan), mask=mask, collect=keep_info
+        guided_rao_blackwell(make_inner(), look),
+        jax.random.key(2),
+        jnp.where(mask, ys, jnp.nan),
+        mask=mask,
+        collect=keep_info,
     )
     assert np.all(np.isfinite(infos.log_evidence))
     assert np.all(np.isfinite(state.ensemble.particles))
@@ -145,7 +149,7 @@ def guided_errors(keys, num_particles):
         temper=AdaptiveTempering(0.02),
     )
     # A rough guide: one standard deviation off in every coordinate, with half of the information.
-    pf = guided(inner, lambda x, lw, y: Guidance(y + SHARP**0.5, 0.5 * eye / SHARP), prior_share=0.1)
+    pf = guided_rao_blackwell(inner, lambda x, lw, y: Guidance(y + SHARP**0.5, 0.5 * eye / SHARP), prior_share=0.1)
     F = jnp.kron(jnp.array([[1.0, DT], [0.0, 1.0]]), eye)
     Q = jnp.diag(jnp.repeat(jnp.array([DT * Q_N, 0.4]), size))
     start = Gaussian(jnp.zeros(2 * size), jnp.diag(jnp.repeat(jnp.array([1.0, 4.0]), size)))
@@ -184,6 +188,6 @@ def test_more_particles_do_not_make_a_tempered_guided_filter_worse():
 
 def test_only_a_shared_covariance_can_be_guided():
     with pytest.raises(ValueError, match="rao_blackwell_shared"):
-        guided(make_inner(rao_blackwell), look)
+        guided_rao_blackwell(make_inner(rao_blackwell), look)
     with pytest.raises(ValueError, match="prior_share"):
-        guided(make_inner(), look, prior_share=0.0)
+        guided_rao_blackwell(make_inner(), look, prior_share=0.0)

@@ -69,7 +69,7 @@ def subtract(x: Float[Array, " n"], other: Float[Array, " n"]) -> Float[Array, "
     return other - x
 
 
-def guided(
+def guided_rao_blackwell(
     inner: Filter,
     guide: Guide,
     *,
@@ -104,7 +104,7 @@ def guided(
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2) / R
         >>> prior, velocity = lambda key: jnp.zeros(1), jf.Gaussian(jnp.zeros(1), one)
         >>> inner = jf.rao_blackwell_shared(prior, velocity, dynamics, log_likelihood, num_particles=100, noise_dim=1)
-        >>> pf = jf.guided(inner, lambda particles, log_weights, y: jf.Guidance(y, one / R))
+        >>> pf = jf.guided_rao_blackwell(inner, lambda particles, log_weights, y: jf.Guidance(y, one / R))
         >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)))
     """
     params = getattr(inner, "params", None)
