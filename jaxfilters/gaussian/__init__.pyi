@@ -2,6 +2,7 @@ from . import arithmetic as arithmetic
 from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
+from . import continuous as continuous
 from . import ensemble as ensemble
 from . import extended as extended
 from . import gaussian_sum as gaussian_sum
