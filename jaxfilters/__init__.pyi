@@ -1,3 +1,4 @@
+from . import ensemble as ensemble
 from . import fit as fit
 from . import hmm as hmm
 from . import math as math

@@ -4,10 +4,12 @@ from . import consider as consider
 from . import constraints as constraints
 from . import continuous as continuous
 from . import ensemble as ensemble
+from . import ensemble_analysis as ensemble_analysis
 from . import extended as extended
 from . import gaussian_sum as gaussian_sum
 from . import linear as linear
 from . import linearize as linearize
+from . import localization as localization
 from . import manifold as manifold
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust

@@ -4,6 +4,8 @@ Y. Bar-Shalom, X. R. Li and T. Kirubarajan, "Estimation with Applications to Tra
 11.7. Positive rates turn to the left, from the first axis to the second.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -186,8 +188,10 @@ def _turned(a: Array) -> tuple[Array, ...]:
 
 def _series(square: Array, first: int) -> Array:
     """1 / first! - square / (first + 2)! + square^2 / (first + 4)! - ..."""
-    coefficients = [(-1) ** k / np.prod(np.arange(1.0, first + 2 * k + 1)) for k in range(_TERMS)]
-    return jnp.polyval(jnp.asarray(coefficients[::-1], square.dtype), square, unroll=_TERMS)
+    total = jnp.zeros_like(square)
+    for k in reversed(range(_TERMS)):
+        total = total * square + (-1) ** k / math.factorial(first + 2 * k)
+    return total
 
 
 def _blocks(a: Array, b: Array, c: Array, d: Array) -> Array:
