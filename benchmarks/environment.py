@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from jaxfilters.trackers.shell.devices import available_cores, processor
+from jaxfilters.trackers.app.devices import available_cores, processor
 
 
 def environment() -> dict[str, Any]:

@@ -15,8 +15,8 @@ from jaxfilters import benchmarks, models, trackers
 from jaxfilters.benchmarks.environment import environment
 from jaxfilters.benchmarks.metrics import Direction, Metric
 from jaxfilters.benchmarks.recordings import VARIABLE
+from jaxfilters.trackers.io.checkpoint import write_npz
 from jaxfilters.trackers.io.npz import read_npz
-from jaxfilters.trackers.shell.checkpoint import write_npz
 
 _PACKAGES = (jaxfilters, models, trackers, benchmarks)
 """In a checkout they lie side by side."""

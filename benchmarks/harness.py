@@ -17,8 +17,8 @@ from pathlib import Path
 
 from jaxfilters.benchmarks import gate, metrics, scenarios
 from jaxfilters.benchmarks.recordings import RecordingError
-from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.devices import use_all_cores
+from jaxfilters.trackers.app.devices import use_all_cores
+from jaxfilters.trackers.io.errors import InputError
 
 REGRESSION, FAILURE = 1, 2
 """Exit codes: worse than the baseline allows; wrong arguments, missing packages and files that cannot be written."""

@@ -16,8 +16,8 @@ import numpy as np
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry
 from jaxfilters.models.rendering.depth import render_capsules
-from jaxfilters.trackers.hand_depth import synthetic_sequence
-from jaxfilters.trackers.shell.hand_draw import color_depth, draw_skeleton
+from jaxfilters.trackers.hand_depth.drawing import color_depth, draw_skeleton
+from jaxfilters.trackers.hand_depth.tracker import synthetic_sequence
 
 FRAMES = (0, 45, 90, 120)
 REACH = 0.115

@@ -37,6 +37,7 @@ from .gaussian.gaussian_sum import GaussianSumState as GaussianSumState
 from .gaussian.gaussian_sum import gaussian_sum as gaussian_sum
 from .gaussian.gaussian_sum import map_component as map_component
 from .gaussian.linear import kalman as kalman
+from .gaussian.noise_models import NonAdditiveNoise as NonAdditiveNoise
 from .gaussian.robust import robust as robust
 from .gaussian.sigma_point import cubature_kalman as cubature_kalman
 from .gaussian.sigma_point import unscented_kalman as unscented_kalman

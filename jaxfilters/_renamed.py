@@ -1,5 +1,12 @@
 """What names of version 0.1 are called now. Kept for the releases 0.2.x, so that old code fails with an answer."""
 
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
 _CURRENT = {
     "TemperToShare": "jf.AdaptiveTempering",
     "adaptive": "jf.adaptive_diffusion (a function)",
@@ -30,3 +37,16 @@ _CURRENT = {
 def current_name(name: str) -> str | None:
     """What a public name of version 0.1 is called now, or None where it was none."""
     return _CURRENT.get(name)
+
+
+def takes_inputs(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Wrap a function whose argument `inputs` was called `control` or `controls`, so that an error says so."""
+
+    @wraps(function)
+    def wrapper(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        for old in ("control", "controls"):
+            if old in kwargs:
+                raise TypeError(f"{function.__name__} has no argument {old!r}: it is called 'inputs' now.")
+        return function(*args, **kwargs)
+
+    return wrapper

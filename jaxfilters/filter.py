@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxfilters._renamed import takes_inputs
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.typing import AnyKey, Collect, Init, Predict, Update
 
@@ -29,9 +30,9 @@ class Filter:
     init: Init = field(metadata={"static": True})
     """`(params, key) -> state`, the belief before the first observation."""
     predict: Predict = field(metadata={"static": True})
-    """`(params, key, state, control) -> state`, one step ahead."""
+    """`(params, key, state, inputs) -> state`, one step ahead."""
     update: Update = field(metadata={"static": True})
-    """`(params, key, state, observation) -> (state, info)`; `info.log_evidence` is log p(y_t | y_1:t-1)."""
+    """`(params, key, state, observation, inputs) -> (state, info)`; `info.log_evidence` is log p(y_t | y_1:t-1)."""
 
 
 def keep_all(state: PyTree, info: PyTree) -> tuple[PyTree, PyTree]:
@@ -61,23 +62,26 @@ def init(filter: Filter, key: AnyKey) -> PyTree:
 
 
 @jax.jit
-def predict(filter: Filter, key: AnyKey, state: PyTree, control: PyTree = None) -> PyTree:
+@takes_inputs
+def predict(filter: Filter, key: AnyKey, state: PyTree, inputs: PyTree = None) -> PyTree:
     """State one time step ahead, before the next observation.
 
     Args:
         filter: The filter.
         key: Random key; deterministic filters ignore it.
         state: State after the last observation.
-        control: Known inputs of the step, or `None`.
+        inputs: Known inputs of the step, or `None`.
 
     Returns:
         The predicted state.
     """
-    return filter.predict(filter.params, key, state, control)
+    return filter.predict(filter.params, key, state, inputs)
 
 
 @jax.jit
-def update(filter: Filter, key: AnyKey, state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+def update(
+    filter: Filter, key: AnyKey, state: PyTree, observation: PyTree, inputs: PyTree = None
+) -> tuple[PyTree, PyTree]:
     """State given one more observation, and the diagnostics of the update.
 
     Args:
@@ -85,16 +89,18 @@ def update(filter: Filter, key: AnyKey, state: PyTree, observation: PyTree) -> t
         key: Random key; deterministic filters ignore it.
         state: Predicted state.
         observation: One observation, without a time axis.
+        inputs: Known inputs of the step, those that the prediction had, or `None`.
 
     Returns:
         The state, and the info of the filter, whose `log_evidence` is log p(y_t | y_1:t-1).
     """
-    return filter.update(filter.params, key, state, observation)
+    return filter.update(filter.params, key, state, observation, inputs)
 
 
 @jax.jit
+@takes_inputs
 def step(
-    filter: Filter, key: AnyKey, state: PyTree, observation: PyTree, control: PyTree = None
+    filter: Filter, key: AnyKey, state: PyTree, observation: PyTree, inputs: PyTree = None
 ) -> tuple[PyTree, PyTree]:
     """State after one prediction and one update, and the diagnostics: for observations that arrive one by one.
 
@@ -103,21 +109,22 @@ def step(
         key: Random key, a new one for every step; deterministic filters ignore it.
         state: State after the last observation; `init` gives the first.
         observation: One observation, without a time axis.
-        control: Known inputs of the step, or `None`.
+        inputs: Known inputs of the step, or `None`.
 
     Returns:
         The state, and the info of the filter.
     """
     predict_key, update_key = jax.random.split(key)
-    state = filter.predict(filter.params, predict_key, state, control)
-    return filter.update(filter.params, update_key, state, observation)
+    state = filter.predict(filter.params, predict_key, state, inputs)
+    return filter.update(filter.params, update_key, state, observation, inputs)
 
 
+@takes_inputs
 def run(
     filter: Filter,
     key: AnyKey,
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
     state: PyTree = None,
@@ -129,7 +136,8 @@ def run(
         filter: The filter; its functions are static, its parameters traced: a second call compiles nothing.
         key: Random key; deterministic filters ignore it.
         observations: Pytree whose leaves have time as their first axis.
-        controls: Pytree of known inputs, time first; `None` passes `None` to every prediction.
+        inputs: Pytree of known inputs, time first: those of a step belong to the transition to it and to its
+            observation. The model's functions get them where they ask for them, see `jf.typing`. `None` passes `None`.
         mask: Booleans (t,), `False` for frames without an observation: there the filter only predicts, and the info is
             all zeros. The observations of such a frame, NaN included, have no effect on values or gradients.
         state: State to start from, e.g. the first result of an earlier `run`; `None` starts from `filter.init`.
@@ -140,7 +148,7 @@ def run(
         The last state, and the results of `collect`, stacked along time: `(states, infos)` by default.
 
     Raises:
-        ValueError: If the leaves of `observations`, `controls` and `mask` do not share one length, or `mask` is not of
+        ValueError: If the leaves of `observations`, `inputs` and `mask` do not share one length, or `mask` is not of
             shape (t,).
         TypeError: If `filter` is no `Filter`, or `mask` no boolean array.
 
@@ -149,24 +157,25 @@ def run(
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> filter = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x, inputs: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
         >>> last, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)))
         >>> beliefs.mean.shape
         (5, 1)
     """
     _check_run(filter, mask)
-    _check_lengths(observations, controls, mask)
+    _check_lengths(observations, inputs, mask)
     init_key, scan_key = jax.random.split(key)
     if state is None:
         state = init(filter, init_key)
-    return _scan(filter, scan_key, state, observations, controls, mask, collect)
+    return _scan(filter, scan_key, state, observations, inputs, mask, collect)
 
 
+@takes_inputs
 def log_evidence(
     filter: Filter,
     key: AnyKey,
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Bool[Array, " t"] | None = None,
 ) -> Float[Array, ""]:
@@ -178,7 +187,7 @@ def log_evidence(
         filter: The filter.
         key: Random key; deterministic filters ignore it.
         observations: Pytree whose leaves have time as their first axis.
-        controls: Pytree of known inputs, time first, or `None`.
+        inputs: Pytree of known inputs, time first, as for `run`, or `None`.
         mask: Booleans (t,), `False` for frames without an observation; these add nothing.
 
     Returns:
@@ -188,7 +197,7 @@ def log_evidence(
         ValueError: As for `run`.
         TypeError: As for `run`.
     """
-    _, log_evidence = run(filter, key, observations, controls, mask=mask, collect=_keep_log_evidence)
+    _, log_evidence = run(filter, key, observations, inputs, mask=mask, collect=_keep_log_evidence)
     return log_evidence.sum()
 
 
@@ -203,15 +212,18 @@ def _scan(
     key: AnyKey,
     state: PyTree,
     observations: PyTree,
-    controls: PyTree,
+    inputs: PyTree,
     mask: Array | None,
     collect: Collect,
 ) -> tuple[PyTree, PyTree]:
-    def body(state: PyTree, inputs: tuple) -> tuple[PyTree, PyTree]:
-        step_key, observation, control, is_observed = inputs
+    def body(state: PyTree, frame: tuple) -> tuple[PyTree, PyTree]:
+        step_key, observation, inputs, is_observed = frame
         predict_key, update_key = jax.random.split(step_key)
-        state = filter.predict(filter.params, predict_key, state, control)
-        update = partial(filter.update, filter.params, update_key)
+        state = filter.predict(filter.params, predict_key, state, inputs)
+
+        def update(state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+            return filter.update(filter.params, update_key, state, observation, inputs)
+
         if is_observed is None:
             state, info = update(state, observation)
         else:
@@ -219,7 +231,7 @@ def _scan(
         return state, collect(state, info)
 
     keys = jax.random.split(key, _length(observations))
-    return jax.lax.scan(body, state, (keys, observations, controls, mask))
+    return jax.lax.scan(body, state, (keys, observations, inputs, mask))
 
 
 def _update_if(
@@ -259,14 +271,14 @@ def _check_run(filter: Filter, mask: PyTree) -> None:
         )
 
 
-def _check_lengths(observations: PyTree, controls: PyTree, mask: PyTree) -> None:
+def _check_lengths(observations: PyTree, inputs: PyTree, mask: PyTree) -> None:
     lengths = {
         f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)[:1]
-        for name, tree in (("observations", observations), ("controls", controls), ("mask", mask))
+        for name, tree in (("observations", observations), ("inputs", inputs), ("mask", mask))
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
     if not any(name.startswith("observations") for name in lengths):
         raise ValueError("observations must have at least one array leaf with time as its first axis; got none.")
     if len(set(lengths.values())) != 1 or () in lengths.values():
         shown = ", ".join(f"{name}: {shape[0] if shape else 'a scalar'}" for name, shape in lengths.items())
-        raise ValueError(f"observations, controls and mask must share one length along their first axis; got {shown}.")
+        raise ValueError(f"observations, inputs and mask must share one length along their first axis; got {shown}.")

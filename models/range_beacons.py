@@ -88,7 +88,7 @@ def drive(x: Float[Array, "3"], step: Step) -> Float[Array, "3"]:
 
 
 def localisation(robot: RangeRobot, beacons: Float[Array, "b 2"], prior: Gaussian) -> Filter:
-    """Extended Kalman filter of (x, y, heading) in metres and radians; controls are `Step`, observations `Measured`.
+    """Extended Kalman filter of (x, y, heading) in metres and radians; inputs are `Step`, observations `Measured`.
 
     Beacons that were not heard are masked.
 

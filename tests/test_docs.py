@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import jaxfilters
-from jaxfilters.trackers.shell import cli
+from jaxfilters.trackers.app import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

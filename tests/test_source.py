@@ -25,6 +25,9 @@ MODULE_NAMES = {"opencv-python-headless": "cv2", "lazy-loader": "lazy_loader"}
 """Where a distribution is not imported by its own name."""
 BEFORE_THE_KEY = {"self", "cls", "filter", "params", "model"}
 """What a function belongs to may stand before the random key; nothing else."""
+APPLICATION = {"app", "calibration", "fitting", "gestures"}
+"""Folders of `trackers/` that are commands; in the others, only the files below know that there is a command line."""
+PRESENTATION = {"command", "options", "run", "drawing", "pictures", "summary", "table", "files", "outcome"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 CHANGES_SETTINGS = ("jax.random.key(", "jax.random.PRNGKey(", "random.key(", "PRNGKey(", "jax.config.update(", "print(")
 PRIVATE_WORDS = re.compile(
@@ -135,7 +138,7 @@ def test_files_and_functions_can_be_read():
     assert not [path for path in SOURCES if path.stem in {"utils", "helpers", "common", "misc"}]
 
 
-# What is imported: trackers and shell -> models -> the core, never back.
+# What is imported: trackers -> models -> the core, never back.
 
 
 @functools.cache
@@ -173,8 +176,8 @@ def upward_imports(path):
     return [name for name in imported(path) if (layer(name) or 0) > here]
 
 
-def imports_of_the_shell(path):
-    return [name for name in imported(path) if name.startswith("jaxfilters.trackers.shell")]
+def imports_of_the_application(path):
+    return [name for name in imported(path) if name.startswith("jaxfilters.trackers.app")]
 
 
 def imports_by_another_name(path):
@@ -199,8 +202,10 @@ def test_imports_run_downwards():
     assert not (found := offenders(SOURCES, upward_imports)), found
 
 
-def test_trackers_know_nothing_of_the_shell_around_them():
-    assert not (found := offenders(sorted((ROOT / "trackers").glob("*.py")), imports_of_the_shell)), found
+def test_trackers_import_nothing_of_the_application_around_them():
+    systems = [path for path in (ROOT / "trackers").rglob("*.py") if not APPLICATION & set(path.parts)]
+    paths = sorted(path for path in systems if path.stem not in PRESENTATION)
+    assert not (found := offenders(paths, imports_of_the_application)), found
 
 
 def test_our_modules_have_one_name():
@@ -328,18 +333,18 @@ def test_the_rules_for_functions_and_files_notice_what_they_forbid(tmp_path):
 def test_the_rules_for_imports_notice_what_they_forbid(tmp_path, monkeypatch):
     text = (
         "import os.path, jaxfilters.models\nfrom . import b\nfrom jaxfilters import trackers\nimport jaxopt\n"
-        "def f():\n    from jaxfilters.models.camera import Pinhole\n    from jaxfilters.trackers.shell import cli\n"
+        "def f():\n    from jaxfilters.models.camera import Pinhole\n    from jaxfilters.trackers.app import cli\n"
     )
     (tmp_path / "models").mkdir()
     path = written(tmp_path / "models", "a.py", text)
     names = ["os.path", "jaxfilters.models", "..b", "jaxfilters.trackers", "jaxopt"]
-    inner = ["jaxfilters.models.camera.Pinhole", "jaxfilters.trackers.shell.cli"]
+    inner = ["jaxfilters.models.camera.Pinhole", "jaxfilters.trackers.app.cli"]
     assert sorted(imported(path)) == sorted(names + inner)
     assert [layer(name) for name in (*names, *inner)] == [None, 1, None, 2, None, 1, 2]
     assert dependencies() >= {"jax", "jaxopt", "cv2"}
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
-    assert sorted(upward_imports(path)) == ["jaxfilters.trackers", "jaxfilters.trackers.shell.cli"]
-    assert imports_of_the_shell(path) == ["jaxfilters.trackers.shell.cli"]
+    assert sorted(upward_imports(path)) == ["jaxfilters.trackers", "jaxfilters.trackers.app.cli"]
+    assert imports_of_the_application(path) == ["jaxfilters.trackers.app.cli"]
     assert imports_by_another_name(path) == ["..b"]
     assert undeclared_imports(path) == {""}
     assert early_imports_of_jaxopt(path) == ["import jaxopt"]

@@ -1,1 +1,1 @@
-"""Complete systems, one file or folder each; what feeds them is in `shell/`."""
+"""Six tracking systems, a folder each; `io` reads and writes files, and `app` is the command line around them."""

@@ -1,4 +1,4 @@
-"""What a tracker is to the shell that feeds it."""
+"""The interface between a tracker and the application that runs it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ class SequenceTracker(NamedTuple):
     """`(state, frames (b, rows, cols), times (b,)) -> (state, track)`: metres with NaN for no reading, seconds.
 
     `track` is a named tuple of arrays with the frame axis first (`HandTrack` for a hand). Row `i` depends on
-    frames `0..i` only: the shell fills up the last chunk by holding its last frame, and drops those rows.
+    frames `0..i` only: the application fills up the last chunk by holding its last frame, and drops those rows.
     """
 
 

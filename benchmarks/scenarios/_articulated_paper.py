@@ -102,8 +102,8 @@ def filter_of(make, model: Model, sequence: ArticulatedSequence) -> Filter:
 def looks_of(sequence: ArticulatedSequence) -> tuple[Look, Float[Array, " t"]]:
     """Observations and times between frames, 0 before the first one, as `jaxfilters.run` takes them."""
     std = jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
-    controls = jnp.ones(len(sequence.features), sequence.features.dtype).at[0].set(0.0)
-    return Look(sequence.features, sequence.masks, std), controls
+    inputs = jnp.ones(len(sequence.features), sequence.features.dtype).at[0].set(0.0)
+    return Look(sequence.features, sequence.masks, std), inputs
 
 
 def _filtered(make, sequences: ArticulatedSequence) -> Runs:

@@ -9,7 +9,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.shell.devices import available_cores
+from jaxfilters.trackers.app.devices import available_cores
 
 
 class Embree:

@@ -39,9 +39,9 @@ class Drift:
         """The same from standard normal numbers."""
         return 0.5 * noise
 
-    def move(self, noise: Float[Array, "10"], x: Float[Array, "10"], control: None = None) -> Float[Array, "10"]:
+    def move(self, noise: Float[Array, "10"], x: Float[Array, "10"], inputs: None = None) -> Float[Array, "10"]:
         """A tenth of a second later."""
-        del control
+        del inputs
         return jnp.concatenate([x[:POSE] + DT * x[POSE:], x[POSE:]]) + self.spread * noise
 
     def observe(self, x: Float[Array, "10"]) -> Float[Array, "3"]:
@@ -109,9 +109,9 @@ class Mixed:
         size = self.A_l.shape[0]
         return Gaussian(jnp.zeros(size), jnp.eye(size))
 
-    def dynamics(self, x: Float[Array, " n"], control: None = None) -> MixedDynamics:
+    def dynamics(self, x: Float[Array, " n"], inputs: None = None) -> MixedDynamics:
         """One step."""
-        del control
+        del inputs
         still = jnp.zeros(self.A_l.shape[0], x.dtype)
         return MixedDynamics(0.95 * x + 0.1 * jnp.sin(x), self.A_n, self.Q_n, still, self.A_l, self.Q_l)
 

@@ -23,9 +23,9 @@ class Coupled:
     C: Float[Array, "..."]
     """(m, n)."""
 
-    def move(self, x: Float[Array, " n"], control: None = None) -> Float[Array, " n"]:
+    def move(self, x: Float[Array, " n"], inputs: None = None) -> Float[Array, " n"]:
         """Where a state goes, without noise."""
-        del control
+        del inputs
         return self.A @ x + 0.05 * jnp.sin(x)
 
     def observe(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -41,9 +41,9 @@ class Ranging:
     beacons: Float[Array, "..."]
     """(3, 3), metres."""
 
-    def move(self, x: Float[Array, "6"], control: None = None) -> Float[Array, "6"]:
+    def move(self, x: Float[Array, "6"], inputs: None = None) -> Float[Array, "6"]:
         """A tenth of a second later."""
-        del control
+        del inputs
         return x + 0.1 * jnp.concatenate([x[3:], jnp.zeros(3)])
 
     def observe(self, x: Float[Array, "6"]) -> Float[Array, "3"]:

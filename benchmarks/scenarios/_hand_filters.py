@@ -36,7 +36,7 @@ from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.proposals import Proposal, exact
 from jaxfilters.particle.rao_blackwell import condition_on_increment, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
-from jaxfilters.trackers.hand_depth import pose_moments
+from jaxfilters.trackers.hand_depth.tracker import pose_moments
 from jaxfilters.typing import AnyKey
 
 WINDOW = (128, 128)
@@ -198,9 +198,10 @@ def advance(
 ) -> tuple[Any, Estimate]:
     """One frame from end to end: predict, cut the window about the prediction, update, estimate."""
     predict_key, update_key = jax.random.split(key)
-    state = filter.predict(filter.params, predict_key, state, jnp.asarray(FRAME_INTERVAL, frame.dtype))
+    elapsed = jnp.asarray(FRAME_INTERVAL, frame.dtype)
+    state = filter.predict(filter.params, predict_key, state, elapsed)
     expected, _ = pose_moments(state.particles, state.log_weights)
-    state, info = filter.update(filter.params, update_key, state, view.image(frame, expected))
+    state, info = filter.update(filter.params, update_key, state, view.image(frame, expected), elapsed)
     pose, _ = pose_moments(state.particles, state.log_weights)
     return state, Estimate(pose, forward_kinematics(pose, view.geometry).joints, info.effective_sample_size)
 

@@ -21,8 +21,8 @@ from jaxfilters.benchmarks.scenarios._head_runs import (
 )
 from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import face_sequence
-from jaxfilters.trackers.head.state import HeadOptions
-from jaxfilters.trackers.shell.chart import Curve, Shade, draw_chart
+from jaxfilters.trackers.app.chart import Curve, Shade, draw_chart
+from jaxfilters.trackers.head.common.state import HeadOptions
 
 AMPLITUDE, MILD_AMPLITUDE = 1.8, 1.0
 CONTRIBUTION_FRAME = 600

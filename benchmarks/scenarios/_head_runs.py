@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
-from jaxfilters.trackers.head.session import HeadSession
-from jaxfilters.trackers.head.state import HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.state import HeadOptions, HeadTrack
+from jaxfilters.trackers.head.stereo.session import HeadSession
 
 AXES = ("x", "y", "z", "roll", "yaw", "pitch")
 AXIS_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")

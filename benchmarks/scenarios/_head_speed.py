@@ -13,13 +13,13 @@ from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
-from jaxfilters.trackers.head import learning
-from jaxfilters.trackers.head.estimate import refined
-from jaxfilters.trackers.head.registration import register
-from jaxfilters.trackers.head.search import Searches, at, searches
-from jaxfilters.trackers.head.state import POSE, HeadOptions, HeadState
-from jaxfilters.trackers.head.track import SHARPENING, advance, begin
-from jaxfilters.trackers.head.ways import WAYS
+from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.estimate import refined
+from jaxfilters.trackers.head.common.search import Searches, at, searches
+from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState
+from jaxfilters.trackers.head.stereo.registration import register
+from jaxfilters.trackers.head.stereo.track import SHARPENING, advance, begin
+from jaxfilters.trackers.head.stereo.ways import WAYS
 
 BATCH = 8
 """Frames in one call."""
@@ -151,8 +151,9 @@ def _searched(search: Searches, state: HeadState, images: Array, key: Array, *, 
     chosen, deviation = (search.layered, model.deviation) if layered else (search.rigid, 0 * model.deviation)
     filter = at(chosen, model, model.templates, deviation)
     predict_key, update_key = jax.random.split(key)
-    moved = filter.predict(filter.params, predict_key, state.search, jnp.ones_like(state.time))
-    return filter.update(filter.params, update_key, moved, images)[0]
+    steps = jnp.ones_like(state.time)
+    moved = filter.predict(filter.params, predict_key, state.search, steps)
+    return filter.update(filter.params, update_key, moved, images, steps)[0]
 
 
 def _refined(rig, state: HeadState, images: Array, search):

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks.metrics import Metric
-from jaxfilters.trackers.head.mesh import MeshDetector
+from jaxfilters.trackers.head.common.mesh import MeshDetector
 
 EVERY = 4
 """Frames from one that the mesh is fitted to to the next."""

@@ -21,12 +21,12 @@ from jaxfilters.models.synthetic.face_training import ict_shapes
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import ict_sequence
-from jaxfilters.trackers.head_mono.dense import NUM_DENSE
-from jaxfilters.trackers.head_mono.session import MonoSession
-from jaxfilters.trackers.head_mono.state import MonoOptions
-from jaxfilters.trackers.shell.face_model_files import default_face_model
-from jaxfilters.trackers.shell.head_input import FOCAL_WIDTHS
-from jaxfilters.trackers.shell.head_table import TRACKED
+from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
+from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.dense import NUM_DENSE
+from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.io.face_models import default_face_model
 
 PEOPLE = ((0, 1), (1, 2), (2, 0), (3, 13), (4, 5), (5, 14), (6, 3), (7, 8))
 """Random key of the person, and which stretch of recorded rotations."""

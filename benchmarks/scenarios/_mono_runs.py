@@ -18,11 +18,11 @@ from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, 
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
 from jaxfilters.models.synthetic.face_training import generator_shapes
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
-from jaxfilters.trackers.head_mono.dense import NUM_DENSE, Dense
-from jaxfilters.trackers.head_mono.detections import Detections
-from jaxfilters.trackers.head_mono.session import MonoSession
-from jaxfilters.trackers.head_mono.state import MonoOptions, MonoTrack
-from jaxfilters.trackers.shell.head_table import TRACKED
+from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
+from jaxfilters.trackers.head.mono.detections import Detections
+from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
 
 DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
 """From millimetres and radians to millimetres and degrees."""

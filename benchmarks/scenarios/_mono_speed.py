@@ -7,9 +7,9 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._mono_runs import camera, talking_head
 from jaxfilters.benchmarks.timing import interleaved
-from jaxfilters.trackers.head_mono.session import MonoSession
-from jaxfilters.trackers.head_mono.state import PUBLISHED, MonoOptions
-from jaxfilters.trackers.shell.face_model_files import default_face_model
+from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
+from jaxfilters.trackers.io.face_models import default_face_model
 
 FRAMES, WARM_UP = 32, 64
 """In one call, and before it."""

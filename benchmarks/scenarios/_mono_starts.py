@@ -10,8 +10,8 @@ from jaxfilters.models.face.bundle import Bundle, projected
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
-from jaxfilters.trackers.head_mono.start import initialise
-from jaxfilters.trackers.head_mono.state import NUM_FRAMES, MonoOptions
+from jaxfilters.trackers.head.mono.start import initialise
+from jaxfilters.trackers.head.mono.state import NUM_FRAMES, MonoOptions
 
 SPREADS = (0.1, 0.5, 1.0, 2.0)
 TURNED_DEG = (3.0, 12.0, 7.0)

@@ -12,10 +12,10 @@ import numpy as np
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import upright_depth
-from jaxfilters.trackers.background import Background
+from jaxfilters.trackers.background.choice import Background
+from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people.state import PeopleConfig, PeopleScene
 from jaxfilters.trackers.people.tracker import people_scene
-from jaxfilters.trackers.undistortion import Undistortion
 
 SHAPE = (360, 480)
 BEYOND_M = 3.0

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 COLORS = {"truth": (60, 60, 60), "pf": (40, 120, 230), "rbpf": (200, 110, 30)}
 """Blue, green, red."""

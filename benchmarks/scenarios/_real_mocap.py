@@ -25,8 +25,8 @@ from jaxfilters.models.articulated.limits import LimitRows, limit_rows, within
 from jaxfilters.models.articulated.motion import MOVEMENT_TIME, AboutEase, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.articulated_hand import ArticulatedConfig, tracker_of
-from jaxfilters.trackers.feature_sequence import FeatureFrame, Start
+from jaxfilters.trackers.articulated.recording import FeatureFrame, Start
+from jaxfilters.trackers.articulated.tracker import ArticulatedConfig, tracker_of
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 TRIANGLE = ("hand_top", "hand_left", "hand_right")

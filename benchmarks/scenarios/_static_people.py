@@ -25,9 +25,11 @@ from jaxfilters.models.synthetic.standing_person import (
     silhouette,
     standing_body,
 )
+from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import tracker
 from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS, NEWCOMER_SD_M
-from jaxfilters.trackers.people.paper import (
+from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody
+from jaxfilters.trackers.published.people import (
     ACQUIRE,
     PaperState,
     paper_start,
@@ -35,9 +37,7 @@ from jaxfilters.trackers.people.paper import (
     score_profile,
     with_person,
 )
-from jaxfilters.trackers.people.paper_scene import PaperConfig, PaperScene, paper_scene
-from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody
-from jaxfilters.trackers.undistortion import Undistortion
+from jaxfilters.trackers.published.people_scene import PaperConfig, PaperScene, paper_scene
 from jaxfilters.typing import AnyKey
 
 SHAPE = (120, 160)

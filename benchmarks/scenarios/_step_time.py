@@ -24,7 +24,7 @@ from jaxfilters.models.hand.skeleton import hand_geometry
 from jaxfilters.models.hand.surface import triangle_hand
 from jaxfilters.models.synthetic.depth_sensor import depth_from_millimetres
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, kinect_v2, simulate_sequence
-from jaxfilters.trackers import hand_depth
+from jaxfilters.trackers.hand_depth import tracker as hand_depth
 
 NUM_FRAMES = 30
 """Of data B, filtered again and again from their start: both filters still follow the hand, and render as much."""
@@ -89,7 +89,7 @@ class _Follower:
 
 
 class _Tracker:
-    """The tracker as the shell runs it: a few frames with each call, on the host before and after."""
+    """The tracker as the application runs it: a few frames with each call, on the host before and after."""
 
     chunk = 5
 

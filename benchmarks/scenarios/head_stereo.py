@@ -24,7 +24,7 @@ from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS, HeadRun
 from jaxfilters.benchmarks.scenarios._head_speed import speed_metrics
 from jaxfilters.models.synthetic.face_motion import DIMMING_FRAMES, OCCLUSION_FRAMES, motion
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
-from jaxfilters.trackers.head.state import HeadOptions
+from jaxfilters.trackers.head.common.state import HeadOptions
 
 FIRST_SEED = 100
 """The tracker was made with smaller ones."""

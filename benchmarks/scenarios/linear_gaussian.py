@@ -127,8 +127,8 @@ def _sample_pose_prior(key: AnyKey) -> Array:
     return _sample_joint_prior(key)[:1]
 
 
-def _dynamics(pose: Array, control: PyTree) -> MixedDynamics:
-    del control
+def _dynamics(pose: Array, inputs: PyTree) -> MixedDynamics:
+    del inputs
     one = jnp.ones((1, 1))
     return MixedDynamics(pose, DT * one, DT * Q_N * one, jnp.zeros(1), one, DT * Q_L * one)
 
@@ -137,8 +137,8 @@ def _sample_joint_prior(key: AnyKey) -> Array:
     return jnp.sqrt(jnp.array([PRIOR_POSE, PRIOR_VELOCITY])) * jax.random.normal(key, (2,))
 
 
-def _move_joint(noise: Array, x: Array, control: PyTree) -> Array:
-    del control
+def _move_joint(noise: Array, x: Array, inputs: PyTree) -> Array:
+    del inputs
     drift = jnp.array([x[0] + DT * x[1], x[1]])
     return drift + jnp.sqrt(DT * jnp.array([Q_N, Q_L])) * noise
 

@@ -81,9 +81,9 @@ class Damped:
         """Standard deviations of the noise of one step."""
         return jnp.exp(self.theta[1]) * jnp.array([0.1, 1.0]) * np.sqrt(DT)
 
-    def move(self, noise: Float[Array, "2"], x: Float[Array, "2"], control: PyTree) -> Float[Array, "2"]:
+    def move(self, noise: Float[Array, "2"], x: Float[Array, "2"], inputs: PyTree) -> Float[Array, "2"]:
         """One step with noise."""
-        del control
+        del inputs
         return self.transition(x) + self.spread() * noise
 
     def log_likelihood(self, x: Float[Array, "2"], y: Float[Array, ""]) -> Float[Array, ""]:

@@ -27,7 +27,7 @@ from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._pom import pom_metrics
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import walkable
-from jaxfilters.trackers.background import Background, background
+from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene
 from jaxfilters.trackers.people.tracker import people_scene, start, step

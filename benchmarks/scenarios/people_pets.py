@@ -24,7 +24,7 @@ from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, e
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
 from jaxfilters.benchmarks.scenarios._pets import Pets, images, load_pets, probability
-from jaxfilters.trackers.background import background
+from jaxfilters.trackers.background.choice import background
 from jaxfilters.trackers.people.following import follow
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig

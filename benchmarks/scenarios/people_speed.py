@@ -24,7 +24,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.room import floor_camera, looking, room_camera, room_image
 from jaxfilters.models.synthetic.walkers import Walker
-from jaxfilters.trackers.background import Background, background
+from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.people.fit import PASSES
 from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS
 from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody

@@ -18,9 +18,9 @@ from jaxfilters.benchmarks.scenarios import _static_people as static
 from jaxfilters.benchmarks.scenarios._static_people import BODY_M, LOOKS, MODEL_M, Estimates, Look, Runs
 from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.synthetic.standing_person import Flaws
-from jaxfilters.trackers.people.paper import ACQUIRE, TRACK
-from jaxfilters.trackers.people.paper_scene import STEP_HALVING, PaperConfig
 from jaxfilters.trackers.people.state import PeopleConfig
+from jaxfilters.trackers.published.people import ACQUIRE, TRACK
+from jaxfilters.trackers.published.people_scene import STEP_HALVING, PaperConfig
 
 NUM_SEEDS, QUICK_NUM_SEEDS = 10, 1
 NUM_FRAMES = 8

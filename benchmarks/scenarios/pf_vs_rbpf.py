@@ -36,7 +36,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, START, kinect_v2
 from jaxfilters.particle.proposals import plug_in, plug_in_corrected
-from jaxfilters.trackers import hand_depth
+from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.typing import AnyKey
 
 NUM_PARTICLES = 512

@@ -148,8 +148,8 @@ def _log_evidences(prior, model, ys):
     return parallel_kalman(prior, model, ys)[1]
 
 
-def _moved(F, x, control):
-    del control
+def _moved(F, x, inputs):
+    del inputs
     return F @ x
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxfilters import filter as filters
+from jaxfilters._renamed import takes_inputs
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.extended import Observation
@@ -120,7 +121,7 @@ class LogEvidence:
 
     filter_of: Callable[[PyTree], Filter]
     observations: PyTree
-    controls: PyTree
+    inputs: PyTree
     mask: Any
     sequences: bool = field(default=False, metadata={"static": True})
     """Whether the leaves hold several sequences along their last axis."""
@@ -129,21 +130,22 @@ class LogEvidence:
         filter = self.filter_of(theta)
 
         def one(key: AnyKey, *data: PyTree) -> Float[Array, ""]:
-            observations, controls, mask = data
-            return filters.log_evidence(filter, key, observations, controls, mask=mask)
+            observations, inputs, mask = data
+            return filters.log_evidence(filter, key, observations, inputs, mask=mask)
 
-        data = (self.observations, self.controls, self.mask)
+        data = (self.observations, self.inputs, self.mask)
         if not self.sequences:
             return one(key, *data)
         count = jax.tree.leaves(self.observations)[0].shape[-1]
         return jnp.sum(jax.vmap(one, in_axes=(0, -1, -1, -1))(jax.random.split(key, count), *data))
 
 
+@takes_inputs
 def log_evidence(
     key: AnyKey,
     filter_of: Callable[[PyTree], Filter],
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Array | np.ndarray | None = None,
     draws: Callable[[AnyKey, RandomLogDensity], Any] = common_random_numbers,
@@ -158,7 +160,7 @@ def log_evidence(
         key: Random key; deterministic filters ignore it.
         filter_of: `theta -> Filter`. Functions are compared by identity: a new function object compiles anew.
         observations: Pytree of arrays with time as their first axis, as for `jaxfilters.run`.
-        controls: Known inputs, time first, as for `jaxfilters.run`.
+        inputs: Known inputs, time first, as for `jaxfilters.run`.
         mask: (T,), `False` for frames without an observation.
         draws: `common_random_numbers` or `fresh_keys`: the random numbers of a particle filter in a search.
 
@@ -166,27 +168,28 @@ def log_evidence(
         A callable pytree `theta -> log p(y_1:T | theta)`.
 
     Raises:
-        ValueError: If `observations` has no array, or `observations`, `controls` and `mask` differ in length.
+        ValueError: If `observations` has no array, or `observations`, `inputs` and `mask` differ in length.
 
     Example:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> def filter_of(noise):
         ...     prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        ...     return jf.extended_kalman(prior, lambda x, u: x, jnp.eye(1), lambda x: x, noise**2 * jnp.eye(1))
+        ...     return jf.extended_kalman(prior, lambda x: x, jnp.eye(1), lambda x: x, noise**2 * jnp.eye(1))
         >>> log_density = jf.fit.log_evidence(jax.random.key(0), filter_of, jnp.zeros((10, 1)))
         >>> log_density(1.0).shape
         ()
     """
-    _check_lengths(observations, controls, mask)
-    return draws(key, LogEvidence(as_pytree(filter_of), observations, controls, mask))
+    _check_lengths(observations, inputs, mask)
+    return draws(key, LogEvidence(as_pytree(filter_of), observations, inputs, mask))
 
 
+@takes_inputs
 def over_sequences(
     key: AnyKey,
     filter_of: Callable[[PyTree], Filter],
     observations: PyTree,
-    controls: PyTree = None,
+    inputs: PyTree = None,
     *,
     mask: Array | np.ndarray | None = None,
     draws: Callable[[AnyKey, RandomLogDensity], Any] = common_random_numbers,
@@ -194,7 +197,7 @@ def over_sequences(
     """The marginal log-likelihood of n sequences that share their parameters: the sum of those of all sequences.
 
     Arguments are those of `log_evidence`, with the sequences along the last axis of every leaf of `observations` and
-    `controls` and of `mask` (T, n). Shorter sequences are padded, and the padding is masked: see `jaxfilters.hmm.pad`.
+    `inputs` and of `mask` (T, n). Shorter sequences are padded, and the padding is masked: see `jaxfilters.hmm.pad`.
 
     Returns:
         A callable pytree `theta -> sum of log p(y_1:T | theta)`.
@@ -202,31 +205,31 @@ def over_sequences(
     Raises:
         ValueError: If `observations` has no array, or lengths or numbers of sequences differ.
     """
-    _check_lengths(observations, controls, mask)
+    _check_lengths(observations, inputs, mask)
     counts = {
         f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)
-        for name, tree in (("observations", observations), ("controls", controls), ("mask", mask))
+        for name, tree in (("observations", observations), ("inputs", inputs), ("mask", mask))
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
     if any(len(shape) < 2 for shape in counts.values()) or len({shape[-1] for shape in counts.values()}) != 1:
         raise ValueError(
-            f"observations, controls and mask must share one number of sequences along their last axis, which is not "
+            f"observations, inputs and mask must share one number of sequences along their last axis, which is not "
             f"the axis of time; got shapes {counts}."
         )
-    return draws(key, LogEvidence(as_pytree(filter_of), observations, controls, mask, sequences=True))
+    return draws(key, LogEvidence(as_pytree(filter_of), observations, inputs, mask, sequences=True))
 
 
-def _check_lengths(observations: PyTree, controls: PyTree, mask: Array | np.ndarray | None) -> None:
+def _check_lengths(observations: PyTree, inputs: PyTree, mask: Array | np.ndarray | None) -> None:
     shapes = {
         f"{name}{jax.tree_util.keystr(path)}": jnp.shape(leaf)
-        for name, tree in (("observations", observations), ("controls", controls), ("mask", mask))
+        for name, tree in (("observations", observations), ("inputs", inputs), ("mask", mask))
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
     if not jax.tree.leaves(observations):
         raise ValueError("observations must have at least one array with time as its first axis; got none.")
     if () in shapes.values() or len({shape[0] for shape in shapes.values()}) != 1:
         raise ValueError(
-            f"observations, controls and mask must share one length along their first axis, time; got shapes {shapes}."
+            f"observations, inputs and mask must share one length along their first axis, time; got shapes {shapes}."
         )
 
 
@@ -257,7 +260,7 @@ def _first_bad_frame(key: AnyKey, evidence: LogEvidence, theta: PyTree) -> str:
         evidence.filter_of(theta),
         key,
         evidence.observations,
-        evidence.controls,
+        evidence.inputs,
         mask=evidence.mask,
         collect=filters.keep_info,
     )

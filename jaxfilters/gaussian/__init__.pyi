@@ -11,6 +11,7 @@ from . import linear as linear
 from . import linearize as linearize
 from . import localization as localization
 from . import manifold as manifold
+from . import noise_models as noise_models
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust
 from . import sigma_point as sigma_point

@@ -173,9 +173,13 @@ def _spread(value: Gaussian | GaussianRoot) -> tuple[Array, str]:
     return (value.root, "root") if isinstance(value, GaussianRoot) else (value.covariance, "covariance")
 
 
-def transitioned(transition: Callable, x: Array, control: PyTree) -> Array:
+def transitioned(transition: Callable, x: Array, inputs: PyTree) -> Array:
     """The state after a transition, which must have the shape that it had before."""
-    after = transition(x, control)
+    return moved(transition(x, inputs), x)
+
+
+def moved(after: Any, x: Array) -> Array:
+    """The result of a transition, which must have the shape of the state before it."""
     shaped("the result of transition", after, x.shape, ", that of the state")
     return after
 

@@ -103,7 +103,7 @@ def schmidt_kalman(
         >>> prior = jf.Gaussian(jnp.array([0.5, 60.0]), jnp.diag(jnp.array([0.04, 100.0])))
         >>> observe = lambda x: x[1:] * jnp.cos(x[:1])
         >>> Q, R = jnp.diag(jnp.array([1e-4, 0.0])), 0.04 * jnp.eye(1)
-        >>> inner = jf.extended_kalman(prior, lambda x, control: x, Q, observe, R)
+        >>> inner = jf.extended_kalman(prior, lambda x: x, Q, observe, R)
         >>> filter = jf.schmidt_kalman(inner, lambda mean: mean[:1], jnp.array([False, True]), tolerance=0.5)
         >>> _, (states, infos) = jf.run(filter, jax.random.key(0), jnp.full((5, 1), 50.0))
         >>> infos.is_new.tolist()
@@ -145,14 +145,14 @@ def _init(model: SchmidtKalman, key: AnyKey) -> SchmidtState:
     return SchmidtState(state, memory)
 
 
-def _predict(model: SchmidtKalman, key: AnyKey, state: SchmidtState, control: PyTree) -> SchmidtState:
-    return state._replace(inner=model.inner.predict(model.inner.params, key, state.inner, control))
+def _predict(model: SchmidtKalman, key: AnyKey, state: SchmidtState, inputs: PyTree) -> SchmidtState:
+    return state._replace(inner=model.inner.predict(model.inner.params, key, state.inner, inputs))
 
 
 def _update(
-    model: SchmidtKalman, key: AnyKey, state: SchmidtState, observation: PyTree
+    model: SchmidtKalman, key: AnyKey, state: SchmidtState, observation: PyTree, inputs: PyTree
 ) -> tuple[SchmidtState, SchmidtInfo]:
-    updated, info = model.inner.update(model.inner.params, key, state.inner, observation)
+    updated, info = model.inner.update(model.inner.params, key, state.inner, observation, inputs)
     signature = jax.lax.stop_gradient(model.signature(_belief(updated).mean))
     new = is_new(state.views, signature, model.tolerance)
     considered = consider(_belief(state.inner), _belief(updated), model.constant)

@@ -29,7 +29,7 @@ from jaxfilters.gaussian.manifold import Belief, Manifold, with_mean
 from jaxfilters.gaussian.measurement_update import subtract
 from jaxfilters.motion.discretization import product, step_length
 from jaxfilters.motion.flow import Integrate, rk4
-from jaxfilters.typing import AnyKey, as_pytree
+from jaxfilters.typing import AnyKey, as_pytree, only_inputs, taking_inputs
 
 _WEIGHTS = (1 / 6, 4 / 6, 1 / 6)
 """Of Simpson's rule at the begin, the middle and the end of an interval."""
@@ -66,21 +66,19 @@ class ContinuousExtendedKalman:
         """Whether beliefs are written as covariances or as roots of them."""
         return self._model.arithmetic
 
-    @property
-    def observation_noise(self) -> Array:
+    def observation_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
         """Covariance of the observation noise, or a root of it."""
-        return self._model.observation_noise
+        return self._model.observation_noise_of(belief, inputs)
 
-    def process_noise_of(self, control: PyTree) -> Array:
+    def process_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
         """None beside that of `linear_transition`, which depends on where the belief is."""
-        del control
-        return self._model.process_noise
+        return self._model.process_noise_of(belief, inputs)
 
-    def linear_transition(self, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
+    def linear_transition(self, belief: Belief, inputs: PyTree) -> tuple[Array, Linearization]:
         """Where the mean goes, the Jacobian of the flow there, and a root of the noise that has come on top."""
         x = belief.mean
-        h = step_length(self.duration(control), x.dtype) / self.num_intervals
-        rate = lambda x: _checked_drift(self.drift(x, control), x)
+        h = step_length(self.duration(inputs), x.dtype) / self.num_intervals
+        rate = lambda x: _checked_drift(self.drift(x, inputs), x)
 
         def field(y: tuple[Array, Array]) -> tuple[Array, Array]:
             return rate(y[0]), jax.vmap(lambda v: jax.jvp(rate, y[:1], (v,))[1], in_axes=-1, out_axes=-1)(y[1])
@@ -113,17 +111,17 @@ class ContinuousExtendedKalman:
         return L
 
 
-def same(control: PyTree) -> PyTree:
-    """The input itself."""
-    return control
+def same(inputs: PyTree) -> PyTree:
+    """The inputs themselves."""
+    return inputs
 
 
 def continuous_extended_kalman(
     prior: Gaussian | GaussianRoot,
-    drift: Callable[[Float[Array, " n"], PyTree], Float[Array, " n"]],
+    drift: Callable[..., Float[Array, " n"]],
     diffusion: Array | Callable[[Float[Array, " n"]], Float[Array, "n k"]],
-    observe: Callable[[Array], Float[Array, " m"]],
-    observation_noise: Float[Array, "m _"],
+    observe: Callable[..., Float[Array, " m"]],
+    observation_noise: Array | Callable[..., Array],
     *,
     duration: Callable[[PyTree], Array] = same,
     integrate: Integrate | None = None,
@@ -142,12 +140,12 @@ def continuous_extended_kalman(
     Args:
         prior: Belief before the first step, with a mean of shape (n,), a `Gaussian` or, for
             `jf.arithmetic.square_root`, a `GaussianRoot`.
-        drift: `(x, control) -> dx/dt`, (n,) to (n,), per unit of time.
+        drift: `(x, inputs) -> dx/dt` or `x -> dx/dt`, (n,) to (n,), per unit of time.
         diffusion: Root L of the spectral density of the noise, (n, k): `L @ L.T` is the covariance that it adds per
             unit of time; or a function `x -> L`.
-        observe: `x -> y` without noise; (n,) to (m,).
-        observation_noise: Covariance of the observation noise, (m, m), or a root of it for `square_root`.
-        duration: `control -> length of the step`, where inputs hold more than the length.
+        observe: `x -> y` or `(x, inputs) -> y` without noise; (n,) to (m,).
+        observation_noise: As for `extended_kalman`.
+        duration: `inputs -> length of the step`, where inputs hold more than the length.
         integrate: `jf.motion.rk4(num_steps)`, one step by default, or `jf.motion.adaptive(...)`, which needs diffrax;
             what integrates over half an interval.
         num_intervals: Intervals of equal length into which a step is divided. Each has a point of the noise's integral
@@ -170,7 +168,7 @@ def continuous_extended_kalman(
 
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
-        >>> drift = lambda x, control: jnp.stack([x[1], -9.8 * jnp.sin(x[0])])
+        >>> drift = lambda x: jnp.stack([x[1], -9.8 * jnp.sin(x[0])])
         >>> prior, R = jf.Gaussian(jnp.array([1.0, 0.0]), 0.1 * jnp.eye(2)), 0.01 * jnp.eye(1)
         >>> L = jnp.array([[0.0], [0.1]])
         >>> filter = jf.continuous_extended_kalman(prior, drift, L, lambda x: x[:1], R)
@@ -182,8 +180,6 @@ def continuous_extended_kalman(
         raise ValueError(f"num_intervals must be an integer of at least 1; got {num_intervals!r}.")
     checks.arithmetic_of(prior, arithmetic)
     n = prior.mean.size
-    checks.function("drift", drift)
-    checks.function("duration", duration)
     integrate = rk4() if integrate is None else integrate
     checks.function("integrate", integrate)
     if not callable(diffusion):
@@ -193,17 +189,16 @@ def continuous_extended_kalman(
     discrete = extended_kalman(prior, _stay, none, observe, observation_noise, **options)
     params = ContinuousExtendedKalman(
         discrete,
-        as_pytree(drift),
+        taking_inputs("drift", drift, "x"),
         as_pytree(diffusion) if callable(diffusion) else diffusion,
-        as_pytree(duration),
+        only_inputs("duration", duration),
         integrate,
         num_intervals,
     )
     return Filter(params, _init, _predict, _update)
 
 
-def _stay(x, control):
-    del control
+def _stay(x):
     return x
 
 
@@ -216,15 +211,15 @@ def _init(model: ContinuousExtendedKalman, key: AnyKey) -> Belief:
     return model.discrete.init(model.discrete.params, key)
 
 
-def _predict(model: ContinuousExtendedKalman, key: AnyKey, belief: Belief, control: PyTree) -> Belief:
+def _predict(model: ContinuousExtendedKalman, key: AnyKey, belief: Belief, inputs: PyTree) -> Belief:
     del key
     checks.state(belief, model.prior)
-    ahead, flow = model.linear_transition(belief, control)
-    moved = model.arithmetic.predict(belief, flow.F, model.process_noise_of(control), 0.0, flow.residual_root)
+    ahead, flow = model.linear_transition(belief, inputs)
+    moved = model.arithmetic.predict(belief, flow.F, model.process_noise_of(belief, inputs), 0.0, flow.residual_root)
     return with_mean(moved, ahead)
 
 
 def _update(
-    model: ContinuousExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree
+    model: ContinuousExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree, inputs: PyTree
 ) -> tuple[Belief, KalmanInfo]:
-    return model.discrete.update(model.discrete.params, key, belief, observation)
+    return model.discrete.update(model.discrete.params, key, belief, observation, inputs)

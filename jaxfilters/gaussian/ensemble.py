@@ -28,7 +28,7 @@ from jaxfilters.math.linalg import cholesky, matmul, safe_norm, solve_triangular
 from jaxfilters.noise import random_keys
 from jaxfilters.particle import checks
 from jaxfilters.priors import sample_ensemble
-from jaxfilters.typing import AnyKey, DrawNoise, SamplePrior, SampleTransition, as_pytree
+from jaxfilters.typing import AnyKey, DrawNoise, SamplePrior, SampleTransition, as_pytree, taking_inputs
 
 
 class EnsembleState(NamedTuple):
@@ -69,7 +69,7 @@ class EnsembleKalman:
 def ensemble_kalman(
     sample_prior: SamplePrior,
     sample_transition: SampleTransition,
-    observe: Callable[[Float[Array, " n"]], Float[Array, " m"]],
+    observe: Callable[..., Float[Array, " m"]],
     R: ArrayLike,
     *,
     num_particles: int,
@@ -88,8 +88,9 @@ def ensemble_kalman(
 
     Args:
         sample_prior: `key -> x`, a vector `(n,)`; or one of `jaxfilters.priors`, which draw the whole ensemble at once.
-        sample_transition: `(randomness, x, control) -> x`, the state one step later with its process noise.
-        observe: `x -> y`, the noise-free observation `(m,)` of the state `(n,)`.
+        sample_transition: `(randomness, x) -> x`, the state one step later with its process noise; or with the inputs
+            of the step after them, see `jf.typing`.
+        observe: `x -> y` or `(x, inputs) -> y`, the noise-free observation `(m,)` of the state `(n,)`.
         R: Covariance `(m, m)` of the observation noise, positive definite.
         num_particles: Number N of samples, at least 2.
         noise: Source of `randomness`: by default a random key for each sample; `StandardNormal(d)` passes d standard
@@ -120,7 +121,7 @@ def ensemble_kalman(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(3), jnp.eye(3)))
-        >>> transition, observe = lambda noise, x, control: 0.9 * x + 0.1 * noise, lambda x: x[:2]
+        >>> transition, observe = lambda noise, x: 0.9 * x + 0.1 * noise, lambda x: x[:2]
         >>> filter = jf.ensemble_kalman(
         ...     prior, transition, observe, 0.2 * jnp.eye(2), num_particles=100, noise=jf.StandardNormal(3)
         ... )
@@ -142,8 +143,8 @@ def ensemble_kalman(
         _check_diagonal(R)
     params = EnsembleKalman(
         as_pytree(sample_prior),
-        as_pytree(sample_transition),
-        as_pytree(observe),
+        taking_inputs("sample_transition", sample_transition, "randomness", "x"),
+        taking_inputs("observe", observe, "x"),
         jnp.asarray(R, dtype=float),
         jnp.asarray(inflation, dtype=float),
         relaxation,
@@ -182,17 +183,17 @@ def _init(model: EnsembleKalman, key: AnyKey) -> EnsembleState:
     return EnsembleState(particles, checks.checked_noise(model.noise(noise_key, model.num_particles), particles))
 
 
-def _predict(model: EnsembleKalman, key: AnyKey, state: EnsembleState, control: PyTree) -> EnsembleState:
+def _predict(model: EnsembleKalman, key: AnyKey, state: EnsembleState, inputs: PyTree) -> EnsembleState:
     transition = checks.checked_transition(model.sample_transition)
     move = jax.vmap(transition, in_axes=(-1, -1, None), out_axes=-1)
-    return EnsembleState(move(state.noise, state.particles, control), model.noise(key, model.num_particles))
+    return EnsembleState(move(state.noise, state.particles, inputs), model.noise(key, model.num_particles))
 
 
 def _update(
-    model: EnsembleKalman, key: AnyKey, state: EnsembleState, observation: Array
+    model: EnsembleKalman, key: AnyKey, state: EnsembleState, observation: Array, inputs: PyTree
 ) -> tuple[EnsembleState, EnsembleInfo]:
     checks.check_shape("observation", observation, model.R.shape[:1], "one number for each row of R")
-    forecast = _forecast(model, state.particles, observation)
+    forecast = _forecast(model, state.particles, observation, inputs)
     moved = model.analysis(key, forecast)
     checks.check_shape("the result of analysis", moved, state.particles.shape, "that of the samples")
     if model.relaxation is not None:
@@ -204,7 +205,9 @@ def _update(
     return state._replace(particles=moved.astype(state.particles.dtype)), EnsembleInfo(log_evidence, innovation)
 
 
-def _forecast(model: EnsembleKalman, particles: Float[Array, "n k"], observation: Float[Array, " m"]) -> Forecast:
+def _forecast(
+    model: EnsembleKalman, particles: Float[Array, "n k"], observation: Float[Array, " m"], inputs: PyTree
+) -> Forecast:
     n, m = particles.shape[0], observation.size
     if model.localization is not None:
         checks.check_shape("localization.state", model.localization.state, (n, m), "states by observations")
@@ -213,7 +216,7 @@ def _forecast(model: EnsembleKalman, particles: Float[Array, "n k"], observation
     observed = jnp.isfinite(observation)
     # For a component that was not observed, prediction, observation and noise are set to zero and its row of R to that
     # of the identity: it then changes no particle and adds nothing to the log evidence.
-    predicted = jax.vmap(_observe(model), in_axes=-1, out_axes=-1)(mean + deviations)
+    predicted = jax.vmap(_observe(model, inputs), in_axes=-1, out_axes=-1)(mean + deviations)
     predicted = jnp.where(observed[:, None], predicted, 0.0)
     R = jnp.where(observed[:, None] & observed, model.R, jnp.eye(m, dtype=model.R.dtype))
     spread = predicted - jnp.mean(predicted, axis=1, keepdims=True)
@@ -236,9 +239,9 @@ def _relaxed(
     return mean + (1 + share.astype(mean.dtype) * lost) * after
 
 
-def _observe(model: EnsembleKalman) -> Callable:
+def _observe(model: EnsembleKalman, inputs: PyTree) -> Callable:
     def observe(x: Array) -> Array:
-        predicted = model.observe(x)
+        predicted = model.observe(x, inputs)
         checks.check_shape("the result of observe", predicted, model.R.shape[:1], "one number for each row of R")
         return predicted
 

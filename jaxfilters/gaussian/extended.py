@@ -1,6 +1,8 @@
 r"""Gaussian filters of nonlinear models: extended, iterated, second-order, unscented and cubature, on manifolds too.
 
-$$x_t = f(x_{t-1}, u_t) \boxplus q_t,\ q_t \sim N(0, Q),\qquad y_t = h(x_t) + r_t,\ r_t \sim N(0, R).$$
+$$x_t = f(x_{t-1}, u_t) \boxplus q_t,\ q_t \sim N(0, Q),\qquad y_t = h(x_t, u_t) + r_t,\ r_t \sim N(0, R),$$
+
+where $Q$ and $R$ may depend on the inputs $u_t$ and on the state.
 
 The state of the filter is the belief itself, a `Gaussian` or `GaussianRoot`: whatever changes a belief (a constraint,
 a merge of hypotheses) may change it between the steps.
@@ -38,6 +40,15 @@ from jaxfilters.gaussian.measurement_update import (
     linear_update,
     subtract,
 )
+from jaxfilters.gaussian.noise_models import (
+    Augmented,
+    NonAdditiveNoise,
+    StateNoise,
+    bound_function,
+    bound_noise,
+    no_noise,
+    noise_of_step,
+)
 from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, as_pytree
 
@@ -65,9 +76,9 @@ class ExtendedKalman:
 
     prior: Belief
     transition: Callable
-    process_noise: Array | Callable
+    process_noise: Array | Callable | StateNoise
     observe: Callable
-    observation_noise: Array
+    observation_noise: Array | Callable | StateNoise
     manifold: Manifold
     residual: Callable
     linearize: Linearize = field(metadata={"static": True})
@@ -75,35 +86,54 @@ class ExtendedKalman:
     iterations: int = field(metadata={"static": True})
     iterate_to: Literal["mean", "mode"] = field(metadata={"static": True}, default="mean")
 
-    def linear_transition(self, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
+    def linear_transition(self, belief: Belief, inputs: PyTree) -> tuple[Array, Linearization]:
         """The predicted mean, and the transition as a linear function of increments, from the mean to the predicted."""
-        transition = lambda x: checks.transitioned(self.transition, x, control)
+        transition, linearize = self._transition(belief, inputs)
         if self.manifold.flat:
-            ahead = self.linearize(transition, belief)
+            ahead = linearize(transition, belief)
             return ahead.value, ahead._replace(value=jnp.zeros_like(ahead.value))
         origin = transition(belief.mean)
 
-        def step(delta: Array) -> Array:
-            return self.manifold.local(origin, transition(self.manifold.retract(belief.mean, delta)))
+        def step(delta: Array, *noise: Array) -> Array:
+            return self.manifold.local(origin, transition(self.manifold.retract(belief.mean, delta), *noise))
 
-        return origin, self.linearize(step, increments(belief))
+        return origin, linearize(step, increments(belief))
 
-    def process_noise_of(self, control: PyTree) -> Array:
+    def process_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
         """The process noise of one step: a covariance, or a root of it, as the arithmetic needs."""
-        if not callable(self.process_noise):
-            return self.process_noise
-        noise = self.process_noise(control)
-        is_root = isinstance(self.prior, GaussianRoot)
-        checks.noise("the result of process_noise", noise, dimension(self.prior), is_root=is_root)
-        return noise
+        if isinstance(self.transition, NonAdditiveNoise):
+            return no_noise(belief, dimension(belief))
+        return noise_of_step(
+            "process_noise", self.process_noise, inputs, dimension(belief), *self._about(belief), self.linearize
+        )
+
+    def observation_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
+        """The observation noise of one step, or what `observe` receives of it."""
+        return noise_of_step(
+            "observation_noise", self.observation_noise, inputs, None, *self._about(belief), self.linearize
+        )
+
+    def _about(self, belief: Belief) -> tuple[Belief, Callable]:
+        """The belief in coordinates, and the state at some of them."""
+        if self.manifold.flat:
+            return belief, lambda x: x
+        return increments(belief), lambda delta: self.manifold.retract(belief.mean, delta)
+
+    def _transition(self, belief: Belief, inputs: PyTree) -> tuple[Callable, Linearize]:
+        """The transition of one step, maybe with noise as its second argument, and the strategy to linearise it."""
+        if not isinstance(self.transition, NonAdditiveNoise):
+            return lambda x: checks.transitioned(self.transition, x, inputs), self.linearize
+        noise = noise_of_step("process_noise", self.process_noise, inputs, None, belief, lambda x: x, self.linearize)
+        move = self.transition.at(inputs, noise.shape[0], belief.mean.dtype)
+        return lambda x, *q: checks.moved(move(x, *q), x), Augmented(noise, self.linearize)
 
 
 def extended_kalman(
     prior: Gaussian | GaussianRoot,
-    transition: Callable[[Array, PyTree], Array],
-    process_noise: Array | Callable[[PyTree], Array],
-    observe: Callable[[Array], Float[Array, " m"]],
-    observation_noise: Float[Array, "m _"],
+    transition: Callable[..., Array] | NonAdditiveNoise,
+    process_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
+    observation_noise: Array | Callable[..., Array],
     *,
     linearize: Linearize = taylor,
     arithmetic: Arithmetic = arithmetics.joseph,
@@ -121,13 +151,15 @@ def extended_kalman(
     Args:
         prior: Belief before the first observation, with a mean of shape (n,): a `Gaussian` with a covariance (d, d),
             or a `GaussianRoot` for `jf.arithmetic.square_root`. On vector spaces d = n.
-        transition: `(x, control) -> x` without noise; (n,) to (n,). `control` is one step of the `controls` of
-            `jf.run`, or `None`.
+        transition: `x -> x` without noise, (n,) to (n,), or `(x, inputs) -> x`, where `inputs` is one step of the
+            `inputs` of `jf.run`, see `jf.typing`; or `NonAdditiveNoise` of a function `(x, noise)`.
         process_noise: Covariance of the process noise, (d, d), in the tangent space of the state (for
-            `jf.arithmetic.square_root` a root of it, (d, any width)); or a function `control -> covariance`, e.g. for
-            steps of unequal length.
-        observe: `x -> y` without noise; (n,) to (m,).
-        observation_noise: Covariance of the observation noise, (m, m), or a root of it, (m, any width).
+            `jf.arithmetic.square_root` a root of it, (d, any width)); or a function `inputs -> covariance`, e.g. for
+            steps of unequal length; or a function `(x, inputs) -> covariance`, whose expected value counts (with
+            `taylor`, that at the mean).
+        observe: `x -> y` without noise, (n,) to (m,), or `(x, inputs) -> y`; or `NonAdditiveNoise`.
+        observation_noise: Covariance of the observation noise, (m, m), or a root of it, (m, any width); or a function
+            like `process_noise`, of the predicted state.
         linearize: `jf.linearize.taylor` (the extended filter), `second_order`, `second_order_covariance_only`,
             `cubature` or `unscented(...)`.
         arithmetic: `jf.arithmetic.joseph`, `square_root` or `fast`.
@@ -160,16 +192,18 @@ def extended_kalman(
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
-        >>> transition = lambda x, control: x
         >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
-        >>> filter = jf.extended_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
         >>> last, (beliefs, infos) = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
         >>> beliefs.mean.shape, infos.log_evidence.shape
         ((10, 2), (10,))
     """
-    _check(prior, process_noise, observation_noise, arithmetic, manifold)
-    checks.function("transition", transition)
-    checks.function("observe", observe)
+    checks.arithmetic_of(prior, arithmetic)
+    checks.on_manifold("prior", prior, manifold)
+    is_root = isinstance(prior, GaussianRoot)
+    R = bound_noise("observation_noise", observation_noise, None, is_root=is_root, function=observe)
+    Q = bound_noise("process_noise", process_noise, dimension(prior), is_root=is_root, function=transition)
+    transition, observe = bound_function("transition", transition), bound_function("observe", observe)
     checks.function("residual", residual)
     checks.function("linearize", linearize)
     if not isinstance(iterations, int) or iterations < 1:
@@ -178,10 +212,10 @@ def extended_kalman(
         raise ValueError(f'iterate_to must be "mean" or "mode"; got {iterate_to!r}.')
     params = ExtendedKalman(
         prior,
-        as_pytree(transition),
-        as_pytree(process_noise) if callable(process_noise) else process_noise,
-        as_pytree(observe),
-        observation_noise,
+        transition,
+        Q,
+        observe,
+        R,
         hashable(manifold),
         as_pytree(residual),
         linearize,
@@ -192,15 +226,6 @@ def extended_kalman(
     return Filter(params, _init, _predict, _update)
 
 
-def _check(prior, process_noise, observation_noise, arithmetic, manifold):
-    checks.arithmetic_of(prior, arithmetic)
-    checks.on_manifold("prior", prior, manifold)
-    is_root = isinstance(prior, GaussianRoot)
-    checks.noise("observation_noise", observation_noise, None, is_root=is_root)
-    if not callable(process_noise):
-        checks.noise("process_noise", process_noise, dimension(prior), is_root=is_root)
-
-
 def _init(model: ExtendedKalman, key: AnyKey) -> Belief:
     del key
     prior = model.prior
@@ -209,28 +234,30 @@ def _init(model: ExtendedKalman, key: AnyKey) -> Belief:
     return prior
 
 
-def _predict(model: ExtendedKalman, key: AnyKey, belief: Belief, control: PyTree) -> Belief:
+def _predict(model: ExtendedKalman, key: AnyKey, belief: Belief, inputs: PyTree) -> Belief:
     del key
     checks.state(belief, model.prior)
     ahead = _ahead if dimension(belief) > factor.UNROLLED else batch_last(_ahead)
-    return ahead(model, belief, control)
+    return ahead(model, belief, inputs)
 
 
-def _ahead(model: ExtendedKalman, belief: Belief, control: PyTree) -> Belief:
-    origin, step = model.linear_transition(belief, control)
-    noise = model.process_noise_of(control)
+def _ahead(model: ExtendedKalman, belief: Belief, inputs: PyTree) -> Belief:
+    origin, step = model.linear_transition(belief, inputs)
+    noise = model.process_noise_of(belief, inputs)
     ahead = model.arithmetic.predict(increments(belief), step.F, noise, step.value, step.residual_root)
     # The mean is that of the step; F times a mean of zeros would be computed.
     return retract_belief(model.manifold, origin, with_mean(ahead, step.value))
 
 
-def _update(model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
+def _update(
+    model: ExtendedKalman, key: AnyKey, belief: Belief, observation: PyTree, inputs: PyTree
+) -> tuple[Belief, KalmanInfo]:
     del key
     checks.state(belief, model.prior)
     y = as_observation(observation).y
     small = max(dimension(belief), y.size) <= factor.UNROLLED
     conditioned = batch_last(_conditioned) if small else _conditioned
-    return conditioned(model, belief, observation)
+    return conditioned(model, belief, observation, inputs)
 
 
 def as_observation(observation: Any) -> Observation:
@@ -240,13 +267,27 @@ def as_observation(observation: Any) -> Observation:
     return measured
 
 
-def _conditioned(model: ExtendedKalman, belief: Belief, observation: PyTree) -> tuple[Belief, KalmanInfo]:
+def _conditioned(
+    model: ExtendedKalman, belief: Belief, observation: PyTree, inputs: PyTree
+) -> tuple[Belief, KalmanInfo]:
+    measured = as_observation(observation)
+    own_noise, linearize = measured.noise, model.linearize
+    if isinstance(model.observe, NonAdditiveNoise):
+        noise = model.observation_noise_of(belief, inputs) if own_noise is None else own_noise
+        if own_noise is not None:
+            checks.noise_shape("Observation.noise", own_noise, None, is_root=isinstance(belief, GaussianRoot))
+        observe = model.observe.at(inputs, noise.shape[0], belief.mean.dtype)
+        linearize, noise = Augmented(noise, linearize), no_noise(belief, measured.y.size)
+        measured = measured._replace(noise=None)
+    else:
+        observe = lambda x: model.observe(x, inputs)
+        noise = model.observation_noise_of(belief, inputs) if own_noise is None else own_noise
     return condition(
         belief,
-        observation,
-        model.observe,
-        model.observation_noise,
-        linearize=model.linearize,
+        measured,
+        observe,
+        noise,
+        linearize=linearize,
         arithmetic=model.arithmetic,
         residual=model.residual,
         manifold=model.manifold,
@@ -311,7 +352,7 @@ def condition(
         y,
         mask,
         noise,
-        lambda coordinates: checks.predicted(observe(point(coordinates)), y, name, noise, is_root=is_root),
+        lambda coordinates, *r: checks.predicted(observe(point(coordinates), *r), y, name, noise, is_root=is_root),
         residual if is_difference(residual) else checks.residual_of(residual),
         linearize,
         arithmetic,

@@ -20,7 +20,7 @@ from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
-from jaxfilters.typing import AnyKey, as_pytree
+from jaxfilters.typing import AnyKey, as_pytree, taking_inputs
 
 UNUSED, KEPT, REJECTED, MERGED, PRUNED, CROWDED_OUT, INVALID = range(7)
 """Fates of a candidate: never formed; kept; its margin was negative; merged into one of larger weight; its weight was
@@ -35,7 +35,7 @@ class Branch(Protocol):
     All of them condition the same predicted hypothesis.
     """
 
-    def __call__(self, state: PyTree, observation: PyTree, /) -> tuple[PyTree, Bool[Array, " b"]]: ...
+    def __call__(self, state: PyTree, observation: PyTree, inputs: PyTree, /) -> tuple[PyTree, Bool[Array, " b"]]: ...
 
 
 @runtime_checkable
@@ -115,7 +115,8 @@ def gaussian_sum(
         inner: Filter of one hypothesis; its info needs `log_evidence`.
         capacity: Number of slots, at least 1.
         start: Hypotheses before the first observation, at most `capacity`; `None` starts with the one of `inner`.
-        branch: Interpretations of an observation, see `Branch`; `None` is the observation itself.
+        branch: `(state, observation)`, maybe with the inputs of the step after them, to interpretations of the
+            observation, see `Branch`; `None` is the observation itself.
         margin: `(state, info) -> margin`; a negative one rejects. `None` rejects nothing.
         same: `(state, state) -> bool`; merges where true. `None` merges nothing.
         log_ratio: Hypotheses whose log weight is this much below the largest are dropped; positive.
@@ -135,7 +136,7 @@ def gaussian_sum(
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
         >>> places = jf.Gaussian(jnp.array([[-5.0], [5.0]]), jnp.ones((2, 1, 1)))
         >>> start = jf.GaussianSumState(places, jnp.log(jnp.array([0.5, 0.5])))
         >>> filter = jf.gaussian_sum(inner, capacity=4, start=start)
@@ -156,7 +157,7 @@ def gaussian_sum(
     params = GaussianSum(
         inner,
         start,
-        as_pytree(branch or _unchanged),
+        taking_inputs("branch", branch or _unchanged, "state", "observation"),
         as_pytree(margin or _never_rejected),
         as_pytree(same or _never_the_same),
         float(log_ratio),
@@ -233,10 +234,10 @@ def _init(model: GaussianSum, key: AnyKey) -> GaussianSumState:
     return GaussianSumState(components, weights.normalize(log_weights)[0])
 
 
-def _predict(model: GaussianSum, key: AnyKey, state: GaussianSumState, control: PyTree) -> GaussianSumState:
+def _predict(model: GaussianSum, key: AnyKey, state: GaussianSumState, inputs: PyTree) -> GaussianSumState:
     keys = jax.random.split(key, model.capacity)
     predict = partial(model.inner.predict, model.inner.params)
-    components = jax.vmap(lambda key, component: predict(key, component, control))(keys, state.components)
+    components = jax.vmap(lambda key, component: predict(key, component, inputs))(keys, state.components)
     return state._replace(components=components)
 
 
@@ -254,9 +255,9 @@ class _Candidates(NamedTuple):
 
 
 def _update(
-    model: GaussianSum, key: AnyKey, state: GaussianSumState, observation: PyTree
+    model: GaussianSum, key: AnyKey, state: GaussianSumState, observation: PyTree, inputs: PyTree
 ) -> tuple[GaussianSumState, GaussianSumInfo]:
-    candidates, all_rejected = _rejected(_form(model, key, state, observation))
+    candidates, all_rejected = _rejected(_form(model, key, state, observation, inputs))
     order = jnp.argsort(-_usable(candidates))
     candidates = jax.tree.map(lambda leaf: leaf[order], candidates)
     candidates = _merged(model.same, candidates)
@@ -286,14 +287,14 @@ def _usable(candidates: _Candidates) -> Float[Array, " m"]:
     return jnp.where(candidates.fates == KEPT, candidates.log_weights, -jnp.inf)
 
 
-def _form(model: GaussianSum, key: AnyKey, state: GaussianSumState, observation: PyTree) -> _Candidates:
+def _form(model: GaussianSum, key: AnyKey, state: GaussianSumState, observation: PyTree, inputs: PyTree) -> _Candidates:
     """Update every hypothesis with every branch of the observation that is to be tried."""
-    readings, tried = jax.vmap(model.branch, (0, None))(state.components, observation)
+    readings, tried = jax.vmap(model.branch, (0, None, None))(state.components, observation, inputs)
     tried = tried & (state.log_weights > -jnp.inf)[:, None]
     parents, branches = jnp.indices(tried.shape, dtype=jnp.int32)
 
     def update(key: AnyKey, component: PyTree, reading: PyTree) -> tuple[Any, ...]:
-        after, info = model.inner.update(model.inner.params, key, component, reading)
+        after, info = model.inner.update(model.inner.params, key, component, reading, inputs)
         margin = model.margin(after, info)
         if jnp.shape(margin) != ():
             raise ValueError(f"margin must return one number; got the shape {jnp.shape(margin)}.")
@@ -304,8 +305,8 @@ def _form(model: GaussianSum, key: AnyKey, state: GaussianSumState, observation:
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (info, margin))
         return component, *nothing
 
-    def candidate(inputs: tuple) -> tuple[Any, ...]:
-        is_tried, parent, branch = inputs
+    def candidate(place: tuple) -> tuple[Any, ...]:
+        is_tried, parent, branch = place
         component = jax.tree.map(lambda leaf: leaf[parent], state.components)
         reading = jax.tree.map(lambda leaf: leaf[parent, branch], readings)
         return jax.lax.cond(is_tried, update, skip, keys[parent], component, reading)

@@ -34,8 +34,8 @@ class Measurement(NamedTuple):
     y: Float[Array, " m"]
     mask: Array | None
     noise: Float[Array, "m _"]
-    predict: Callable[[Array], Array]
-    """`coordinates -> y`, without noise."""
+    predict: Callable[..., Array]
+    """`coordinates -> y`, without noise; `(coordinates, noise) -> y` where the noise is not additive."""
     residual: Callable[[Array, Array], Array]
     linearize: Linearize
     arithmetic: Arithmetic
@@ -138,7 +138,7 @@ def _linear_at(measurement, offset):
     if is_difference(measurement.residual):
         return measurement.linearize(measurement.predict, about), None
     reference = measurement.predict(at)
-    from_reference = lambda x: measurement.residual(measurement.predict(x), reference)
+    from_reference = lambda x, *noise: measurement.residual(measurement.predict(x, *noise), reference)
     return measurement.linearize(from_reference, about), reference
 
 

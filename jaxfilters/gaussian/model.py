@@ -30,17 +30,20 @@ class GaussianModel(Protocol):
         """Whether beliefs are written as covariances or as roots of them."""
         ...
 
-    @property
-    def observation_noise(self) -> Array:
-        """Covariance of the observation noise, or a root of it, as the arithmetic has it."""
-        ...
-
-    def linear_transition(self, belief: Belief, control: PyTree) -> tuple[Array, Linearization]:
+    def linear_transition(self, belief: Belief, inputs: PyTree) -> tuple[Array, Linearization]:
         """Where the mean goes, and the transition as a linear function of increments, from the mean to there."""
         ...
 
-    def process_noise_of(self, control: PyTree) -> Array:
-        """Covariance of the process noise of one step, or a root of it, as the arithmetic has it."""
+    def process_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
+        """Covariance of the additive process noise of one step, or a root of it, as the arithmetic has it.
+
+        It is expected over the belief before the step where it depends on the state. Noise that is not additive is
+        part of the `residual_root` of `linear_transition`, and this is zero.
+        """
+        ...
+
+    def observation_noise_of(self, belief: Belief, inputs: PyTree) -> Array:
+        """Covariance of the observation noise of one step, or a root of it, as the arithmetic has it."""
         ...
 
 

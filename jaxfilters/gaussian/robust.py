@@ -69,7 +69,7 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(1), lambda x: x, 0.1 * jnp.eye(1))
         >>> filter = jf.robust(inner, 0.05, 100.0 * jnp.eye(1))
         >>> y = jnp.array([[0.1], [30.0], [0.2]])
         >>> _, (beliefs, infos) = jf.run(filter, jax.random.key(0), y)
@@ -84,12 +84,9 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
             f"prior; its prior is a {type(model.prior).__name__}."
         )
     checks.probability("outlier_probability", outlier_probability)
-    checks.shaped(
-        "outlier_noise",
-        outlier_noise,
-        jnp.shape(inner.params.observation_noise),
-        ", that of the observation noise of inner",
-    )
+    if not callable(model.observation_noise):
+        shape = jnp.shape(model.observation_noise)
+        checks.shaped("outlier_noise", outlier_noise, shape, ", that of the observation noise of inner")
     checks.noise("outlier_noise", outlier_noise, None, is_root=False)
     return Filter(Robust(inner, jnp.asarray(outlier_probability), outlier_noise), _init, _predict, _update)
 
@@ -98,15 +95,17 @@ def _init(model: Robust, key: AnyKey) -> Gaussian:
     return model.inner.init(model.inner.params, key)
 
 
-def _predict(model: Robust, key: AnyKey, belief: Gaussian, control: PyTree) -> Gaussian:
-    return model.inner.predict(model.inner.params, key, belief, control)
+def _predict(model: Robust, key: AnyKey, belief: Gaussian, inputs: PyTree) -> Gaussian:
+    return model.inner.predict(model.inner.params, key, belief, inputs)
 
 
-def _update(model: Robust, key: AnyKey, belief: Gaussian, observation: PyTree) -> tuple[Gaussian, RobustInfo]:
+def _update(
+    model: Robust, key: AnyKey, belief: Gaussian, observation: PyTree, inputs: PyTree
+) -> tuple[Gaussian, RobustInfo]:
     inner = model.inner.params
     observed = observation if isinstance(observation, Observation) else Observation(observation)
-    inlier, inlier_info = model.inner.update(inner, key, belief, observed)
-    outlier, outlier_info = model.inner.update(inner, key, belief, observed._replace(noise=model.outlier_noise))
+    inlier, inlier_info = model.inner.update(inner, key, belief, observed, inputs)
+    outlier, outlier_info = model.inner.update(inner, key, belief, observed._replace(noise=model.outlier_noise), inputs)
     log_inlier = jnp.log1p(-model.outlier_probability) + inlier_info.log_evidence
     log_outlier = jnp.log(model.outlier_probability) + outlier_info.log_evidence
     inlier_probability = jax.nn.sigmoid(log_inlier - log_outlier)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import arithmetic as arithmetics
@@ -12,14 +12,15 @@ from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.gaussian.linearize import cubature, unscented
 from jaxfilters.gaussian.manifold import Manifold, euclidean
 from jaxfilters.gaussian.measurement_update import subtract
+from jaxfilters.gaussian.noise_models import NonAdditiveNoise
 
 
 def unscented_kalman(
     prior: Gaussian | GaussianRoot,
-    transition: Callable[[Array, PyTree], Array],
-    process_noise: Array | Callable[[PyTree], Array],
-    observe: Callable[[Array], Float[Array, " m"]],
-    observation_noise: Float[Array, "m _"],
+    transition: Callable[..., Array] | NonAdditiveNoise,
+    process_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
+    observation_noise: Array | Callable[..., Array],
     *,
     alpha: float = 1.0,
     beta: float = 2.0,
@@ -34,10 +35,11 @@ def unscented_kalman(
 
     Args:
         prior: Belief before the first observation, with a mean of shape (n,), as for `extended_kalman`.
-        transition: `(x, control) -> x` without noise; (n,) to (n,).
-        process_noise: Covariance of the process noise, (n, n), or `control -> covariance`.
-        observe: `x -> y` without noise; (n,) to (m,).
-        observation_noise: Covariance of the observation noise, (m, m).
+        transition: `x -> x` or `(x, inputs) -> x` without noise, (n,) to (n,); or `NonAdditiveNoise`.
+        process_noise: Covariance of the process noise, (n, n), or a function `inputs -> covariance` or
+            `(x, inputs) -> covariance`.
+        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`.
+        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`.
         alpha: Distance of the points from the mean, relative to sqrt(n + kappa) standard deviations; positive.
         beta: Weight of the centre point in the covariance, at least 0; 2 suits Gaussian states.
         kappa: Addition to the dimension n in the distance of the points, at least 0.
@@ -57,9 +59,8 @@ def unscented_kalman(
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
-        >>> transition = lambda x, control: x
         >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
-        >>> filter = jf.unscented_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> filter = jf.unscented_kalman(prior, lambda x: x, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
         >>> last, _ = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
         >>> last.mean.shape
         (2,)
@@ -79,10 +80,10 @@ def unscented_kalman(
 
 def cubature_kalman(
     prior: Gaussian | GaussianRoot,
-    transition: Callable[[Array, PyTree], Array],
-    process_noise: Array | Callable[[PyTree], Array],
-    observe: Callable[[Array], Float[Array, " m"]],
-    observation_noise: Float[Array, "m _"],
+    transition: Callable[..., Array] | NonAdditiveNoise,
+    process_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
+    observation_noise: Array | Callable[..., Array],
     *,
     arithmetic: Arithmetic = arithmetics.joseph,
     manifold: Manifold = euclidean,
@@ -94,10 +95,11 @@ def cubature_kalman(
 
     Args:
         prior: Belief before the first observation, with a mean of shape (n,), as for `extended_kalman`.
-        transition: `(x, control) -> x` without noise; (n,) to (n,).
-        process_noise: Covariance of the process noise, (n, n), or `control -> covariance`.
-        observe: `x -> y` without noise; (n,) to (m,).
-        observation_noise: Covariance of the observation noise, (m, m).
+        transition: `x -> x` or `(x, inputs) -> x` without noise, (n,) to (n,); or `NonAdditiveNoise`.
+        process_noise: Covariance of the process noise, (n, n), or a function `inputs -> covariance` or
+            `(x, inputs) -> covariance`.
+        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`.
+        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`.
         arithmetic: `jf.arithmetic.joseph`, `square_root` (all covariances are then roots) or `fast`.
         manifold: Space of the states, as for `extended_kalman`.
         residual: `(y, y_hat) -> y - y_hat`, for observations that wrap around.
@@ -114,9 +116,8 @@ def cubature_kalman(
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.array([3.0, 4.0]), jnp.eye(2))
-        >>> transition = lambda x, control: x
         >>> observe = lambda x: jnp.sqrt(x[:1] ** 2 + x[1:] ** 2)
-        >>> filter = jf.cubature_kalman(prior, transition, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
+        >>> filter = jf.cubature_kalman(prior, lambda x: x, 0.1 * jnp.eye(2), observe, 0.01 * jnp.eye(1))
         >>> last, _ = jf.run(filter, jax.random.key(0), 5.0 * jnp.ones((10, 1)))
         >>> last.mean.shape
         (2,)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxfilters._renamed import takes_inputs
 from jaxfilters.filter import Filter, keep_all, run
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.manifold import Belief, increments, retract_belief, to_tangent
@@ -11,8 +12,9 @@ from jaxfilters.gaussian.model import GaussianModel, model_of
 from jaxfilters.typing import AnyKey, Mask
 
 
+@takes_inputs
 def filter_and_smooth(
-    filter: Filter, key: AnyKey, observations: PyTree, controls: PyTree = None, *, mask: Mask | None = None
+    filter: Filter, key: AnyKey, observations: PyTree, inputs: PyTree = None, *, mask: Mask | None = None
 ) -> tuple[Belief, PyTree]:
     """Smoothed beliefs given the whole sequence, time first, and the infos of the filter.
 
@@ -22,7 +24,7 @@ def filter_and_smooth(
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         key: Random key; the filter ignores it.
         observations: Observations, time first, as for `jf.run`.
-        controls: Known inputs, time first, or `None`.
+        inputs: Known inputs, time first, or `None`.
         mask: False for frames without an observation, (t,).
 
     Returns:
@@ -34,11 +36,12 @@ def filter_and_smooth(
     """
     checks.is_filter("filter", filter)
     model_of(filter, "filter")
-    _, (beliefs, infos) = run(filter, key, observations, controls, mask=mask, collect=keep_all)
-    return rts(filter, beliefs, controls), infos
+    _, (beliefs, infos) = run(filter, key, observations, inputs, mask=mask, collect=keep_all)
+    return rts(filter, beliefs, inputs), infos
 
 
-def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
+@takes_inputs
+def rts(filter: Filter, beliefs: Belief, inputs: PyTree = None) -> Belief:
     """Rauch-Tung-Striebel smoother: beliefs given the whole sequence, from those of the filter.
 
     Each belief is conditioned on the smoothed one of the next frame (S. Särkkä, "Bayesian Filtering and Smoothing",
@@ -49,13 +52,13 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
         filter: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         beliefs: The states that `jf.run` collects, time first, with leaves (t, n) and (t, d, d); or those of a wrapper
             of the filter, such as `constrained`.
-        controls: The controls of that run, time first.
+        inputs: The inputs of that run, time first.
 
     Returns:
         The smoothed beliefs, time first; the last is that of the filter.
 
     Raises:
-        ValueError: If `filter` is another kind of filter, `beliefs` have other shapes than its states, or `controls`
+        ValueError: If `filter` is another kind of filter, `beliefs` have other shapes than its states, or `inputs`
             another length than `beliefs`.
         TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
 
@@ -64,7 +67,7 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> filter = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> filter = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
         >>> _, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)))
         >>> smoothed = jf.smoothing.rts(filter, beliefs)
         >>> bool((smoothed.covariance[:-1] < beliefs.covariance[:-1]).all())
@@ -73,24 +76,24 @@ def rts(filter: Filter, beliefs: Belief, controls: PyTree = None) -> Belief:
     checks.is_filter("filter", filter)
     model = model_of(filter, "filter")
     length = checks.beliefs("beliefs", beliefs, model.prior)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(controls)}
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(inputs)}
     if not lengths <= {(length,)}:
-        raise ValueError(f"controls must be as long as beliefs, {length}; got {sorted(lengths)}.")
-    return _backward(model, beliefs, controls)
+        raise ValueError(f"inputs must be as long as beliefs, {length}; got {sorted(lengths)}.")
+    return _backward(model, beliefs, inputs)
 
 
 @jax.jit
-def _backward(model: GaussianModel, beliefs: Belief, controls: PyTree) -> Belief:
-    def step(following: Belief, inputs: tuple) -> tuple[Belief, Belief]:
-        belief, control = inputs
-        origin, ahead = model.linear_transition(belief, control)
+def _backward(model: GaussianModel, beliefs: Belief, inputs: PyTree) -> Belief:
+    def step(following: Belief, frame: tuple) -> tuple[Belief, Belief]:
+        belief, inputs = frame
+        origin, ahead = model.linear_transition(belief, inputs)
         next_belief = to_tangent(model.manifold, origin, following)
-        noise = model.process_noise_of(control)
+        noise = model.process_noise_of(belief, inputs)
         delta = model.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(model.manifold, belief.mean, delta)
         return smoothed, smoothed
 
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
-    _, smoothed = jax.lax.scan(step, last, (earlier, jax.tree.map(lambda leaf: leaf[1:], controls)), reverse=True)
+    _, smoothed = jax.lax.scan(step, last, (earlier, jax.tree.map(lambda leaf: leaf[1:], inputs)), reverse=True)
     return jax.tree.map(lambda most, end: jnp.concatenate([most, end[None]]), smoothed, last)

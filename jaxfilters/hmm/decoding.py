@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxfilters.hmm.log_likelihoods import Lengths, as_column, check_shapes, inside_sequences, usable
-from jaxfilters.hmm.model import HiddenMarkovModel
+from jaxfilters.hmm.model import HiddenMarkovModel, of_each_frame
 
 _UNROLLED = 16
 """Largest number of states for which the Viterbi maximum is written out as operations on vectors."""
@@ -44,8 +44,9 @@ def viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"
     initial = as_column(model.log_initial, log_likelihoods)
 
     def step(best: Array, inputs: tuple) -> tuple[Array, Array]:
-        frame, is_first, is_inside = inputs
-        reached, origin = best_predecessor(best, model.log_transition)
+        frame, is_first, is_inside, log_transition = inputs
+        log_transition = model.log_transition if log_transition is None else log_transition
+        reached, origin = best_predecessor(best, log_transition)
         after = jnp.where(is_first, initial, reached) + usable(frame)
         return jnp.where(is_inside, after, best), origin
 
@@ -56,7 +57,9 @@ def viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"
 
     start = jnp.zeros((len(initial), *inside.shape[1:]), log_likelihoods.dtype)
     is_first = jnp.arange(len(log_likelihoods)) == 0
-    best, origins = jax.lax.scan(step, start, (log_likelihoods, is_first, inside))
+    best, origins = jax.lax.scan(
+        step, start, (log_likelihoods, is_first, inside, of_each_frame(model.log_transition, after=False))
+    )
     last = jnp.argmax(best, axis=0).astype(jnp.int32)
     _, states = jax.lax.scan(back, last, (origins, inside), reverse=True)
     log_probability = jnp.max(best, axis=0)

@@ -11,8 +11,9 @@ Lengths = Int[Array, "*batch"] | None
 
 def check_shapes(model: HiddenMarkovModel, log_likelihoods: Array, lengths: Array | None) -> None:
     """Reject shapes that do not match, at trace time."""
-    check_model(model)
-    shape, num_states = jnp.shape(log_likelihoods), model.log_initial.shape[0]
+    shape = jnp.shape(log_likelihoods)
+    check_model(model, shape[0] if shape else None)
+    num_states = model.log_initial.shape[0]
     if len(shape) < 2 or shape[1] != num_states:
         raise ValueError(
             f"log_likelihoods must be (T, Q) or (T, Q, n) with the {num_states} states of the model; got {shape}."

@@ -1,5 +1,7 @@
 """Hidden Markov models: their parameters, common topologies, and sampling."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.hmm.emissions import Emission, check_values
-from jaxfilters.typing import AnyKey
+from jaxfilters.typing import AnyKey, only_inputs
 
 
 @pytree_dataclass
@@ -22,10 +24,47 @@ class HiddenMarkovModel:
 
     log_initial: Float[Array, "..."]
     """(Q,): log p(s_1), for the state in the first frame."""
-    log_transition: Float[Array, "..."]
-    """(Q, Q): log p(s_t+1 = j | s_t = i) at [i, j]; `-inf` for a transition that is ruled out, also in training."""
+    log_transition: Float[Array, "..."] | Callable
+    """(Q, Q): log p(s_t+1 = j | s_t = i) at [i, j]; `-inf` for a transition that is ruled out, also in training.
+    (T - 1, Q, Q) where it changes with time: element t leads from frame t to frame t + 1. A function of the inputs of a
+    step for `jf.hmm.online`, and for `with_inputs`, which evaluates it for a whole sequence."""
     emission: Emission | None = None
     """p(y | s); `None` if log-likelihoods (T, Q) come from another source."""
+
+    def with_inputs(self, inputs: PyTree) -> "HiddenMarkovModel":
+        """The model of one sequence whose transitions depend on known inputs.
+
+        Args:
+            inputs: Inputs of the T frames, leaves with time first, as for `jf.run`: those of a frame belong to the
+                transition to it, and those of the first frame to none.
+
+        Returns:
+            The model with `log_transition` (T - 1, Q, Q).
+
+        Raises:
+            ValueError: If `log_transition` is no function; if the leaves of `inputs` do not share one length; if the
+                function returns another shape than (Q, Q), or rows that do not sum to 1 where they are known.
+        """
+        if not callable(self.log_transition):
+            raise ValueError("model must have a function of the inputs for its transitions; it has an array.")
+        lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(inputs)}
+        if len(lengths) != 1 or () in lengths:
+            raise ValueError(f"inputs must have leaves that share one length, time first; got {sorted(lengths)}.")
+        found = jax.vmap(self.transition_of)(jax.tree.map(lambda leaf: leaf[1:], inputs))
+        if not isinstance(found, jax.core.Tracer) and found.size:
+            _check_probabilities("transition", np.exp(np.asarray(found, float)).reshape(-1, found.shape[-1]))
+        return replace(self, log_transition=found)
+
+    def transition_of(self, inputs: PyTree) -> Float[Array, "q q"]:
+        """Log transition probabilities (Q, Q) of one step."""
+        if not callable(self.log_transition):
+            return self.log_transition
+        found = self.log_transition(inputs)
+        if jnp.shape(found) != self.log_initial.shape * 2:
+            raise ValueError(
+                f"the transition function must return {self.log_initial.shape * 2}, (Q, Q); got {jnp.shape(found)}."
+            )
+        return found
 
     def log_likelihoods(self, observations: PyTree, mask: Bool[Array, " t"] | None = None) -> Float[Array, "t q"]:
         """Log p(y_t | s_t) of every frame and state of one sequence.
@@ -67,15 +106,43 @@ class HiddenMarkovModel:
         return found if mask is None else jnp.where(mask[:, None], found, 0.0)
 
 
-def check_model(model: HiddenMarkovModel) -> None:
+def check_model(model: HiddenMarkovModel, num_frames: int | None = None) -> None:
     """Reject parameters whose shapes do not match, at trace time.
 
+    Args:
+        model: The model.
+        num_frames: Length T of the sequence where transitions may change with time; `None` where they may not.
+
     Raises:
-        ValueError: If `log_initial` is not (Q,) or `log_transition` is not (Q, Q).
+        ValueError: If `log_initial` is not (Q,), or `log_transition` is neither (Q, Q) nor, where it may be,
+            (T - 1, Q, Q).
     """
+    if callable(model.log_transition):
+        raise ValueError(
+            "log_transition must be an array here; got a function of the inputs: pass model.with_inputs(inputs)."
+        )
     shapes = jnp.shape(model.log_initial), jnp.shape(model.log_transition)
-    if len(shapes[0]) != 1 or shapes[1] != shapes[0] * 2:
-        raise ValueError(f"log_initial and log_transition must be (Q,) and (Q, Q); got {shapes[0]} and {shapes[1]}.")
+    square = shapes[0] * 2
+    if num_frames and len(shapes[0]) == 1 and shapes[1] == (num_frames - 1, *square):
+        return
+    if len(shapes[0]) != 1 or shapes[1] != square:
+        varying = "" if not num_frames else f" (or {(num_frames - 1, *square)}, one for each step)"
+        raise ValueError(
+            f"log_initial and log_transition must be (Q,) and (Q, Q){varying}; got {shapes[0]} and {shapes[1]}."
+        )
+
+
+def of_each_frame(log_transition: Float[Array, "..."], *, after: bool) -> Float[Array, "t q q"] | None:
+    """The transitions from each frame (`after`), or to each frame; None where all are the same.
+
+    That from the last frame, or to the first, is one of certainty to stay, and stands for none.
+    """
+    if jnp.ndim(log_transition) == 2:
+        return None
+    size = log_transition.shape[-1]
+    none = jnp.log(jnp.eye(size, dtype=log_transition.dtype))[None]
+    parts = (log_transition, none) if after else (none, log_transition)
+    return jnp.concatenate(parts)
 
 
 def from_probabilities(initial: Any, transition: Any, emission: Emission | None = None) -> HiddenMarkovModel:
@@ -83,11 +150,14 @@ def from_probabilities(initial: Any, transition: Any, emission: Emission | None 
 
     Args:
         initial: (Q,): p(s_1), summing to 1.
-        transition: (Q, Q): p(s_t+1 = j | s_t = i) at [i, j]; every row sums to 1.
+        transition: (Q, Q): p(s_t+1 = j | s_t = i) at [i, j]; every row sums to 1. Or (T - 1, Q, Q), one for each step
+            of a sequence of T frames; or a function `inputs -> (Q, Q)` of the known inputs of a step, for
+            `jf.hmm.online` and `HiddenMarkovModel.with_inputs`.
         emission: p(y | s) of the Q states.
 
     Raises:
         ValueError: If shapes do not match, a number is not a probability, or a sum differs from 1 by more than 1e-4.
+        TypeError: If a function takes other arguments than the inputs.
 
     Example:
         >>> import jaxfilters as jf
@@ -95,17 +165,37 @@ def from_probabilities(initial: Any, transition: Any, emission: Emission | None 
         >>> model.log_transition.shape
         (2, 2)
     """
-    initial, transition = np.asarray(initial, float), np.asarray(transition, float)
-    if initial.ndim != 1 or transition.shape != (len(initial), len(initial)) or not len(initial):
+    initial = np.asarray(initial, float)
+    steps = np.zeros((0, 0)) if callable(transition) else np.asarray(transition, float)
+    shape = (len(initial), len(initial)) if initial.ndim == 1 else ()
+    if initial.ndim != 1 or not len(initial) or (not callable(transition) and steps.shape[-2:] != shape):
         raise ValueError(
-            f"initial and transition must be (Q,) and (Q, Q), Q > 0; got {initial.shape} and {transition.shape}."
+            f"initial and transition must be (Q,) and (Q, Q), Q > 0; got {initial.shape} and {steps.shape}."
         )
+    if steps.ndim > 3:
+        raise ValueError(f"transition must be (Q, Q), or (T - 1, Q, Q) for each step; got {steps.shape}.")
     _check_probabilities("initial", initial[None])
-    _check_probabilities("transition", transition)
     _check_num_states(emission, len(initial))
     with np.errstate(divide="ignore"):
-        logs = np.log(initial), np.log(transition)
-    return HiddenMarkovModel(jnp.asarray(logs[0], dtype=float), jnp.asarray(logs[1], dtype=float), emission)
+        log_initial = jnp.asarray(np.log(initial), dtype=float)
+    if callable(transition):
+        return HiddenMarkovModel(log_initial, _LogOf(only_inputs("transition", transition)), emission)
+    _check_probabilities("transition", steps.reshape(-1, len(initial)))
+    with np.errstate(divide="ignore"):
+        return HiddenMarkovModel(log_initial, jnp.asarray(np.log(steps), dtype=float), emission)
+
+
+@pytree_dataclass
+class _LogOf:
+    """Logarithm of the probabilities that a function of the inputs gives."""
+
+    transition: Callable
+
+    def __call__(self, inputs: PyTree) -> Array:
+        found = self.transition(inputs)
+        positive = found > 0
+        # The derivative of a probability of zero is zero, not infinite.
+        return jnp.where(positive, jnp.log(jnp.where(positive, found, 1.0)), jnp.where(found < 0, jnp.nan, -jnp.inf))
 
 
 def from_topology(
@@ -181,15 +271,19 @@ def sample(key: AnyKey, model: HiddenMarkovModel, num_frames: int) -> tuple[Int3
     Returns:
         States (T,) and observations, leaves with time first; `None` without an emission.
     """
+    check_model(model, num_frames)
     state_key, emission_key = jax.random.split(key)
 
-    def step(state: Array, step_key: AnyKey) -> tuple[Array, Array]:
-        following = jax.random.categorical(step_key, model.log_transition[state]).astype(jnp.int32)
+    def step(state: Array, frame: tuple[AnyKey, Array | None]) -> tuple[Array, Array]:
+        step_key, log_transition = frame
+        log_transition = model.log_transition if log_transition is None else log_transition
+        following = jax.random.categorical(step_key, log_transition[state]).astype(jnp.int32)
         return following, state
 
     keys = jax.random.split(state_key, num_frames + 1)
     first = jax.random.categorical(keys[0], model.log_initial).astype(jnp.int32)
-    _, states = jax.lax.scan(step, first, keys[1:])
+    # The state that follows the last frame is drawn, and not used.
+    _, states = jax.lax.scan(step, first, (keys[1:], of_each_frame(model.log_transition, after=True)))
     if model.emission is None:
         return states, None
     return states, jax.vmap(model.emission.sample)(jax.random.split(emission_key, num_frames), states)

@@ -34,7 +34,8 @@ def online(model: HiddenMarkovModel) -> Filter:
     """The exact filter of the hidden state, for `jaxfilters.run`.
 
     Args:
-        model: The model. Observations are those of `model.emission`; without one, log-likelihoods (Q,).
+        model: The model. Observations are those of `model.emission`; without one, log-likelihoods (Q,). Transitions
+            that are a function of the inputs get those of `jf.run`; those of the first frame are not used.
 
     Raises:
         ValueError: If `log_initial` and `log_transition` are not (Q,) and (Q, Q).
@@ -47,7 +48,8 @@ def online(model: HiddenMarkovModel) -> Filter:
         >>> states.log_probabilities.shape
         (5, 2)
     """
-    check_model(model)
+    if not callable(model.log_transition):
+        check_model(model)
     return Filter(model, _init, _predict, _update)
 
 
@@ -56,17 +58,17 @@ def _init(model: HiddenMarkovModel, key: AnyKey) -> ChainState:
     return ChainState(model.log_initial, jnp.zeros((), bool))
 
 
-def _predict(model: HiddenMarkovModel, key: AnyKey, state: ChainState, control: PyTree) -> ChainState:
-    del key, control
-    arriving = state.log_probabilities[:, None] + model.log_transition
+def _predict(model: HiddenMarkovModel, key: AnyKey, state: ChainState, inputs: PyTree) -> ChainState:
+    del key
+    arriving = state.log_probabilities[:, None] + model.transition_of(inputs)
     _, ahead = jax.vmap(weights.normalize, in_axes=1)(arriving)
     return ChainState(jnp.where(state.started, ahead, state.log_probabilities), jnp.ones((), bool))
 
 
 def _update(
-    model: HiddenMarkovModel, key: AnyKey, state: ChainState, observation: PyTree
+    model: HiddenMarkovModel, key: AnyKey, state: ChainState, observation: PyTree, inputs: PyTree
 ) -> tuple[ChainState, ChainInfo]:
-    del key
+    del key, inputs
     log_likelihood = observation if model.emission is None else model.emission.log_likelihood(observation)
     if jnp.shape(log_likelihood) != model.log_initial.shape:
         name = "observation, without an emission," if model.emission is None else "emission.log_likelihood"

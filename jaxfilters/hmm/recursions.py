@@ -9,6 +9,7 @@ where the sum is a matrix product and $\alpha$ is rescaled by about its largest 
 nats below that of the best one in float32, 1000 in float64, counts as impossible; `viterbi` has no such
 limit.
 
+`model.log_transition` is `(Q, Q)`, or `(T - 1, Q, Q)` where it changes with time; sequences share it.
 `log_likelihoods` are `(T, Q)`, or `(T, Q, n)` for n sequences: with the sequences last this is vector arithmetic, a
 third faster than `vmap` over a first axis, which works as well. NaN counts as `-inf`. `lengths` (n,) are the numbers of
 frames of the sequences; later frames are padding and contribute nothing, whatever they hold. A sequence that is
@@ -27,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters.hmm.log_likelihoods import Lengths, as_column, check_shapes, inside_sequences, usable
-from jaxfilters.hmm.model import HiddenMarkovModel
+from jaxfilters.hmm.model import HiddenMarkovModel, of_each_frame
 
 _BLOCK = 16
 """Number of frames whose scales are added together: operations on many frames at once use longer vectors."""
@@ -51,8 +52,9 @@ class Posterior(NamedTuple):
     """Marginal log-likelihood log p(y_1:T)."""
     states: Float[Array, "t q *batch"]
     """p(s_t | y_1:T); zero in padding and for impossible sequences."""
-    transitions: Float[Array, "q q"]
-    """Expected number of transitions from i to j at [i, j], summed over the sequences."""
+    transitions: Float[Array, "..."]
+    """(Q, Q): expected number of transitions from i to j at [i, j], summed over the sequences; (T - 1, Q, Q), one for
+    each step, where the transitions of the model change with time."""
 
 
 @jax.jit
@@ -128,13 +130,14 @@ def backward(
     inside = inside_sequences(log_likelihoods, lengths)
 
     def step(following: Array, inputs: tuple) -> tuple[Array, Array]:
-        frame, is_inside = inputs
+        frame, is_inside, own = inputs
         scaled, shift = _scaled(following + usable(frame))
-        log_beta = jnp.where(is_inside, jnp.log(_matmul(A, scaled)) + shift, 0.0)
+        log_beta = jnp.where(is_inside, jnp.log(_matmul(A if own is None else own, scaled)) + shift, 0.0)
         return log_beta, log_beta
 
     last = jnp.zeros_like(log_likelihoods[:1])
-    _, earlier = jax.lax.scan(step, last[0], (log_likelihoods[1:], inside[1:]), reverse=True)
+    each = (log_likelihoods[1:], inside[1:], A if A.ndim == 3 else None)
+    _, earlier = jax.lax.scan(step, last[0], each, reverse=True)
     return jnp.concatenate([earlier, last])
 
 
@@ -162,12 +165,13 @@ def _log_evidence(log_initial, log_transition, log_likelihoods, lengths):
     step = _step(log_initial, log_transition, log_likelihoods)
     num_frames, batch = len(log_likelihoods), log_likelihoods.shape[2:]
     inside = None if lengths is None else inside_sequences(log_likelihoods, lengths)
+    steps = _to_each_frame(log_transition)
 
     def block(carry: tuple, first: Any, count: int = _BLOCK) -> tuple[tuple, None]:
         scaled, total = carry
         here = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, count)
-        frames, is_inside = usable(here(log_likelihoods)), jax.tree.map(here, inside)
-        scaled, shifts = jax.lax.scan(step, scaled, (frames, jnp.arange(count) + first == 0, is_inside))
+        frames, is_inside, own = usable(here(log_likelihoods)), *jax.tree.map(here, (inside, steps))
+        scaled, shifts = jax.lax.scan(step, scaled, (frames, jnp.arange(count) + first == 0, is_inside, own))
         return (scaled, _add_compensated(total, jnp.sum(shifts, axis=0))), None
 
     zero = jnp.zeros(batch, log_likelihoods.dtype)
@@ -212,19 +216,19 @@ def _forward(log_initial, log_transition, log_likelihoods, lengths) -> tuple[Arr
     zero = jnp.zeros(log_likelihoods.shape[2:], log_likelihoods.dtype)
     start = (_uniform(log_initial, log_likelihoods), (zero, zero))
     is_first = jnp.arange(len(log_likelihoods)) == 0
-    carry, stored = jax.lax.scan(accumulate, start, (log_likelihoods, is_first, inside))
+    carry, stored = jax.lax.scan(accumulate, start, (log_likelihoods, is_first, inside, _to_each_frame(log_transition)))
     return _total(*carry, log_likelihoods, lengths), *stored
 
 
 def _step(log_initial, log_transition, log_likelihoods) -> Callable:
     """The function that advances scaled probabilities by one frame, from usable log-likelihoods."""
-    A_transposed = jnp.exp(log_transition).T
+    A_transposed = jnp.exp(log_transition).T if log_transition.ndim == 2 else None
     initial = jnp.exp(as_column(log_initial, log_likelihoods))
 
     def step(scaled: Array, inputs: tuple) -> tuple[Array, Array]:
-        frame, is_first, is_inside = inputs
+        frame, is_first, is_inside, own = inputs
         # The first frame is part of the loop, because a loop over the other frames would copy them.
-        predicted = jnp.where(is_first, initial, _matmul(A_transposed, scaled))
+        predicted = jnp.where(is_first, initial, _matmul(A_transposed if own is None else own.T, scaled))
         # An approximation suffices to choose a scale, and is much cheaper than logarithms.
         peak = jnp.max(jnp.where(predicted > 0, frame + _rough_log(predicted), -jnp.inf), axis=0)
         shift = jax.lax.stop_gradient(_finite(peak)) - _headroom(predicted)
@@ -238,6 +242,12 @@ def _step(log_initial, log_transition, log_likelihoods) -> Callable:
         return jnp.where(is_inside, after, scaled), jnp.where(is_inside, shift, 0.0)
 
     return step
+
+
+def _to_each_frame(log_transition: Array) -> Array | None:
+    """The transition probabilities to each frame where they change with time, else None."""
+    steps = of_each_frame(log_transition, after=False)
+    return None if steps is None else jnp.exp(steps)
 
 
 def _rough_log(x: Array) -> Array:
@@ -273,21 +283,31 @@ def _smoothed(A: Array, scaled: Array, inside: Array) -> tuple[Array, Array]:
 
     def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple[Array, Array]]:
         following, next_inside = carry
-        here, is_inside = inputs
-        predicted = _matmul(A.T, here)
+        here, is_inside, own = inputs
+        step_A = A if own is None else own
+        predicted = _matmul(step_A.T, here)
         possible = predicted > jnp.finfo(here.dtype).tiny
         ratio = jnp.where(possible, following / jnp.where(possible, predicted, 1.0), 0.0)
-        gamma = _normalized(jnp.where(next_inside, here * _matmul(A, ratio), here), axis=0)
+        gamma = _normalized(jnp.where(next_inside, here * _matmul(step_A, ratio), here), axis=0)
         gamma = jnp.where(is_inside, gamma, 0.0)
         return (gamma, is_inside), (gamma, ratio)
 
     after_the_end = (jnp.zeros(scaled.shape[1:], scaled.dtype), jnp.zeros(inside.shape[1:], bool))
-    _, found = jax.lax.scan(step, after_the_end, (scaled, inside), reverse=True)
+    # The last frame has no transition, and its element has no effect.
+    own = None if A.ndim == 2 else jnp.concatenate([A, jnp.zeros((1, *A.shape[1:]), A.dtype)])
+    _, found = jax.lax.scan(step, after_the_end, (scaled, inside, own), reverse=True)
     return found
 
 
 def _expected_transitions(A: Array, scaled: Array, ratios: Array) -> Array:
-    """Expected numbers of transitions, summed over frames and sequences by one matrix product."""
+    """Expected numbers of transitions, summed over sequences, and over frames unless each has a transition of its own.
+
+    One matrix product, or one for each frame.
+    """
+    if A.ndim == 3:
+        earlier, later = (leaf[:-1].reshape(len(A), A.shape[1], -1) for leaf in (scaled, ratios))
+        sums = jnp.einsum("tin,tjn->tij", earlier, later, precision="highest")
+        return jnp.where(A > 0, A * sums, 0.0)
     axes = (0, *range(2, scaled.ndim))
     sums = jnp.tensordot(scaled, ratios, axes=(axes, axes), precision="highest")
     return jnp.where(A > 0, A * sums, 0.0)

@@ -135,8 +135,8 @@ def _init(model: Spotter, key: AnyKey) -> SpotterState:
     )
 
 
-def _predict(model: Spotter, key: AnyKey, state: SpotterState, control: PyTree) -> SpotterState:
-    del key, control
+def _predict(model: Spotter, key: AnyKey, state: SpotterState, inputs: PyTree) -> SpotterState:
+    del key, inputs
     frame, chain = state.frame + 1, model.network.model
     first = frame == 0
     # A path may enter a symbol from the best state of the null model.
@@ -152,8 +152,10 @@ def _predict(model: Spotter, key: AnyKey, state: SpotterState, control: PyTree) 
     )
 
 
-def _update(model: Spotter, key: AnyKey, state: SpotterState, observation: PyTree) -> tuple[SpotterState, SpotterInfo]:
-    del key
+def _update(
+    model: Spotter, key: AnyKey, state: SpotterState, observation: PyTree, inputs: PyTree
+) -> tuple[SpotterState, SpotterInfo]:
+    del key, inputs
     emission = model.network.model.emission
     scores = observation if emission is None else emission.log_likelihood(observation)
     if jnp.shape(scores) != state.null.shape:

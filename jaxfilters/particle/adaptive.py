@@ -39,7 +39,7 @@ from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import no_tempering
 from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
-from jaxfilters.typing import AnyKey, ResamplingScheme, SamplePrior, as_pytree
+from jaxfilters.typing import AnyKey, ResamplingScheme, SamplePrior, as_pytree, taking_inputs
 
 
 class AdaptiveDiffusionState(NamedTuple):
@@ -102,7 +102,7 @@ def adaptive_diffusion(
     The transition is $x_t = x'_{t-1} + \tau v_{t-1} + \omega$ with a resampled particle $x'$, the velocity $v$ of the
     last *estimate* (the mean around the mode), and noise $\omega$ of standard deviation $\tau (A |v| + b)$. Only the
     first m coordinates move like this; the others perform a random walk with $\sqrt\tau$ times `steady_std`. The
-    control is $\tau$, the time since the last prediction; `None` is 1. An update in which no particle explains the
+    inputs is $\tau$, the time since the last prediction; `None` is 1. An update in which no particle explains the
     observation leaves estimate, velocity and fit unchanged, as a missed frame does.
 
     Args:
@@ -134,7 +134,7 @@ def adaptive_diffusion(
         raise TypeError(f"fit must be a DiffusionFit of jaxfilters.math.diffusion.start; got {fit!r}.")
     params = AdaptiveDiffusion(
         as_pytree(sample_prior),
-        as_pytree(log_likelihood),
+        taking_inputs("log_likelihood", log_likelihood, "particles", "y"),
         fit,
         as_pytree(update_fit),
         _limits("low", low, fit.scale.shape),
@@ -178,11 +178,11 @@ def _init(model: AdaptiveDiffusion, key: AnyKey) -> AdaptiveDiffusionState:
 
 
 def _predict(
-    model: AdaptiveDiffusion, key: AnyKey, state: AdaptiveDiffusionState, control: PyTree
+    model: AdaptiveDiffusion, key: AnyKey, state: AdaptiveDiffusionState, inputs: PyTree
 ) -> AdaptiveDiffusionState:
     resample_key, noise_key = jax.random.split(key)
-    tau = jnp.asarray(1.0 if control is None else control, state.elapsed.dtype)
-    checks.check_shape("control", tau, (), "it is the time since the last prediction")
+    tau = jnp.asarray(1.0 if inputs is None else inputs, state.elapsed.dtype)
+    checks.check_shape("inputs", tau, (), "it is the time since the last prediction")
     tau = jnp.where(tau > 0, tau, 0.0)
     particles, log_weights, ancestors = resample(resample_key, state.particles, state.log_weights, model.scheme, 1.0)
     changing = tau * diffusion.velocity_change_std(state.fit, state.velocity, low=model.low, high=model.high)
@@ -202,12 +202,12 @@ def _predict(
 
 
 def _update(
-    model: AdaptiveDiffusion, key: AnyKey, state: AdaptiveDiffusionState, observation: PyTree
+    model: AdaptiveDiffusion, key: AnyKey, state: AdaptiveDiffusionState, observation: PyTree, inputs: PyTree
 ) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     particles, log_weights, ancestors = state.particles, state.log_weights, state.ancestors
 
     def log_likelihood(particles: Array) -> Array:
-        values = model.log_likelihood(particles, observation)
+        values = model.log_likelihood(particles, observation, inputs)
         return checks.log_likelihoods_of_ensemble(values, particles.shape[1])
 
     if model.partitions is None:

@@ -30,6 +30,7 @@ from jaxfilters.typing import (
     SampleTransition,
     Temper,
     as_pytree,
+    taking_inputs,
 )
 
 
@@ -79,8 +80,9 @@ def bootstrap(
 
     Args:
         sample_prior: `key -> x`; or one of `jaxfilters.priors`, which draw all particles at once, twice as fast.
-        sample_transition: `(randomness, x, control) -> x`, the state one step later with its process noise.
-        log_likelihood: `(x, y) -> log p(y | x)`, a scalar.
+        sample_transition: `(randomness, x) -> x`, the state one step later with its process noise.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar. Both may take the inputs of the step as one more argument,
+            see `jf.typing`.
         num_particles: Number n of particles.
         noise: Source of `randomness`: by default a random key for each particle. `StandardNormal(d)` passes d standard
             normal numbers instead and is several times faster.
@@ -99,7 +101,7 @@ def bootstrap(
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
-        >>> move = lambda noise, x, control: 0.9 * x + 0.5 * noise
+        >>> move = lambda noise, x: 0.9 * x + 0.5 * noise
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2)
         >>> pf = jf.bootstrap(
         ...     lambda key: jnp.zeros(1), move, log_likelihood, num_particles=1000, noise=jf.StandardNormal(1)
@@ -111,8 +113,8 @@ def bootstrap(
     checks.check_ensemble(num_particles, ess_threshold, scheme, temper)
     params = Bootstrap(
         as_pytree(sample_prior),
-        as_pytree(sample_transition),
-        as_pytree(log_likelihood),
+        taking_inputs("sample_transition", sample_transition, "randomness", "x"),
+        taking_inputs("log_likelihood", log_likelihood, "x", "y"),
         as_pytree(temper or no_tempering),
         ess_threshold,
         num_particles,
@@ -130,7 +132,7 @@ def _init(model: Bootstrap, key: AnyKey) -> ParticleState:
     return ParticleState(particles, weights.uniform(count), jnp.arange(count, dtype=jnp.int32), noise)
 
 
-def _predict(model: Bootstrap, key: AnyKey, state: ParticleState, control: PyTree) -> ParticleState:
+def _predict(model: Bootstrap, key: AnyKey, state: ParticleState, inputs: PyTree) -> ParticleState:
     resample_key, noise_key = jax.random.split(key)
     particles, log_weights, ancestors = resample(
         resample_key, state.particles, state.log_weights, model.scheme, model.ess_threshold
@@ -138,15 +140,15 @@ def _predict(model: Bootstrap, key: AnyKey, state: ParticleState, control: PyTre
     transition = checks.checked_transition(model.sample_transition)
     move = jax.vmap(transition, in_axes=(-1, -1, None), out_axes=-1)
     return ParticleState(
-        move(state.noise, particles, control), log_weights, ancestors, model.noise(noise_key, model.num_particles)
+        move(state.noise, particles, inputs), log_weights, ancestors, model.noise(noise_key, model.num_particles)
     )
 
 
 def _update(
-    model: Bootstrap, key: AnyKey, state: ParticleState, observation: PyTree
+    model: Bootstrap, key: AnyKey, state: ParticleState, observation: PyTree, inputs: PyTree
 ) -> tuple[ParticleState, ParticleInfo]:
     del key
     log_likelihood = checks.checked_log_likelihood(model.log_likelihood)
-    log_likelihoods = jax.vmap(log_likelihood, in_axes=(-1, None))(state.particles, observation)
+    log_likelihoods = jax.vmap(log_likelihood, in_axes=(-1, None, None))(state.particles, observation, inputs)
     log_weights, info = reweight(state.log_weights, log_likelihoods, state.ancestors, model.temper)
     return state._replace(log_weights=log_weights), info

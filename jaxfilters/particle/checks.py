@@ -187,10 +187,10 @@ def like(name: str, value: PyTree, reference: PyTree, reference_name: str, hint:
 def checked_transition(sample_transition: Callable) -> Callable:
     """The transition of one particle, which must return a state like the one that it is given."""
 
-    def transition(randomness: Any, x: PyTree, control: PyTree) -> PyTree:
+    def transition(randomness: Any, x: PyTree, inputs: PyTree) -> PyTree:
         shapes = [leaf.shape for leaf in jax.tree.leaves(randomness) if hasattr(leaf, "shape")]
         hint = f" (x is what sample_prior draws; randomness has the shape {', '.join(map(str, shapes))})"
-        return like("the result of sample_transition", sample_transition(randomness, x, control), x, "x", hint)
+        return like("the result of sample_transition", sample_transition(randomness, x, inputs), x, "x", hint)
 
     return transition
 
@@ -198,8 +198,8 @@ def checked_transition(sample_transition: Callable) -> Callable:
 def checked_log_likelihood(log_likelihood: Callable) -> Callable:
     """The log-likelihood of one particle, which must be one real number."""
 
-    def scalar(x: PyTree, y: PyTree) -> Array:
-        return scalar_log_density("log_likelihood", log_likelihood(x, y))
+    def scalar(x: PyTree, y: PyTree, inputs: PyTree) -> Array:
+        return scalar_log_density("log_likelihood", log_likelihood(x, y, inputs))
 
     return scalar
 
@@ -245,8 +245,8 @@ def checked_dynamics(dynamics: Callable, noise_dim: int | tuple[int, ...], linea
     l = linear_size
     expected = {"A_n": (n, l), "Q_n": (n, n), "f_l": (l,), "A_l": (l, l), "Q_l": (l, l)}
 
-    def checked(x: PyTree, control: PyTree) -> Any:
-        step = dynamics(x, control)
+    def checked(x: PyTree, inputs: PyTree) -> Any:
+        step = dynamics(x, inputs)
         if not all(hasattr(step, name) for name in ("f_n", *expected)):
             raise TypeError(f"dynamics must return a MixedDynamics; got {_kind(step)}.")
         like("f_n of dynamics", step.f_n, x, "x, which sample_prior draws")

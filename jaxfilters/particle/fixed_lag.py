@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from jaxfilters._renamed import takes_inputs
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
@@ -39,7 +40,7 @@ class GaussianLagState(NamedTuple):
     belief: Belief
     window: Belief
     """Filtered beliefs of the last `lag + 1` frames, the oldest first."""
-    controls: PyTree
+    inputs: PyTree
     """Controls of the same frames."""
     frames: Int[Array, ""]
     """Number of frames so far."""
@@ -52,7 +53,7 @@ class FixedLag:
     """Parameters of a filter made by `fixed_lag` or `fixed_lag_rts`; their arguments describe them."""
 
     inner: Filter
-    control: PyTree
+    inputs: PyTree
     lag: int = field(metadata={"static": True})
 
 
@@ -83,13 +84,14 @@ def fixed_lag(inner: Filter, lag: int) -> Filter:
     return Filter(FixedLag(inner, None, lag), _begin_lineages, _predict_lineages, _update_lineages)
 
 
-def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
+@takes_inputs
+def fixed_lag_rts(inner: Filter, lag: int, *, inputs: PyTree = None) -> Filter:
     """Fixed-lag Rauch-Tung-Striebel smoother of a Gaussian filter; the state is a `GaussianLagState`.
 
     Args:
         inner: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman`.
         lag: Number of frames that the smoothed belief is behind, at least 1; each frame costs that many steps back.
-        control: Any control, where predictions have them: its shapes are needed before the first one arrives.
+        inputs: Any inputs of a step, where steps have them: their shapes are needed before the first ones arrive.
 
     Returns:
         The filter.
@@ -103,7 +105,7 @@ def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
-        >>> inner = jf.extended_kalman(prior, lambda x, control: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
+        >>> inner = jf.extended_kalman(prior, lambda x: x, 0.1 * jnp.eye(1), lambda x: x, jnp.eye(1))
         >>> filter = jf.smoothing.fixed_lag_rts(inner, lag=3)
         >>> _, (states, infos) = jf.run(filter, jax.random.key(0), jnp.ones((10, 1)))
         >>> bool(states.delayed.covariance[-1, 0, 0] < states.belief.covariance[-1, 0, 0])
@@ -112,7 +114,7 @@ def fixed_lag_rts(inner: Filter, lag: int, *, control: PyTree = None) -> Filter:
     checks.is_filter("inner", inner)
     _check(lag)
     model_of(inner, "inner")
-    return Filter(FixedLag(inner, control, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
+    return Filter(FixedLag(inner, inputs, lag), _begin_beliefs, _predict_beliefs, _update_beliefs)
 
 
 def _check(lag: int) -> None:
@@ -125,17 +127,17 @@ def _begin_lineages(model: FixedLag, key: AnyKey) -> LineageState:
     return LineageState(inner, _repeated(_ensemble(inner).particles, model.lag + 1))
 
 
-def _predict_lineages(model: FixedLag, key: AnyKey, state: LineageState, control: PyTree) -> LineageState:
-    inner = model.inner.predict(model.inner.params, key, state.inner, control)
+def _predict_lineages(model: FixedLag, key: AnyKey, state: LineageState, inputs: PyTree) -> LineageState:
+    inner = model.inner.predict(model.inner.params, key, state.inner, inputs)
     ensemble = _ensemble(inner)
     return LineageState(inner, _pushed(_followed(state.window, ensemble.ancestors), ensemble.particles))
 
 
 def _update_lineages(
-    model: FixedLag, key: AnyKey, state: LineageState, observation: PyTree
+    model: FixedLag, key: AnyKey, state: LineageState, observation: PyTree, inputs: PyTree
 ) -> tuple[LineageState, PyTree]:
     before = _ensemble(state.inner).ancestors
-    inner, info = model.inner.update(model.inner.params, key, state.inner, observation)
+    inner, info = model.inner.update(model.inner.params, key, state.inner, observation, inputs)
     ensemble = _ensemble(inner)
 
     def children_of_the_same() -> PyTree:
@@ -167,26 +169,24 @@ def _followed(window: PyTree, ancestors: Int[Array, " n"]) -> PyTree:
 
 def _begin_beliefs(model: FixedLag, key: AnyKey) -> GaussianLagState:
     belief = model.inner.init(model.inner.params, key)
-    window, controls = (
-        _repeated(belief, model.lag + 1),
-        _repeated(jax.tree.map(jnp.asarray, model.control), model.lag + 1),
-    )
-    return GaussianLagState(belief, window, controls, jnp.zeros((), jnp.int32), belief)
+    window = _repeated(belief, model.lag + 1)
+    inputs = _repeated(jax.tree.map(jnp.asarray, model.inputs), model.lag + 1)
+    return GaussianLagState(belief, window, inputs, jnp.zeros((), jnp.int32), belief)
 
 
-def _predict_beliefs(model: FixedLag, key: AnyKey, state: GaussianLagState, control: PyTree) -> GaussianLagState:
-    got, wanted = (str(jax.tree.structure(tree)) for tree in (model.control, control))
+def _predict_beliefs(model: FixedLag, key: AnyKey, state: GaussianLagState, inputs: PyTree) -> GaussianLagState:
+    got, wanted = (str(jax.tree.structure(tree)) for tree in (model.inputs, inputs))
     if got != wanted:
-        raise ValueError(f"control of fixed_lag_rts must have the structure of the controls, {wanted}; got {got}.")
-    belief = model.inner.predict(model.inner.params, key, state.belief, control)
-    window, controls = _pushed(state.window, belief), _pushed(state.controls, control)
-    return _smoothed(model, GaussianLagState(belief, window, controls, state.frames + 1, state.delayed))
+        raise ValueError(f"inputs of fixed_lag_rts must have the structure of those of a step, {wanted}; got {got}.")
+    belief = model.inner.predict(model.inner.params, key, state.belief, inputs)
+    window, past = _pushed(state.window, belief), _pushed(state.inputs, inputs)
+    return _smoothed(model, GaussianLagState(belief, window, past, state.frames + 1, state.delayed))
 
 
 def _update_beliefs(
-    model: FixedLag, key: AnyKey, state: GaussianLagState, observation: PyTree
+    model: FixedLag, key: AnyKey, state: GaussianLagState, observation: PyTree, inputs: PyTree
 ) -> tuple[GaussianLagState, PyTree]:
-    belief, info = model.inner.update(model.inner.params, key, state.belief, observation)
+    belief, info = model.inner.update(model.inner.params, key, state.belief, observation, inputs)
     return _smoothed(model, state._replace(belief=belief, window=_renewed(state.window, belief))), info
 
 
@@ -195,18 +195,18 @@ def _smoothed(model: FixedLag, state: GaussianLagState) -> GaussianLagState:
     # Before the first frame there are only copies of the prior, with no transition between them.
     exists = jnp.arange(model.lag) >= model.lag - state.frames
 
-    def step(following: Belief, inputs: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
-        belief, control, exists = inputs
-        origin, ahead = linear.linear_transition(belief, control)
+    def step(following: Belief, frame: tuple[Belief, PyTree, Bool[Array, ""]]) -> tuple[Belief, None]:
+        belief, inputs, exists = frame
+        origin, ahead = linear.linear_transition(belief, inputs)
         next_belief = to_tangent(linear.manifold, origin, following)
-        noise = linear.process_noise_of(control)
+        noise = linear.process_noise_of(belief, inputs)
         delta = linear.arithmetic.rts(increments(belief), next_belief, ahead.F, noise, ahead.value, ahead.residual_root)
         smoothed = retract_belief(linear.manifold, belief.mean, delta)
         return jax.tree.map(lambda new, old: jnp.where(exists, new, old), smoothed, following), None
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], state.window)
-    controls = jax.tree.map(lambda leaf: leaf[1:], state.controls)
-    delayed, _ = jax.lax.scan(step, state.belief, (earlier, controls, exists), reverse=True)
+    inputs = jax.tree.map(lambda leaf: leaf[1:], state.inputs)
+    delayed, _ = jax.lax.scan(step, state.belief, (earlier, inputs, exists), reverse=True)
     return state._replace(delayed=delayed)
 
 

@@ -26,7 +26,7 @@ from jaxfilters.particle import checks, rao_blackwell
 from jaxfilters.particle.proposals import exact
 from jaxfilters.particle.rao_blackwell import Increments, RaoBlackwell, RaoBlackwellState
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.typing import AnyKey, as_pytree
+from jaxfilters.typing import AnyKey, as_pytree, taking_inputs
 
 
 class Guidance(NamedTuple):
@@ -42,7 +42,9 @@ class Guidance(NamedTuple):
 class Guide(Protocol):
     """Compute a `Guidance` from the observation and the predicted ensemble, whose axis is the last one."""
 
-    def __call__(self, particles: PyTree, log_weights: Float[Array, " n"], y: PyTree, /) -> Guidance: ...
+    def __call__(
+        self, particles: PyTree, log_weights: Float[Array, " n"], y: PyTree, inputs: PyTree, /
+    ) -> Guidance: ...
 
 
 class GuidedState(NamedTuple):
@@ -82,6 +84,7 @@ def guided(
     Args:
         inner: A filter made by `rao_blackwell_shared` with the proposal `exact`.
         guide: `(particles, log_weights, y) -> Guidance`; leaves of `particles` have the ensemble axis last.
+            It may take the inputs of the step as one more argument, see `jf.typing`.
         local: `(x, other) -> delta`, the inverse of the filter's `retract`; subtraction by default.
         prior_share: Fraction of the particles that are drawn from the transition alone, in (0, 1). No importance
             correction is larger than `1 / prior_share`.
@@ -97,7 +100,7 @@ def guided(
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> one, R = jnp.ones((1, 1)), 0.001
-        >>> dynamics = lambda x, control: jf.MixedDynamics(x, 0.1 * one, 0.03 * one, jnp.zeros(1), one, one)
+        >>> dynamics = lambda x: jf.MixedDynamics(x, 0.1 * one, 0.03 * one, jnp.zeros(1), one, one)
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2) / R
         >>> prior, velocity = lambda key: jnp.zeros(1), jf.Gaussian(jnp.zeros(1), one)
         >>> inner = jf.rao_blackwell_shared(prior, velocity, dynamics, log_likelihood, num_particles=100, noise_dim=1)
@@ -110,7 +113,8 @@ def guided(
     checks.check_callables(guide=guide, local=local)
     if isinstance(prior_share, bool) or not 0 < prior_share < 1:
         raise ValueError(f"prior_share must be between 0 and 1; got {prior_share!r}.")
-    return Filter(Guided(params, as_pytree(guide), as_pytree(local), float(prior_share)), _init, _predict, _update)
+    guide = taking_inputs("guide", guide, "particles", "log_weights", "y")
+    return Filter(Guided(params, guide, as_pytree(local), float(prior_share)), _init, _predict, _update)
 
 
 def _init(model: Guided, key: AnyKey) -> GuidedState:
@@ -125,13 +129,15 @@ def _zero_increments(ensemble: RaoBlackwellState) -> Increments:
     return Increments(ensemble.particles, zeros, zeros, jnp.zeros((size, size)), jnp.zeros((linear_size, size)))
 
 
-def _predict(model: Guided, key: AnyKey, state: GuidedState, control: PyTree) -> GuidedState:
-    return GuidedState(*rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, control))
+def _predict(model: Guided, key: AnyKey, state: GuidedState, inputs: PyTree) -> GuidedState:
+    return GuidedState(*rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, inputs))
 
 
-def _update(model: Guided, key: AnyKey, state: GuidedState, observation: PyTree) -> tuple[GuidedState, ParticleInfo]:
+def _update(
+    model: Guided, key: AnyKey, state: GuidedState, observation: PyTree, inputs: PyTree
+) -> tuple[GuidedState, ParticleInfo]:
     ensemble, predicted = state
-    guidance = model.guide(ensemble.particles, ensemble.log_weights, observation)
+    guidance = model.guide(ensemble.particles, ensemble.log_weights, observation, inputs)
     size = predicted.delta.shape[0]
     checks.check_guidance(guidance, jax.tree.map(lambda leaf: leaf[..., 0], ensemble.particles), size)
 
@@ -146,7 +152,7 @@ def _update(model: Guided, key: AnyKey, state: GuidedState, observation: PyTree)
         particles=jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)(predicted.origin, predicted.drift + delta),
         linear_mean=ensemble.linear_mean + predicted.gain @ (delta - predicted.delta),
     )
-    ensemble, info = rao_blackwell.update_ensemble(model.inner, ensemble, observation, log_ratio)
+    ensemble, info = rao_blackwell.update_ensemble(model.inner, ensemble, observation, inputs, log_ratio)
     return GuidedState(ensemble, predicted._replace(delta=delta)), info
 
 

@@ -24,25 +24,25 @@ from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Transp
 from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import no_tempering
 from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
-from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, as_pytree
+from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, taking_inputs
 
 
 @runtime_checkable
 class EnsembleLogLikelihood(Protocol):
     r"""Evaluate $\log p(y_t \mid x_t)$ of all particles at once: `(d, n)` and an observation to `(n,)`."""
 
-    def __call__(self, particles: Float[Array, "d n"], y: PyTree, /) -> Float[Array, " n"]: ...
+    def __call__(self, particles: Float[Array, "d n"], y: PyTree, inputs: PyTree, /) -> Float[Array, " n"]: ...
 
 
 def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood:
     """Map the log-likelihood of one particle over all particles.
 
     Args:
-        log_likelihood: `(x, y) -> log p(y | x)`, a scalar.
+        log_likelihood: `(x, y) -> log p(y | x)`, a scalar; or with the inputs of the step after them, see `jf.typing`.
 
     Returns:
-        `(particles (d, n), y) -> (n,)`. Two results for the same function are equal, so that a filter built again is
-        not compiled again.
+        `(particles (d, n), y, inputs) -> (n,)`, where the inputs are `None` by default. Two results for the same
+        function are equal, so that a filter built again is not compiled again.
 
     Example:
         >>> import jax.numpy as jnp
@@ -51,11 +51,12 @@ def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood
         (5,)
     """
     checks.check_callables(log_likelihood=log_likelihood)
-    return jax.tree_util.Partial(_map_over_particles, as_pytree(log_likelihood))
+    return jax.tree_util.Partial(_map_over_particles, taking_inputs("log_likelihood", log_likelihood, "x", "y"))
 
 
-def _map_over_particles(log_likelihood, particles, y):
-    return jax.vmap(checks.checked_log_likelihood(log_likelihood), in_axes=(-1, None))(particles, y)
+def _map_over_particles(log_likelihood, particles, y, inputs=None):
+    mapped = jax.vmap(checks.checked_log_likelihood(log_likelihood), in_axes=(-1, None, None))
+    return mapped(particles, y, inputs)
 
 
 @runtime_checkable

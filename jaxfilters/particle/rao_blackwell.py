@@ -40,7 +40,7 @@ from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import no_tempering
 from jaxfilters.particle.weighting import ParticleInfo, resample, reweight
 from jaxfilters.priors import sample_ensemble
-from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree
+from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, SamplePrior, Temper, as_pytree, taking_inputs
 
 
 class RaoBlackwellState(NamedTuple):
@@ -87,12 +87,12 @@ def add(x: Float[Array, " n"], delta: Float[Array, " n"]) -> Float[Array, " n"]:
 def rao_blackwell(
     sample_prior: SamplePrior,
     linear_prior: Gaussian,
-    dynamics: Callable[[PyTree, PyTree], MixedDynamics],
+    dynamics: Callable[..., MixedDynamics],
     log_likelihood: LogLikelihood | None = None,
     *,
     num_particles: int,
     noise_dim: int,
-    observe: Callable[[PyTree], LinearObservation] | None = None,
+    observe: Callable[..., LinearObservation] | None = None,
     retract: Callable[[PyTree, Array], PyTree] = add,
     proposal: Proposal = exact,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
@@ -104,7 +104,8 @@ def rao_blackwell(
     Args:
         sample_prior: `key -> x`, the nonlinear state.
         linear_prior: Belief about the linear state `(l,)` before the first observation, the same for all particles.
-        dynamics: `(x, control) -> MixedDynamics`.
+        dynamics: `x -> MixedDynamics`. This and the two functions of observations below may take the inputs of the step
+            as one more argument, see `jf.typing`.
         log_likelihood: `(x, y) -> log p(y | x)`, a scalar, for observations that do not depend on the linear state.
         num_particles: Number n of particles.
         noise_dim: Dimension of the tangent space of the nonlinear state.
@@ -141,12 +142,12 @@ def rao_blackwell(
 def rao_blackwell_shared(
     sample_prior: SamplePrior,
     linear_prior: Gaussian,
-    dynamics: Callable[[PyTree, PyTree], MixedDynamics],
+    dynamics: Callable[..., MixedDynamics],
     log_likelihood: LogLikelihood | None = None,
     *,
     num_particles: int,
     noise_dim: int,
-    observe: Callable[[PyTree], LinearObservation] | None = None,
+    observe: Callable[..., LinearObservation] | None = None,
     retract: Callable[[PyTree, Array], PyTree] = add,
     proposal: Proposal = exact,
     scheme: ResamplingScheme | EnsembleScheme = systematic,
@@ -161,7 +162,7 @@ def rao_blackwell_shared(
     Args:
         sample_prior: `key -> x`, the nonlinear state.
         linear_prior: Belief about the linear state `(l,)` before the first observation, the same for all particles.
-        dynamics: `(x, control) -> MixedDynamics`, whose matrices must not depend on x.
+        dynamics: `x` or `(x, inputs) -> MixedDynamics`, whose matrices must not depend on x.
         log_likelihood: `(x, y) -> log p(y | x)`, a scalar, for observations that do not depend on the linear state.
         num_particles: Number n of particles.
         noise_dim: Dimension of the tangent space of the nonlinear state.
@@ -213,7 +214,7 @@ def _build(
     params = RaoBlackwell(
         as_pytree(sample_prior),
         linear_prior,
-        as_pytree(dynamics),
+        taking_inputs("dynamics", dynamics, "x"),
         as_pytree(retract),
         condition,
         as_pytree(temper or no_tempering),
@@ -283,13 +284,13 @@ def init(model: RaoBlackwell, key: AnyKey) -> RaoBlackwellState:
     )
 
 
-def _predict(model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree) -> RaoBlackwellState:
-    return predict_ensemble(model, key, state, control)[0]
+def _predict(model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, inputs: PyTree) -> RaoBlackwellState:
+    return predict_ensemble(model, key, state, inputs)[0]
 
 
 @checks.names_matrices_that_cannot_be_shared
 def predict_ensemble(
-    model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, control: PyTree
+    model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, inputs: PyTree
 ) -> tuple[RaoBlackwellState, Increments]:
     """Predict one step; returns the ensemble and the increments that moved it."""
     resample_key, noise_key = jax.random.split(key)
@@ -305,7 +306,7 @@ def predict_ensemble(
     small = max(state.linear_mean.shape[0], *state.noise.shape[:-1]) <= factor.UNROLLED
     mapped = last_axis.vmap if small else jax.vmap
     dynamics = checks.checked_dynamics(model.dynamics, model.noise.shape, state.linear_mean.shape[0])
-    steps = mapped(dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, control)
+    steps = mapped(dynamics, in_axes=(-1, None), out_axes=step_axes)(particles, inputs)
 
     def advance(step: MixedDynamics, mean: Array, covariance: Array, noise: Array) -> tuple:
         spread, gain, covariance = condition_on_increment(covariance, step)
@@ -325,15 +326,19 @@ def predict_ensemble(
 
 
 def _update(
-    model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, observation: PyTree
+    model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, observation: PyTree, inputs: PyTree
 ) -> tuple[RaoBlackwellState, ParticleInfo]:
     del key
-    return update_ensemble(model, state, observation)
+    return update_ensemble(model, state, observation, inputs)
 
 
 @checks.names_matrices_that_cannot_be_shared
 def update_ensemble(
-    model: RaoBlackwell, state: RaoBlackwellState, observation: PyTree, log_ratio: Float[Array, " n"] | None = None
+    model: RaoBlackwell,
+    state: RaoBlackwellState,
+    observation: PyTree,
+    inputs: PyTree,
+    log_ratio: Float[Array, " n"] | None = None,
 ) -> tuple[RaoBlackwellState, ParticleInfo]:
     """Condition every particle's linear state on the observation, and multiply its weight by the resulting evidence.
 
@@ -341,11 +346,12 @@ def update_ensemble(
         model: Parameters of the filter.
         state: Predicted ensemble.
         observation: The observation.
+        inputs: Inputs of the step.
         log_ratio: Log importance ratios of a proposal that depends on the observation; tempered with the evidence.
     """
 
     def condition(mean: Array, covariance: Array, x: PyTree) -> tuple[Array, Array, Array]:
-        belief, log_likelihood = model.condition(Gaussian(mean, covariance), x, observation)
+        belief, log_likelihood = model.condition(Gaussian(mean, covariance), x, observation, inputs)
         return belief.mean, belief.covariance, log_likelihood
 
     axis = model.covariance_axis
@@ -363,21 +369,25 @@ def update_ensemble(
 def _condition_on(log_likelihood: LogLikelihood | None, observe: Callable | None) -> Callable:
     checks.check_callables(log_likelihood=log_likelihood, observe=observe)
     if log_likelihood is not None and observe is None:
-        return jax.tree_util.Partial(_by_log_likelihood, as_pytree(log_likelihood))
+        return jax.tree_util.Partial(_by_log_likelihood, taking_inputs("log_likelihood", log_likelihood, "x", "y"))
     if observe is not None and log_likelihood is None:
-        return jax.tree_util.Partial(_by_linear_observation, as_pytree(observe))
+        return jax.tree_util.Partial(_by_linear_observation, taking_inputs("observe", observe, "x"))
     raise ValueError(
         "Exactly one of log_likelihood (of the nonlinear state alone) and observe (linear in the linear state) must be "
         f"given; got {'neither' if observe is None else 'both'}."
     )
 
 
-def _by_log_likelihood(log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTree) -> tuple[Gaussian, Array]:
-    return belief, checks.scalar_log_density("log_likelihood", log_likelihood(x, y))
+def _by_log_likelihood(
+    log_likelihood: LogLikelihood, belief: Gaussian, x: PyTree, y: PyTree, inputs: PyTree
+) -> tuple[Gaussian, Array]:
+    return belief, checks.scalar_log_density("log_likelihood", log_likelihood(x, y, inputs))
 
 
-def _by_linear_observation(observe: Callable, belief: Gaussian, x: PyTree, y: Array) -> tuple[Gaussian, Array]:
-    linear = observe(x)
+def _by_linear_observation(
+    observe: Callable, belief: Gaussian, x: PyTree, y: Array, inputs: PyTree
+) -> tuple[Gaussian, Array]:
+    linear = observe(x, inputs)
     checks.check_linear_observation(linear, y, belief.mean.shape[0])
     h, C, R = linear
     condition = batch_last(_condition) if max(C.shape) <= factor.UNROLLED else _condition

@@ -71,7 +71,7 @@ def placement(filter: Filter, mesh: Mesh, *, axis: str = AXIS) -> PyTree[NamedSh
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
-        >>> prior, move = lambda key: jnp.zeros(1), lambda key, x, control: x + jax.random.normal(key, (1,))
+        >>> prior, move = lambda key: jnp.zeros(1), lambda key, x: x + jax.random.normal(key, (1,))
         >>> pf = jf.bootstrap(prior, move, lambda x, y: -jnp.sum((x - y) ** 2), num_particles=100)
         >>> mesh = jax.sharding.Mesh(jax.devices(), ("particles",))
         >>> state = jax.device_put(jf.init(pf, jax.random.key(0)), jf.sharding.placement(pf, mesh))
@@ -208,8 +208,8 @@ def _init(model: Sharded, key: AnyKey) -> PyTree:
     return on_devices(key, model.island)
 
 
-def _predict(model: Sharded, key: AnyKey, state: PyTree, control: PyTree) -> PyTree:
-    def predict(key: AnyKey, island: Filter, threshold: Array, state: PyTree, control: PyTree) -> PyTree:
+def _predict(model: Sharded, key: AnyKey, state: PyTree, inputs: PyTree) -> PyTree:
+    def predict(key: AnyKey, island: Filter, threshold: Array, state: PyTree, inputs: PyTree) -> PyTree:
         exchange_key, predict_key = jax.random.split(_own(key, model.axis))
         _, log_share = weights.normalize(state.log_weights)
         log_shares = jax.lax.all_gather(log_share, model.axis)
@@ -222,14 +222,14 @@ def _predict(model: Sharded, key: AnyKey, state: PyTree, control: PyTree) -> PyT
             lambda state: (state, origin),
             state,
         )
-        state = island.predict(island.params, predict_key, state, control)
+        state = island.predict(island.params, predict_key, state, inputs)
         return state._replace(ancestors=origin[state.ancestors])
 
     specs = jax.tree.unflatten(jax.tree.structure(state), model.specs)
     on_devices = jax.shard_map(
         predict, mesh=model.mesh, in_specs=(P(), P(), P(), specs, P()), out_specs=specs, check_vma=False
     )
-    return on_devices(key, model.island, jnp.asarray(model.island_threshold), state, control)
+    return on_devices(key, model.island, jnp.asarray(model.island_threshold), state, inputs)
 
 
 def _exchange(
@@ -263,12 +263,16 @@ def _mix(leaf: Shaped[Array, "... n"], *, axis: str, num_devices: int) -> Shaped
     return jnp.concatenate([received.reshape(*shape, part * num_devices), leaf[..., part * num_devices :]], axis=-1)
 
 
-def _update(model: Sharded, key: AnyKey, state: PyTree, observation: PyTree) -> tuple[PyTree, ParticleInfo]:
-    def update(key: AnyKey, island: Filter, state: PyTree, observation: PyTree) -> tuple[PyTree, ParticleInfo]:
+def _update(
+    model: Sharded, key: AnyKey, state: PyTree, observation: PyTree, inputs: PyTree
+) -> tuple[PyTree, ParticleInfo]:
+    def update(
+        key: AnyKey, island: Filter, state: PyTree, observation: PyTree, inputs: PyTree
+    ) -> tuple[PyTree, ParticleInfo]:
         ancestors = state.ancestors
         # The filter of an island numbers its own particles from 0.
         state = state._replace(ancestors=ancestors - _first(ancestors.shape[0], model.axis))
-        state, info = island.update(island.params, _own(key, model.axis), state, observation)
+        state, info = island.update(island.params, _own(key, model.axis), state, observation, inputs)
         infos = jax.lax.all_gather(jnp.stack([jnp.asarray(one, info.log_evidence.dtype) for one in info]), model.axis)
         of_islands = ParticleInfo(*infos.T)
         log_shares, log_evidence = weights.normalize(of_islands.log_evidence)
@@ -283,9 +287,9 @@ def _update(model: Sharded, key: AnyKey, state: PyTree, observation: PyTree) -> 
 
     specs = jax.tree.unflatten(jax.tree.structure(state), model.specs)
     on_devices = jax.shard_map(
-        update, mesh=model.mesh, in_specs=(P(), P(), specs, P()), out_specs=(specs, P()), check_vma=False
+        update, mesh=model.mesh, in_specs=(P(), P(), specs, P(), P()), out_specs=(specs, P()), check_vma=False
     )
-    return on_devices(key, model.island, state, observation)
+    return on_devices(key, model.island, state, observation, inputs)
 
 
 def _own(key: AnyKey, axis: str) -> AnyKey:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
+from jaxfilters._renamed import takes_inputs
 from jaxfilters.particle import checks
-from jaxfilters.typing import AnyKey
+from jaxfilters.typing import AnyKey, taking_inputs
 
 
 class History(NamedTuple):
@@ -30,7 +31,7 @@ class History(NamedTuple):
 class LogTransition(Protocol):
     r"""Evaluate $\log p(x_t \mid x_{t-1}, u_t)$ up to a constant; `-inf` means impossible."""
 
-    def __call__(self, x_next: PyTree, x: PyTree, control: PyTree, /) -> Float[Array, ""]: ...
+    def __call__(self, x_next: PyTree, x: PyTree, inputs: PyTree, /) -> Float[Array, ""]: ...
 
 
 def keep_history(state: PyTree, info: PyTree) -> History:
@@ -59,7 +60,7 @@ def trajectories(history: History) -> PyTree:
     Example:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
-        ...     lambda key: jnp.zeros(1), lambda e, x, u: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
         ...     num_particles=100, noise=jf.StandardNormal(1),
         ... )
         >>> _, history = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.smoothing.keep_history)
@@ -81,8 +82,9 @@ def _trajectories(history: History) -> PyTree:
     return _along(history.particles, chosen)
 
 
+@takes_inputs
 def backward_sampling(
-    key: AnyKey, history: History, log_transition: LogTransition, controls: PyTree = None, *, num_paths: int
+    key: AnyKey, history: History, log_transition: LogTransition, inputs: PyTree = None, *, num_paths: int
 ) -> PyTree:
     """Draw equally weighted trajectories from the smoothing distribution.
 
@@ -94,8 +96,9 @@ def backward_sampling(
     Args:
         key: Random key.
         history: Ensembles that `run` collected with `keep_history`.
-        log_transition: `(x_next, x, control) -> log p(x_next | x)`, a scalar. Compared by identity.
-        controls: The controls of `run`, with time as the first axis.
+        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar, or with the inputs of the step after them.
+            Compared by identity.
+        inputs: The inputs of `run`, with time as the first axis.
         num_paths: Number of trajectories.
 
     Returns:
@@ -103,24 +106,26 @@ def backward_sampling(
 
     Raises:
         TypeError: If `history` is not a `History` or `log_transition` is not callable.
-        ValueError: If `num_paths < 1`, `controls` has another length than `history`, or `log_transition` does not
+        ValueError: If `num_paths < 1`, `inputs` has another length than `history`, or `log_transition` does not
             return a scalar.
     """
     checks.check_history(history)
     checks.check_callables(log_transition=log_transition)
     checks.check_num_particles(num_paths, name="num_paths")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(controls):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         if jnp.shape(leaf)[:1] != history.log_weights.shape[:1]:
             raise ValueError(
-                f"controls{jax.tree_util.keystr(path)} must have as many frames as history, "
+                f"inputs{jax.tree_util.keystr(path)} must have as many frames as history, "
                 f"{history.log_weights.shape[0]}; got the shape {jnp.shape(leaf)}."
             )
-    return _simulate(key, history, jax.tree_util.Partial(log_transition), controls, jnp.zeros(num_paths))
+    return _simulate(
+        key, history, taking_inputs("log_transition", log_transition, "x_next", "x"), inputs, jnp.zeros(num_paths)
+    )
 
 
 @jax.jit
 def _simulate(
-    key: AnyKey, history: History, log_transition: LogTransition, controls: PyTree, paths: Float[Array, " m"]
+    key: AnyKey, history: History, log_transition: LogTransition, inputs: PyTree, paths: Float[Array, " m"]
 ) -> PyTree:
     length = history.log_weights.shape[0]
     points = jax.random.uniform(key, (length, paths.size), history.log_weights.dtype)
@@ -128,12 +133,12 @@ def _simulate(
     chosen = jax.vmap(_draw_index, in_axes=(None, 0))(last.log_weights, points[-1])
     end = _of(last.particles, chosen)
 
-    def step(following: PyTree, inputs: tuple) -> tuple[PyTree, Array]:
-        particles, log_weights, control, points = inputs
+    def step(following: PyTree, frame: tuple) -> tuple[PyTree, Array]:
+        particles, log_weights, inputs, points = frame
 
         def one(x_next: PyTree, point: Array) -> Array:
             def log_density(x: PyTree) -> Array:
-                return checks.scalar_log_density("log_transition", log_transition(x_next, x, control))
+                return checks.scalar_log_density("log_transition", log_transition(x_next, x, inputs))
 
             return _draw_index(log_weights + jax.vmap(log_density, in_axes=-1)(particles), point)
 
@@ -141,7 +146,7 @@ def _simulate(
         return _of(particles, chosen), chosen
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], (history.particles, history.log_weights))
-    following = jax.tree.map(lambda leaf: leaf[1:], controls)
+    following = jax.tree.map(lambda leaf: leaf[1:], inputs)
     _, before = jax.lax.scan(step, end, (*earlier, following, points[:-1]), reverse=True)
     return _along(history.particles, jnp.concatenate([before, chosen[None]]))
 

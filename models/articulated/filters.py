@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
@@ -181,15 +181,17 @@ def _init(model: HandBelief, key: AnyKey) -> Gaussian:
     return model.prior
 
 
-def _predict(model: HandBelief, key: AnyKey, belief: Gaussian, control: Array) -> Gaussian:
+def _predict(model: HandBelief, key: AnyKey, belief: Gaussian, inputs: Array) -> Gaussian:
     del key
-    F = jax.jacfwd(model.hand.transition)(belief.mean, control)
-    ahead = joseph.predict(belief, F, model.hand.process_noise(control))
-    return Gaussian(model.hand.transition(belief.mean, control), ahead.covariance)
+    F = jax.jacfwd(model.hand.transition)(belief.mean, inputs)
+    ahead = joseph.predict(belief, F, model.hand.process_noise(inputs))
+    return Gaussian(model.hand.transition(belief.mean, inputs), ahead.covariance)
 
 
-def _update(model: HandBelief, key: AnyKey, belief: Gaussian, look: Look) -> tuple[Gaussian, KalmanInfo]:
-    del key
+def _update(
+    model: HandBelief, key: AnyKey, belief: Gaussian, look: Look, inputs: PyTree
+) -> tuple[Gaussian, KalmanInfo]:
+    del key, inputs
     hand = model.hand
     if look.reversed is not None:
         mirror = jax.jacfwd(partial(reverse_depth, hand=hand))(belief.mean)

@@ -31,7 +31,7 @@ class ArticulatedHand:
     """Links seen by one camera, for any Gaussian filter; made by `articulated_hand`.
 
     `transition`, `process_noise`, `observe`, `observation_noise` and `residual` are what the filters take. Frames are
-    the unit of time; a `control` is the time since the last state in frames, `None` for one.
+    the unit of time; the `inputs` of a step are the time since the last state in frames, `None` for one.
     """
 
     projection: Projection
@@ -52,19 +52,19 @@ class ArticulatedHand:
     compare: Residual = field(metadata=dict(static=True))
     """`undirected_residual` or `directed_residual`."""
 
-    def transition(self, x: Float[Array, " n"], control: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
-        """The expected state after a frame, or after `control` frames."""
-        moved = self.motion.advance(x, self.layout, 1.0 if control is None else control)
+    def transition(self, x: Float[Array, " n"], inputs: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
+        """The expected state after a frame, or after `inputs` frames."""
+        moved = self.motion.advance(x, self.layout, 1.0 if inputs is None else inputs)
         return self.projection.settle(moved, self.layout)
 
-    def process_noise(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n n"]:
+    def process_noise(self, inputs: Float[Array, ""] | float | None = None) -> Float[Array, "n n"]:
         """Covariance of what accelerations add to a transition."""
-        root = self.process_noise_root(control)
+        root = self.process_noise_root(inputs)
         return matmul(root, root.T)
 
-    def process_noise_root(self, control: Float[Array, ""] | float | None = None) -> Float[Array, "n columns"]:
+    def process_noise_root(self, inputs: Float[Array, ""] | float | None = None) -> Float[Array, "n columns"]:
         """A root of `process_noise`."""
-        return self.motion.noise_root(self.layout, 1.0 if control is None else control)
+        return self.motion.noise_root(self.layout, 1.0 if inputs is None else inputs)
 
     def points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 3"]:
         """Joints of every finger from base to tip in the camera frame: pixels from the wrist's depth, or metres."""

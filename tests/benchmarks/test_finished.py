@@ -9,8 +9,8 @@ from jaxfilters.benchmarks import finished
 from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._mono_runs import MonoRun, as_arrays, from_arrays
-from jaxfilters.trackers.head_mono.state import MonoTrack
-from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.head.mono.state import MonoTrack
+from jaxfilters.trackers.io.errors import InputError
 
 METRICS = {"error": Metric(1 / 3, "mm", "lower"), "speed": Metric(float("inf"), "frames/s", "higher")}
 

@@ -7,8 +7,8 @@ from jaxfilters.benchmarks.scenarios import _mono_runs, head_mono
 from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
 from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
-from jaxfilters.trackers.head_mono.state import MonoOptions, MonoTrack
-from jaxfilters.trackers.shell.face_model_files import default_face_model
+from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
+from jaxfilters.trackers.io.face_models import default_face_model
 
 
 def made_run(errors, status, yaw=None):

@@ -17,7 +17,7 @@ from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.rig import nominal, project_shape
-from jaxfilters.trackers.head.state import RIGID, HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.state import RIGID, HeadOptions, HeadTrack
 
 K, ASTRAY = 10, 50.0
 

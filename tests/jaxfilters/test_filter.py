@@ -17,8 +17,8 @@ def sample_prior(key):
     return jax.random.normal(key, (2,))
 
 
-def sample_transition(noise, x, control):
-    dt = 0.1 if control is None else control
+def sample_transition(noise, x, inputs):
+    dt = 0.1 if inputs is None else inputs
     return jnp.array([x[0] + dt * x[1], x[1]]) + 0.1 * noise
 
 
@@ -122,18 +122,18 @@ def test_continuing_from_a_state_uses_it():
 
 
 @pytest.mark.parametrize(
-    ("observations", "controls", "mask", "named"),
+    ("observations", "inputs", "mask", "named"),
     [
-        (jnp.zeros(5), jnp.zeros(4), None, "controls: 4"),
+        (jnp.zeros(5), jnp.zeros(4), None, "inputs: 4"),
         (jnp.zeros(5), None, jnp.ones(6, bool), "mask: 6"),
         ({"a": jnp.zeros(5), "b": jnp.zeros((6, 2))}, None, None, r"observations\['b'\]: 6"),
         ((), None, None, "at least one array leaf"),
         (jnp.float32(1.0), None, None, "a scalar"),
     ],
 )
-def test_lengths_that_disagree_are_named(observations, controls, mask, named):
+def test_lengths_that_disagree_are_named(observations, inputs, mask, named):
     with pytest.raises(ValueError, match=named):
-        run(make_filter(), KEY, observations, controls, mask=mask)
+        run(make_filter(), KEY, observations, inputs, mask=mask)
 
 
 def test_a_filter_is_data():

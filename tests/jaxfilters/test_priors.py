@@ -49,7 +49,7 @@ def test_a_filter_with_such_a_prior_differs_only_by_its_draws_and_gives_gradient
 
     def posterior_mean(mean):
         prior = gaussian_prior(Gaussian(mean, ROOT @ ROOT.T))
-        still = lambda noise, x, control: x
+        still = lambda noise, x, inputs: x
         filter = jaxfilters.bootstrap(prior, still, read, num_particles=20_000, noise=StandardNormal(1))
         state, _ = jaxfilters.step(filter, jax.random.key(1), jaxfilters.init(filter, jax.random.key(2)), 2.0)
         return weights.mean(state.particles, state.log_weights)

@@ -32,8 +32,8 @@ def evidence_of_textbook(noise):
     return total
 
 
-def move(x, control):
-    del control
+def move(x, inputs):
+    del inputs
     return F @ x
 
 
@@ -45,8 +45,8 @@ def sample_prior(key):
     return PRIOR.mean + jnp.sqrt(jnp.diag(PRIOR.covariance)) * jax.random.normal(key, (2,))
 
 
-def sample_transition(z, x, control):
-    return move(x, control) + jnp.linalg.cholesky(Q) @ z
+def sample_transition(z, x, inputs):
+    return move(x, inputs) + jnp.linalg.cholesky(Q) @ z
 
 
 def log_likelihood_of(noise):
@@ -63,7 +63,7 @@ def extended(noise):
 
 def rao_blackwell_model(noise):
     """The place is sampled, and the velocity integrated out."""
-    dynamics = lambda x, control: jf.MixedDynamics(x, F[:1, 1:], Q[:1, :1], jnp.zeros(1), F[1:, 1:], Q[1:, 1:])
+    dynamics = lambda x, inputs: jf.MixedDynamics(x, F[:1, 1:], Q[:1, :1], jnp.zeros(1), F[1:, 1:], Q[1:, 1:])
     prior = lambda key: sample_prior(key)[:1]
     likelihood = lambda x, y: jax.scipy.stats.norm.logpdf(y - x, 0.0, noise).sum()
     return prior, jf.Gaussian(PRIOR.mean[1:], PRIOR.covariance[1:, 1:]), dynamics, likelihood

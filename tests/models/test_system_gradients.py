@@ -47,8 +47,8 @@ def depth_hand(theta):
     likelihood = HandLikelihood(CapsuleHand(hand_geometry()), theta["sigma"], 0.03, union, gibbs_abs)
     likelihood = likelihood.scaled(theta["size"])
 
-    def move(noise, x, control):
-        del control
+    def move(noise, x, inputs):
+        del inputs
         return retract(x, theta["step"] * noise)
 
     filter = jaxfilters.bootstrap(
@@ -74,7 +74,7 @@ def person(theta):
 
     filter = jaxfilters.bootstrap(
         lambda key: 0.3 * jax.random.normal(key, (2,)),
-        lambda noise, x, control: x + 0.05 * noise,
+        lambda noise, x, inputs: x + 0.05 * noise,
         log_likelihood,
         num_particles=8,
         noise=StandardNormal(2),

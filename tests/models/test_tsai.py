@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.tsai import TsaiCamera, calibration_of_tsai
-from jaxfilters.trackers.shell.camera_files import read_tsai
+from jaxfilters.trackers.io.cameras import read_tsai
 
 CAMERA = TsaiCamera(
     image_size=(768, 576),

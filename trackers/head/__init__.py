@@ -1,1 +1,1 @@
-"""Head pose and face deformation, seen by one camera or several that stand still: how the tracker starts."""
+"""Head pose and face deformation: `stereo` with two cameras, `mono` with one, and `common` parts."""

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxfilters.trackers.recording import InputError
+from jaxfilters.trackers.io.errors import InputError
 
 
 def check_regular(path: Path, wanted: str) -> int:

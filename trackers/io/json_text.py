@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.input_files import check_regular
-from jaxfilters.trackers.recording import InputError
 
 MOST_BYTES = 256 * 2**20
 _MOST_DIGITS = 18

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.input_files import check_regular
-from jaxfilters.trackers.recording import InputError
 
 MOST_BYTES = 8 * 2**30
 """Of all arrays that are read from one file."""

@@ -17,7 +17,7 @@ def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) 
 
     A row moves where the process noise has variance along its normal, or where the transition changes its value. The
     transition is evaluated at the mean of the prior and one standard deviation away from it. Nothing is checked for
-    filters of another kind, on manifolds, where values are not known yet, and where a transition needs a control.
+    filters of another kind, on manifolds, where values are not known yet, and where a transition needs inputs.
 
     Args:
         inner: The filter of the state.
@@ -62,7 +62,7 @@ def _transition_along(model, normals):
         points = [mean, mean + np.sqrt(np.maximum(variance, 0.0))]
         try:
             moved = _on_host([model.transition(jax.numpy.asarray(x, mean.dtype), None) for x in points])
-        except Exception:  # A transition that needs a control, or another one that only the filter can call.
+        except Exception:  # A transition that needs inputs, or another one that only the filter can call.
             return None, None, message
     if moved is None or any(np.shape(y) != mean.shape for y in moved):
         return None, None, message

@@ -142,7 +142,7 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
             pytree with the methods of `Constrain`.
 
     Returns:
-        The constrained filter. It takes the observations and controls of `inner`.
+        The constrained filter. It takes the observations and inputs of `inner`.
 
     Raises:
         TypeError: `inner` or `constrain` is of the wrong kind, the state of `inner` is not Gaussian, or
@@ -200,14 +200,14 @@ def _init(model: Constrained, key: AnyKey) -> ConstrainedState:
     return ConstrainedState(model.inner.init(model.inner.params, key), model.constrain.start())
 
 
-def _predict(model: Constrained, key: AnyKey, state: ConstrainedState, control: PyTree) -> ConstrainedState:
-    return state._replace(belief=model.inner.predict(model.inner.params, key, state.belief, control))
+def _predict(model: Constrained, key: AnyKey, state: ConstrainedState, inputs: PyTree) -> ConstrainedState:
+    return state._replace(belief=model.inner.predict(model.inner.params, key, state.belief, inputs))
 
 
 def _update(
-    model: Constrained, key: AnyKey, state: ConstrainedState, observation: PyTree
+    model: Constrained, key: AnyKey, state: ConstrainedState, observation: PyTree, inputs: PyTree
 ) -> tuple[ConstrainedState, ConstrainedInfo]:
-    belief, info = model.inner.update(model.inner.params, key, state.belief, observation)
+    belief, info = model.inner.update(model.inner.params, key, state.belief, observation, inputs)
     belief, memory, truncation = model.constrain(belief, state.memory)
     log_evidence = info.log_evidence + truncation.log_mass
     report = ConstrainedInfo(log_evidence, info, truncation, jnp.min(truncation.distances))

@@ -195,8 +195,8 @@ def test_prints_survive(capfd: pytest.CaptureFixture) -> None:
     assert capfd.readouterr().out.count("seen") == 2
 
 
-def turning(x, control):
-    del control
+def turning(x, inputs):
+    del inputs
     angle = 0.1 * x[4]
     along = jnp.array([jnp.cos(angle) * x[2] - jnp.sin(angle) * x[3], jnp.sin(angle) * x[2] + jnp.cos(angle) * x[3]])
     return jnp.concatenate([x[:2] + 0.1 * x[2:4], along, x[4:]])

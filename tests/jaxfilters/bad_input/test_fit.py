@@ -62,9 +62,9 @@ FIT = [
         ("observations", "mask", "(6, 1)", "(5,)"),
     ),
     Case(
-        "fit, controls length",
+        "fit, inputs length",
         lambda: jf.fit.log_evidence(KEY, filter_of, YS, jnp.ones((4, 1))),
-        ("observations", "controls", "(6, 1)", "(4, 1)"),
+        ("observations", "inputs", "(6, 1)", "(4, 1)"),
     ),
     Case("fit, no observations", lambda: jf.fit.log_evidence(KEY, filter_of, None), ("observations", "none")),
     Case(

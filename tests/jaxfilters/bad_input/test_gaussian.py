@@ -38,8 +38,8 @@ def extended(transition=lambda x, u: x, Q=Q, observe=lambda x: x[:1], R=R, prior
     return jf.extended_kalman(prior, transition, Q, observe, R, **options)
 
 
-def run_extended(ys=YS, controls=None, mask=None, state=None, **options):
-    return jf.run(extended(**options), KEY, ys, controls, mask=mask, state=state)
+def run_extended(ys=YS, inputs=None, mask=None, state=None, **options):
+    return jf.run(extended(**options), KEY, ys, inputs, mask=mask, state=state)
 
 
 def rooted(**options):
@@ -67,9 +67,9 @@ def schmidt(constant=None, signature=lambda mean: mean, inner=None, tolerance=1.
     return jf.run(jf.schmidt_kalman(inner, signature, constant, tolerance, **options), KEY, YS)
 
 
-def rts(beliefs=None, controls=None, filter=None):
+def rts(beliefs=None, inputs=None, filter=None):
     beliefs = jf.Gaussian(jnp.zeros((5, 2)), jnp.stack([jnp.eye(2)] * 5)) if beliefs is None else beliefs
-    return jf.smoothing.rts(extended() if filter is None else filter, beliefs, controls)
+    return jf.smoothing.rts(extended() if filter is None else filter, beliefs, inputs)
 
 
 def parallel(prior=ROOT_PRIOR, ys=YS, mask=None, **changes):
@@ -290,7 +290,7 @@ WRAPPERS = {
         ("beliefs", "(5, 2)", "(4, 2, 2)"),
     ),
     "rts, beliefs of another kind": (lambda: rts((jnp.zeros((5, 2)),)), ("beliefs", "Gaussian", "tuple")),
-    "rts, long controls": (lambda: rts(controls=jnp.zeros(6)), ("controls", "5", "6")),
+    "rts, long inputs": (lambda: rts(inputs=jnp.zeros(6)), ("inputs", "5", "6")),
     "rts, filter of another kind": (lambda: rts(filter=robust()), ("filter", "extended_kalman", "Robust")),
     "rts, no filter": (lambda: rts(filter=PRIOR), ("filter", "Filter", "Gaussian")),
     "fixed_lag_rts, lag": (lambda: jf.smoothing.fixed_lag_rts(extended(), 0), ("lag", "0")),
@@ -316,16 +316,16 @@ WRAPPERS = {
 
 RUN = {
     "run, filter": (lambda: jf.run(PRIOR, KEY, YS), ("filter", "Filter", "Gaussian")),
-    "run, controls": (lambda: run_extended(controls=jnp.zeros(4)), ("controls", "4", "5")),
-    "run, scalar control": (lambda: run_extended(controls=0.1), ("controls", "scalar")),
+    "run, inputs": (lambda: run_extended(inputs=jnp.zeros(4)), ("inputs", "4", "5")),
+    "run, scalar inputs": (lambda: run_extended(inputs=0.1), ("inputs", "scalar")),
     "run, mask of another length": (lambda: run_extended(mask=jnp.ones(4, bool)), ("mask", "4", "5")),
     "run, mask of components": (lambda: run_extended(mask=jnp.ones((5, 1), bool)), ("mask", "(t,)", "(5, 1)")),
     "run, mask of numbers": (lambda: run_extended(mask=jnp.ones(5)), ("mask", "boolean", "float32")),
     "run, nothing observed": (lambda: jf.run(extended(), KEY, ()), ("observations", "none")),
     "log_evidence, filter": (lambda: jf.log_evidence(PRIOR, KEY, YS), ("filter", "Filter", "Gaussian")),
-    "log_evidence, controls": (
+    "log_evidence, inputs": (
         lambda: jf.log_evidence(extended(), KEY, YS, jnp.zeros(4)),
-        ("controls", "4", "5"),
+        ("inputs", "4", "5"),
     ),
 }
 
@@ -348,7 +348,7 @@ LINEAR = [
     Case("kalman, long d", lambda: linear(d=np.zeros(3)), ("d", "(1,)", "(3,)")),
     Case("kalman, arithmetic", lambda: linear(arithmetic=jf.arithmetic.square_root), ("prior", "GaussianRoot")),
     Case("kalman, wide y", lambda: jf.run(linear(), KEY, jnp.zeros((5, 3))), ("observation", "(3,)", "(1,)")),
-    Case("kalman, a control", lambda: jf.run(linear(), KEY, jnp.zeros((5, 1)), jnp.zeros(5)), ("control", "None")),
+    Case("kalman, a inputs", lambda: jf.run(linear(), KEY, jnp.zeros((5, 1)), jnp.zeros(5)), ("inputs", "None")),
 ]
 
 GAUSSIAN = [*LINEAR] + [Case(name, *case) for name, case in (EXTENDED | WRAPPERS | RUN).items()]

@@ -267,8 +267,8 @@ PARTICLE = [
     Case("paths True", lambda: sample_paths(num_paths=True), ("num_paths", "True")),
     Case("half a path", lambda: sample_paths(num_paths=2.5), ("num_paths", "2.5")),
     Case("transition (1,)", lambda: sample_paths(lambda new, x, u: x - new), ("log_transition", "(1,)")),
-    Case("long controls", lambda: sample_paths(controls=jnp.zeros(4)), ("controls", "3", "(4,)")),
-    Case("scalar controls", lambda: sample_paths(controls=jnp.zeros(())), ("controls", "()")),
+    Case("long inputs", lambda: sample_paths(inputs=jnp.zeros(4)), ("inputs", "3", "(4,)")),
+    Case("scalar inputs", lambda: sample_paths(inputs=jnp.zeros(())), ("inputs", "()")),
     Case("no history", lambda: sample_paths(past=jnp.zeros(3)), ("history",)),
     Case("history weights", lambda: sample_paths(past=history(log_weights=jnp.zeros(8))), ("log_weights", "(8,)")),
     Case(

@@ -19,8 +19,8 @@ LIMITS = {"rate": fit.interval(-1, 1), "drift": fit.positive, "noise": fit.posit
 START = {"rate": 0.3, "drift": 1.0, "noise": 1.0}
 
 
-def move(rate, x, control):
-    del control
+def move(rate, x, inputs):
+    del inputs
     return rate * x
 
 
@@ -119,8 +119,8 @@ def start_anywhere(key):
     return jax.random.normal(key, (1,))
 
 
-def move_by_noise(rate, drift, noise, x, control):
-    del control
+def move_by_noise(rate, drift, noise, x, inputs):
+    del inputs
     return rate * x + drift * noise
 
 

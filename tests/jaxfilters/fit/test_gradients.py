@@ -20,8 +20,8 @@ THETA = {"rate": 0.7, "drift": 0.9, "noise": 0.6, "bend": 0.3}
 KEY = jax.random.key(0)
 
 
-def move(rate, x, control):
-    del control
+def move(rate, x, inputs):
+    del inputs
     return rate * F @ x
 
 

@@ -62,7 +62,7 @@ def stick(tolerance=0.5, capacity=8, angle_noise=1e-4):
     return inner, schmidt_kalman(inner, angle, jnp.array([False, True]), tolerance, capacity=capacity)
 
 
-def unmoved(x, control):
+def unmoved(x, inputs):
     return x
 
 

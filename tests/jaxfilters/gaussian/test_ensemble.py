@@ -23,16 +23,16 @@ YS = RNG.normal(size=(6, 2))
 YS[2, 1] = YS[4] = np.nan
 
 
-def move(noise, x, control):
-    return F @ x + control + ROOT_Q @ noise
+def move(noise, x, inputs):
+    return F @ x + inputs + ROOT_Q @ noise
 
 
 def observe(x):
     return H @ x
 
 
-def transition(x, control):
-    return F @ x + control
+def transition(x, inputs):
+    return F @ x + inputs
 
 
 def make(num_particles, **options):
@@ -47,10 +47,10 @@ def moments(state, info):
 @pytest.mark.system
 def test_mean_covariance_and_evidence_are_those_of_the_kalman_filter():
     """Within 4 standard errors over 40 ensembles, beside a bias of 1 / N, here a fiftieth of the standard errors."""
-    ys, controls = jnp.asarray(YS, jnp.float32), jnp.linspace(-1.0, 1.0, 6)
+    ys, inputs = jnp.asarray(YS, jnp.float32), jnp.linspace(-1.0, 1.0, 6)
     exact = extended_kalman(PRIOR, transition, jnp.asarray(ROOT_Q @ ROOT_Q.T), observe, R)
-    beliefs, infos = run(exact, jax.random.key(0), ys, controls, mask=None)[1]
-    follow = lambda key: run(make(2000), key, ys, controls, collect=moments)[1]
+    beliefs, infos = run(exact, jax.random.key(0), ys, inputs, mask=None)[1]
+    follow = lambda key: run(make(2000), key, ys, inputs, collect=moments)[1]
     found = jax.lax.map(follow, jax.random.split(jax.random.key(1), 40))
     for values, expected in zip(found, (beliefs.mean, beliefs.covariance, infos.log_evidence), strict=True):
         values = np.asarray(values, np.float64)
@@ -107,11 +107,11 @@ def test_both_orders_of_the_product_are_the_same(x64, n, m, count):
 
 def test_the_gradient_in_inflation_is_that_of_finite_differences(x64):
     """Central differences of step h = 1e-5 in float64 err by h^2 and by 1e-16 / h: 1e-6 of the slope is safe."""
-    ys, controls = jnp.asarray(YS), jnp.linspace(-1.0, 1.0, 6)
+    ys, inputs = jnp.asarray(YS), jnp.linspace(-1.0, 1.0, 6)
 
     @jax.jit
     def evidence(inflation):
-        return log_evidence(make(40, inflation=inflation), KEY, ys, controls)
+        return log_evidence(make(40, inflation=inflation), KEY, ys, inputs)
 
     slope = jax.grad(evidence)(1.1)
     difference = (evidence(1.1 + 1e-5) - evidence(1.1 - 1e-5)) / 2e-5

@@ -361,8 +361,8 @@ def counted(x):
     return x[:2]
 
 
-def stay(x, control):
-    del control
+def stay(x, inputs):
+    del inputs
     return x
 
 

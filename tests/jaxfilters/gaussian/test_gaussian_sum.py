@@ -35,11 +35,11 @@ def line_filter(mean=(0.0, 0.0), variance=1.0):
     )
 
 
-def predict_line(model, key, state, control):
+def predict_line(model, key, state, inputs):
     return joseph.predict(state, jnp.asarray(F, dtype=float), jnp.asarray(Q, dtype=float))
 
 
-def update_line(model, key, state, y):
+def update_line(model, key, state, y, inputs):
     return joseph.update(state, y, jnp.asarray(H, dtype=float), jnp.asarray(R, dtype=float))
 
 
@@ -123,7 +123,7 @@ class Fit(NamedTuple):
 NOISE = 0.05
 
 
-def update_square(model, key, state, observation):
+def update_square(model, key, state, observation, inputs):
     """One variable of which the square is seen, by Laplace's method from a starting point."""
     y, x = observation
     m, P = state.mean[0], state.covariance[0, 0]
@@ -149,7 +149,7 @@ def square_filter():
     return Filter(
         Line(jnp.array([0.2]), jnp.eye(1)),
         lambda model, key: Gaussian(model.mean, model.covariance),
-        lambda model, key, state, control: state,
+        lambda model, key, state, inputs: state,
         update_square,
     )
 
@@ -217,8 +217,8 @@ def twice(state, y):
 
 
 def test_an_update_that_breaks_leaves_the_others_alone():
-    def update(model, key, state, y):
-        state, info = update_line(model, key, state, y)
+    def update(model, key, state, y, inputs):
+        state, info = update_line(model, key, state, y, inputs)
         broken = state.mean[0] < 0
         return state, Fit(jnp.where(broken, jnp.nan, info.log_evidence))
 
@@ -245,9 +245,9 @@ def test_an_update_that_breaks_leaves_the_others_alone():
 def test_one_program_for_all_frames_and_sequences_and_a_right_gradient(x64):
     traces = []
 
-    def update(model, key, state, y):
+    def update(model, key, state, y, inputs):
         traces.append(None)
-        return update_line(model, key, state, y)
+        return update_line(model, key, state, y, inputs)
 
     def evidence(shift, ys):
         inner = Filter(line_filter().params, line_filter().init, predict_line, update)

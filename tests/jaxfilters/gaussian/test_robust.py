@@ -14,8 +14,8 @@ KEY = jax.random.key(0)
 PRIOR = Gaussian(jnp.array([0.5]), jnp.array([[2.0]]))
 
 
-def still(x, control):
-    del control
+def still(x, inputs):
+    del inputs
     return x
 
 

@@ -22,8 +22,8 @@ SEEN = np.array([[1, 1], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]], bool)
 KEY = jax.random.key(0)
 
 
-def transition(x, control):
-    return F @ x + control * DRIFT
+def transition(x, inputs):
+    return F @ x + inputs * DRIFT
 
 
 def observe(x):
@@ -82,9 +82,9 @@ CURVED = Manifold(add, displacement)
 )
 def test_smoothed_beliefs_are_those_of_the_joint_gaussian(x64, arithmetic, options):
     ys = Observation(jnp.where(SEEN, YS, jnp.nan), jnp.asarray(SEEN))
-    controls = jnp.arange(1.0, T + 1)
+    inputs = jnp.arange(1.0, T + 1)
     means, covariances, log_evidence = joint_posterior()
-    beliefs, infos = filter_and_smooth(build(arithmetic, **options), KEY, ys, controls)
+    beliefs, infos = filter_and_smooth(build(arithmetic, **options), KEY, ys, inputs)
     np.testing.assert_allclose(beliefs.mean, means, atol=1e-9)
     found = beliefs.covariance if isinstance(beliefs, Gaussian) else beliefs.root @ beliefs.root.transpose(0, 2, 1)
     np.testing.assert_allclose(found, covariances, atol=1e-9)
@@ -93,9 +93,9 @@ def test_smoothed_beliefs_are_those_of_the_joint_gaussian(x64, arithmetic, optio
 
 def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
     kept = np.arange(T) != 3
-    filter, controls = build(arithmetics.joseph), jnp.arange(1.0, T + 1)
+    filter, inputs = build(arithmetics.joseph), jnp.arange(1.0, T + 1)
     masked, infos = filter_and_smooth(
-        filter, KEY, Observation(jnp.asarray(YS), jnp.asarray(SEEN)), controls, mask=jnp.asarray(kept)
+        filter, KEY, Observation(jnp.asarray(YS), jnp.asarray(SEEN)), inputs, mask=jnp.asarray(kept)
     )
     np.testing.assert_allclose(masked.mean, joint_posterior()[0], atol=1e-9)
     assert infos.log_evidence[3] == 0
@@ -104,18 +104,18 @@ def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
 @pytest.mark.system
 def test_the_smoother_differentiates(x64):
     filter = build(arithmetics.joseph)
-    ys, controls = jnp.asarray(YS), jnp.ones(T)
+    ys, inputs = jnp.asarray(YS), jnp.ones(T)
 
     def first_mean(scale):
-        _, (beliefs, _) = run(filter, KEY, scale * ys, controls)
-        return rts(filter, beliefs, controls).mean[0, 0]
+        _, (beliefs, _) = run(filter, KEY, scale * ys, inputs)
+        return rts(filter, beliefs, inputs).mean[0, 0]
 
     slope = jax.jit(jax.grad(first_mean))(1.0)
     np.testing.assert_allclose(slope, (first_mean(1 + 1e-6) - first_mean(1 - 1e-6)) / 2e-6, rtol=1e-6)
 
 
 def test_other_filters_and_lengths_are_rejected():
-    def unused(*_):
+    def unused(x, y):
         return jnp.zeros(())
 
     with pytest.raises(ValueError, match="made by kalman or extended_kalman"):

@@ -220,8 +220,7 @@ def test_a_negative_step_that_is_traced_gives_nan():
     assert np.isnan(wrong).any()
 
 
-def pendulum(x, control):
-    del control
+def pendulum(x):
     return jnp.stack([x[1], -4.0 * jnp.sin(x[0]) - 0.3 * x[1]])
 
 
@@ -251,7 +250,7 @@ def test_moments_follow_their_differential_equations(x64, integrator):
     def rates(_, y):
         m, P = y[:2], y[2:].reshape(2, 2)
         J = np.array([[0.0, 1.0], [-4.0 * np.cos(m[0]), -0.3]])
-        return np.concatenate([np.asarray(pendulum(m, None)), (J @ P + P @ J.T + L @ L.T).ravel()])
+        return np.concatenate([np.asarray(pendulum(m)), (J @ P + P @ J.T + L @ L.T).ravel()])
 
     start = np.concatenate([prior.mean, np.ravel(prior.covariance)])
     y = scipy.integrate.solve_ivp(rates, (0, 0.6), start, rtol=1e-10, atol=1e-12).y[:, -1]
@@ -269,7 +268,7 @@ def test_a_linear_drift_is_the_discretised_model_with_its_smoother_in_every_arit
     model, R, ys = MOTION.LinearSDE(A, L), jnp.asarray(Pendulum.R, jnp.float64), jnp.ones((4, 1))
     exactly = jf.extended_kalman(prior, model.transition, model.process_noise, lambda x: x[:1], R)
     expected, infos = jf.smoothing.filter_and_smooth(exactly, jax.random.key(0), ys, Pendulum.dt)
-    drift = lambda x, control: A @ x
+    drift = lambda x: A @ x
     for options in ({}, {"arithmetic": jf.arithmetic.square_root}):
         rooted = bool(options)
         start = jf.GaussianRoot(prior.mean, jnp.linalg.cholesky(prior.covariance)) if rooted else prior
@@ -284,7 +283,7 @@ def test_a_linear_drift_is_the_discretised_model_with_its_smoother_in_every_arit
 @pytest.mark.system
 def test_the_noise_may_depend_on_the_state_and_gradients_are_finite():
     def evidence(scale):
-        drift = lambda x, control: -scale * x
+        drift = lambda x: -scale * x
         filter = jf.continuous_extended_kalman(
             jf.Gaussian(jnp.ones(1), jnp.eye(1)), drift, lambda x: scale * x[:, None], lambda x: x, jnp.eye(1)
         )

@@ -41,14 +41,14 @@ def sample_prior(key):
     return {"pose": jax.random.normal(key, (1,)), "velocity": jax.random.normal(jax.random.fold_in(key, 1))}
 
 
-def move(noise, x, control):
-    del control
+def move(noise, x, inputs):
+    del inputs
     pose = x["pose"] + DT * x["velocity"] + jnp.sqrt(DT * Q_N) * noise[:1]
     return {"pose": pose, "velocity": x["velocity"] + jnp.sqrt(DT * Q_L) * noise[1]}
 
 
-def mixed(x, control):
-    del control
+def mixed(x, inputs):
+    del inputs
     one = jnp.ones((1, 1))
     return MixedDynamics(x, DT * one, DT * Q_N * one, jnp.zeros(1), one, DT * Q_L * one)
 
@@ -157,7 +157,7 @@ def sequences(mesh, num_devices, ys):
 
 
 def refusals(mesh, num_devices):
-    kalman = jaxfilters.Filter(jnp.zeros(2), lambda p, k: p, lambda p, k, s, c: s, lambda p, k, s, y: (s, None))
+    kalman = jaxfilters.Filter(jnp.zeros(2), lambda p, k: p, lambda p, k, s, c: s, lambda p, k, s, y, u: (s, None))
     wrong = {
         "number": lambda: sharded(plain(10 * num_devices + 1), mesh),
         "placed_number": lambda: placement(plain(10 * num_devices + 1), mesh),

@@ -32,13 +32,13 @@ def sample_prior(key):
     return PRIOR_STD * jax.random.normal(key)
 
 
-def move_by_noise(noise, x, control):
-    del control
+def move_by_noise(noise, x, inputs):
+    del inputs
     return RATE * x + PROCESS_STD * noise[0]
 
 
-def move_by_key(key, x, control):
-    return move_by_noise(jax.random.normal(key, (1,)), x, control)
+def move_by_key(key, x, inputs):
+    return move_by_noise(jax.random.normal(key, (1,)), x, inputs)
 
 
 def simulate(seed, length=25):

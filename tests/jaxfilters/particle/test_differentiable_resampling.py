@@ -23,8 +23,8 @@ def sample_prior(key):
     return jax.random.normal(key)
 
 
-def move(theta, noise, x, control):
-    del control
+def move(theta, noise, x, inputs):
+    del inputs
     return theta[0] * x + jnp.exp(theta[1]) * noise[0]
 
 

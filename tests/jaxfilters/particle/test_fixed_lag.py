@@ -31,8 +31,8 @@ YS, CONTROLS = RNG.normal(size=(LENGTH, 1)), RNG.normal(size=LENGTH)
 MASK = jnp.asarray(np.arange(LENGTH) != 3)
 
 
-def transition(x, control):
-    return F @ x + control
+def transition(x, inputs):
+    return F @ x + inputs
 
 
 def observe(x):
@@ -55,10 +55,10 @@ def test_beliefs_are_those_of_the_smoother_of_what_was_seen(x64, arithmetic):
     Q = jnp.asarray(ROOT_Q if root else ROOT_Q @ ROOT_Q.T)
     R = (0.5**0.5 if root else 0.5) * jnp.eye(1)
     inner = extended_kalman(prior, transition, Q, observe, R, arithmetic=arithmetic)
-    ys, controls = jnp.asarray(YS), jnp.asarray(CONTROLS)
-    filter = fixed_lag_rts(inner, LAG, control=jnp.zeros(()))
-    _, (found, evidences) = run(filter, KEY, ys, controls, mask=MASK, collect=delayed)
-    smooth_until = jax.jit(lambda mask: filter_and_smooth(inner, KEY, ys, controls, mask=mask))
+    ys, inputs = jnp.asarray(YS), jnp.asarray(CONTROLS)
+    filter = fixed_lag_rts(inner, LAG, inputs=jnp.zeros(()))
+    _, (found, evidences) = run(filter, KEY, ys, inputs, mask=MASK, collect=delayed)
+    smooth_until = jax.jit(lambda mask: filter_and_smooth(inner, KEY, ys, inputs, mask=mask))
     for t in range(LENGTH):
         # What comes later is as if it had not been seen.
         beliefs, infos = smooth_until(MASK & (jnp.arange(LENGTH) <= t))
@@ -77,8 +77,8 @@ def sample_prior(key):
     return jax.random.normal(key)
 
 
-def move(noise, x, control):
-    return 0.9 * x + control + 0.5 * noise[0]
+def move(noise, x, inputs):
+    return 0.9 * x + inputs + 0.5 * noise[0]
 
 
 def log_likelihood(x, y):
@@ -92,8 +92,8 @@ def window_and_history(state, info):
 @pytest.mark.system
 def test_delayed_particles_are_those_of_the_lineages():
     pf = bootstrap(sample_prior, move, log_likelihood, num_particles=30, noise=StandardNormal(1))
-    ys, controls = jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32)
-    _, (found, history) = run(fixed_lag(pf, LAG), KEY, ys, controls, mask=MASK, collect=window_and_history)
+    ys, inputs = jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32)
+    _, (found, history) = run(fixed_lag(pf, LAG), KEY, ys, inputs, mask=MASK, collect=window_and_history)
     particles, ancestors = np.asarray(history.particles), np.asarray(history.ancestors)
     for t in range(LAG, LENGTH):
         indices = np.arange(30)
@@ -101,7 +101,7 @@ def test_delayed_particles_are_those_of_the_lineages():
             indices = parents[indices]
         np.testing.assert_array_equal(found[t], particles[t - LAG, indices])
     np.testing.assert_array_equal(found[-1], trajectories(history)[-1 - LAG])
-    _, plain = run(pf, KEY, ys, controls, mask=MASK, collect=keep_history)
+    _, plain = run(pf, KEY, ys, inputs, mask=MASK, collect=keep_history)
     np.testing.assert_array_equal(history.particles, plain.particles)
 
 
@@ -124,8 +124,8 @@ def layered():
     )
 
 
-def drift(x, control):
-    del control
+def drift(x, inputs):
+    del inputs
     one = jnp.ones((1, 1))
     return MixedDynamics(x, 0.3 * one, 0.1 * one, jnp.zeros(1), 0.9 * one, 0.2 * one)
 
@@ -177,6 +177,6 @@ def test_what_does_not_fit_is_rejected():
         fixed_lag_rts(pf, 2)
     with pytest.raises(ValueError, match="inner must have particles"):
         run(fixed_lag(gaussian, 2), KEY, jnp.asarray(YS))
-    with pytest.raises(ValueError, match="control of fixed_lag_rts"):
+    with pytest.raises(ValueError, match="inputs of fixed_lag_rts"):
         run(fixed_lag_rts(gaussian, 2), KEY, jnp.asarray(YS, jnp.float32), jnp.asarray(CONTROLS, jnp.float32))
     assert isinstance(fixed_lag_rts(gaussian, 2), Filter)

@@ -23,8 +23,8 @@ def sample_prior(key):
     return jax.random.normal(key, (1,))
 
 
-def dynamics(x, control):
-    del control
+def dynamics(x, inputs):
+    del inputs
     one = jnp.ones((1, 1))
     return MixedDynamics(x, DT * one, DT * Q_N * one, jnp.zeros(1), one, DT * Q_L * one)
 
@@ -137,7 +137,7 @@ def guided_errors(keys, num_particles):
     inner = rao_blackwell_shared(
         lambda key: jax.random.normal(key, (size,)),
         Gaussian(jnp.zeros(size), 4.0 * eye),
-        lambda x, control: MixedDynamics(x, DT * eye, DT * Q_N * eye, jnp.zeros(size), eye, 0.4 * eye),
+        lambda x, inputs: MixedDynamics(x, DT * eye, DT * Q_N * eye, jnp.zeros(size), eye, 0.4 * eye),
         lambda x, y: -0.5 * jnp.sum((y - x) ** 2) / SHARP,
         num_particles=num_particles,
         noise_dim=size,

@@ -28,8 +28,8 @@ def velocity_step(x, dt=DT, q_n=Q_N, q_l=Q_L):
     return MixedDynamics(x, dt * one, dt * q_n * one, jnp.zeros(1), one, dt * q_l * one)
 
 
-def dynamics(x, control):
-    del control
+def dynamics(x, inputs):
+    del inputs
     return velocity_step(x)
 
 
@@ -267,8 +267,8 @@ def test_own_and_shared_covariance_give_the_same_filter():
 
 
 def test_matrices_that_depend_on_the_particle_cannot_be_shared():
-    def nonlinear(x, control):
-        return dynamics(x, control)._replace(A_n=DT * jnp.cos(x)[:, None])
+    def nonlinear(x, inputs):
+        return dynamics(x, inputs)._replace(A_n=DT * jnp.cos(x)[:, None])
 
     prior = Gaussian(jnp.zeros(1), jnp.eye(1))
     pf = rao_blackwell_shared(sample_prior, prior, nonlinear, log_likelihood, num_particles=8, noise_dim=1)
@@ -339,7 +339,7 @@ def test_transport_is_refused(build):
         build(
             lambda key: jnp.zeros(1),
             Gaussian(jnp.zeros(1), jnp.eye(1)),
-            lambda x, control: None,
+            lambda x, inputs: None,
             lambda x, y: jnp.zeros(()),
             num_particles=4,
             noise_dim=1,

@@ -19,55 +19,55 @@ def sample_prior(key):
     return jax.random.normal(key)
 
 
-def move(noise, x, control):
-    return RATE * x + control + PROCESS_STD * noise[0]
+def move(noise, x, inputs):
+    return RATE * x + inputs + PROCESS_STD * noise[0]
 
 
 def log_likelihood(x, y):
     return norm.logpdf(y, x, NOISE_STD)
 
 
-def log_transition(x_next, x, control):
-    return norm.logpdf(x_next, RATE * x + control, PROCESS_STD)
+def log_transition(x_next, x, inputs):
+    return norm.logpdf(x_next, RATE * x + inputs, PROCESS_STD)
 
 
 def simulate(seed):
     rng = np.random.default_rng(seed)
     x, ys = rng.normal(), []
-    controls = rng.normal(size=LENGTH)
-    for control in controls:
-        x = RATE * x + control + PROCESS_STD * rng.normal()
+    inputs = rng.normal(size=LENGTH)
+    for push in inputs:
+        x = RATE * x + push + PROCESS_STD * rng.normal()
         ys.append(x + NOISE_STD * rng.normal())
-    return jnp.asarray(ys, jnp.float32), jnp.asarray(controls, jnp.float32)
+    return jnp.asarray(ys, jnp.float32), jnp.asarray(inputs, jnp.float32)
 
 
-def joint_posterior(ys, controls):
+def joint_posterior(ys, inputs):
     """Of all states, from their joint Gaussian."""
     carry = np.tril(RATE ** np.subtract.outer(np.arange(LENGTH), np.arange(LENGTH)).astype(float))
-    mean = carry @ controls
+    mean = carry @ inputs
     start = RATE ** np.arange(1, LENGTH + 1)
     P = np.outer(start, start) + PROCESS_STD**2 * carry @ carry.T
     gain = P @ np.linalg.inv(P + NOISE_STD**2 * np.eye(LENGTH))
     return mean + gain @ (ys - mean), P - gain @ P
 
 
-def filtered(key, num_particles, ys, controls):
+def filtered(key, num_particles, ys, inputs):
     pf = bootstrap(sample_prior, move, log_likelihood, num_particles=num_particles, noise=StandardNormal(1))
-    return run(pf, key, ys, controls, collect=keep_history)[1]
+    return run(pf, key, ys, inputs, collect=keep_history)[1]
 
 
 @pytest.mark.system
 def test_both_smoothers_agree_with_the_joint_gaussian():
     # Means over independent runs; their bias, O(1/N), is far below four standard errors of the mean.
-    ys, controls = simulate(0)
-    mean, covariance = joint_posterior(np.asarray(ys, float), np.asarray(controls, float))
+    ys, inputs = simulate(0)
+    mean, covariance = joint_posterior(np.asarray(ys, float), np.asarray(inputs, float))
 
     @jax.jit
     @jax.vmap
     def smoothed(key):
         filter_key, path_key = jax.random.split(key)
-        history = filtered(filter_key, 200, ys, controls)
-        paths = backward_sampling(path_key, history, log_transition, controls, num_paths=100)
+        history = filtered(filter_key, 200, ys, inputs)
+        paths = backward_sampling(path_key, history, log_transition, inputs, num_paths=100)
         traced = weights.mean(trajectories(history), history.log_weights[-1])
         # The covariance of neighbours is that of whole paths, not of frames.
         neighbours = jnp.mean(paths[1:] * paths[:-1], axis=-1)
@@ -96,8 +96,8 @@ def test_what_is_impossible_is_not_drawn():
     log_weights = jnp.log(jnp.array([[0.1, 0.2, 0.7, 0.0], [0.3, 0.0, 0.3, 0.4], [0.5, 0.0, 0.5, 0.0]]))
     history = History(particles, log_weights, jnp.tile(jnp.arange(4, dtype=jnp.int32), (3, 1)))
 
-    def near(x_next, x, control):
-        del control
+    def near(x_next, x, inputs):
+        del inputs
         return jnp.where(abs(x_next - x) < 5, 0.0, -jnp.inf)
 
     paths = np.asarray(backward_sampling(KEY, history, near, num_paths=4000))
@@ -114,5 +114,5 @@ def test_wrong_arguments_are_rejected():
     history = History(jnp.zeros((3, 2)), jnp.zeros((3, 2)), jnp.zeros((3, 2), jnp.int32))
     with pytest.raises(ValueError, match="num_paths must be an integer of at least 1; got 0"):
         backward_sampling(KEY, history, log_transition, num_paths=0)
-    with pytest.raises(ValueError, match="controls must have as many frames as history, 3; got"):
+    with pytest.raises(ValueError, match="inputs must have as many frames as history, 3; got"):
         backward_sampling(KEY, history, log_transition, jnp.zeros(2), num_paths=5)

@@ -37,8 +37,8 @@ def limits():
 
 def looks(sequence):
     std = jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
-    controls = jnp.ones(len(sequence.features)).at[0].set(0.0)
-    return filters.Look(sequence.features, sequence.masks, std), controls
+    inputs = jnp.ones(len(sequence.features)).at[0].set(0.0)
+    return filters.Look(sequence.features, sequence.masks, std), inputs
 
 
 def keep(state, info):

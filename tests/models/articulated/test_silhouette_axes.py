@@ -151,9 +151,9 @@ def test_lengths_and_angles_are_found_from_a_silhouette(hand, states, measured):
     def follow(mean, covariance, y, mask):
         filter = filters.recommended(hand, Gaussian(mean, covariance), limits)
         look = filters.Look(y, mask, jnp.broadcast_to(hand.observation_std(), y.shape))
-        controls = jnp.ones(len(y)).at[0].set(0.0)
+        inputs = jnp.ones(len(y)).at[0].set(0.0)
         _, beliefs = jaxfilters.run(
-            filter, jax.random.key(0), look, controls, collect=lambda state, info: filters.belief_of(state)
+            filter, jax.random.key(0), look, inputs, collect=lambda state, info: filters.belief_of(state)
         )
         return beliefs.mean, jnp.sqrt(jnp.diagonal(beliefs.covariance, axis1=1, axis2=2))
 

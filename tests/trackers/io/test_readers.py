@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.images import read_image
 from jaxfilters.trackers.io.json_text import parse_json, read_json_text
 from jaxfilters.trackers.io.npz import names_in_npz, read_npz
-from jaxfilters.trackers.recording import InputError
-from jaxfilters.trackers.shell.image_files import read_image
 
 WANTED = "expected arrays"
 RNG = np.random.default_rng(0)

@@ -19,7 +19,7 @@ def below_a_half():
     return linear_constraints(np.array([[1.0]]), np.array([-np.inf]), np.array([0.5]))
 
 
-def unmoved(x, control):
+def unmoved(x, inputs):
     return x
 
 

@@ -1,0 +1,97 @@
+"""Starts from one image: the true pose is among them where it can be told, and what was not seen does not matter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles, template_shape
+from jaxfilters.models.articulated.features import KEYPOINTS
+from jaxfilters.models.articulated.filters import inequalities
+from jaxfilters.models.articulated.hand import articulated_hand
+from jaxfilters.models.articulated.layout import five_fingers
+from jaxfilters.models.articulated.limits import limit_rows
+from jaxfilters.models.articulated.projection import Perspective, WeakPerspective
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.articulated.start import NUM_STARTS, starts_from_points
+
+pytestmark = pytest.mark.system
+
+CAMERA = Pinhole.from_intrinsics(600.0, (320.0, 240.0), (480, 640))
+
+
+def hand_in(projection):
+    layout = five_fingers(projection.position_size)
+    hand = articulated_hand(layout, projection=projection, features=KEYPOINTS)
+    return hand, inequalities(limit_rows(layout, five_finger_limits(layout))).constraints
+
+
+def true_state(hand, turned, rng):
+    """A hand near ease, palm up and to the camera, then turned by a rotation vector in degrees."""
+    layout, in_space = hand.layout, hand.layout.position_size == 3
+    upright = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
+    x, y, z, w = (Rotation.from_rotvec(turned, degrees=True) * upright).as_quat()
+    state = np.zeros(layout.size)
+    state[layout.position] = (0.03, -0.05, 0.55) if in_space else (300.0, 260.0)
+    state[layout.quaternion], state[layout.static] = (w, x, y, z), template_shape() * (1e-3 if in_space else 1.0)
+    angles = relaxed_angles(layout) + np.radians(6.0) * rng.standard_normal((5, 4))
+    state[layout.angles] = angles.ravel()
+    return jnp.asarray(state, jnp.float32)
+
+
+@pytest.fixture(scope="module", params=[WeakPerspective(), Perspective(CAMERA)], ids=["weak", "perspective"])
+def scene(request):
+    hand, limits = hand_in(request.param)
+    std = jnp.full(42, 2.0)
+    return hand, jax.jit(lambda y, mask: starts_from_points(hand, limits, y, mask, std))
+
+
+def rotation_error(hand, states, truth):
+    q = np.asarray(states)[:, hand.layout.quaternion]
+    p = np.asarray(truth)[hand.layout.quaternion]
+    return np.degrees(2 * np.arccos(np.clip(np.abs(q @ p), 0, 1)))
+
+
+@pytest.mark.parametrize("turned", [(0, 0, 0), (35, 0, 0), (0, 0, 120), (0, 170, 0), (20, 30, -60)])
+def test_the_true_pose_is_among_the_starts(scene, turned):
+    hand, starts = scene
+    truth = true_state(hand, turned, np.random.default_rng(1))
+    found = starts(hand.observe(truth), jnp.ones(42, bool))
+    assert bool(found.found)
+    assert rotation_error(hand, found.means[:3], truth).min() < 15.0
+    image = hand.image_points(found.means[0]) - hand.image_points(truth)
+    assert float(jnp.sqrt(jnp.mean(image**2))) < 3.0
+
+
+def test_what_was_not_measured_does_not_matter(scene):
+    """Middle joints, tips and the wrist alone, with anything in the other rows."""
+    hand, starts = scene
+    truth = true_state(hand, (20, 0, 10), np.random.default_rng(2))
+    joints = np.zeros((5, 3, 2), bool)
+    joints[:, [0, 2]] = True
+    mask = jnp.asarray(np.concatenate([[True, True], np.zeros(10, bool), joints.ravel()]))
+    y = hand.observe(truth)
+    one, other = (starts(jnp.where(mask, y, rest), mask) for rest in (0.0, 1e4))
+    np.testing.assert_array_equal(one.means, other.means)
+    assert rotation_error(hand, one.means[:3], truth).min() < 25.0
+
+
+def test_covariances_are_positive_and_leave_a_weak_scale_alone(scene):
+    hand, starts = scene
+    truth = true_state(hand, (10, 0, 0), np.random.default_rng(3))
+    found = starts(hand.observe(truth), jnp.ones(42, bool))
+    for mean, covariance in zip(np.asarray(found.means, float), np.asarray(found.covariances, float), strict=True):
+        eigenvalues = np.linalg.eigvalsh(covariance)
+        assert eigenvalues[0] > -1e-6 * eigenvalues[-1]
+        q = mean[hand.layout.quaternion]
+        assert abs(q @ covariance[hand.layout.quaternion, hand.layout.quaternion] @ q) < 1e-6
+
+
+def test_too_few_points_are_no_start(scene):
+    hand, starts = scene
+    truth = true_state(hand, (0, 0, 0), np.random.default_rng(4))
+    found = starts(hand.observe(truth), jnp.arange(42) < 6)
+    assert not bool(found.found)
+    assert found.means.shape[0] == NUM_STARTS
+    assert bool(jnp.all(jnp.isfinite(found.means)))

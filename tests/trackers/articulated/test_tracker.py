@@ -1,0 +1,119 @@
+"""The articulated tracker: on the paper's sequence, from keypoints alone, through gaps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.articulated.anatomy import template_shape
+from jaxfilters.models.articulated.features import FULL, KEYPOINTS
+from jaxfilters.models.articulated.hand import articulated_hand
+from jaxfilters.models.articulated.layout import five_fingers
+from jaxfilters.trackers.articulated import tracker
+from jaxfilters.trackers.articulated.recording import FeatureSequence
+from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING, ArticulatedConfig
+
+
+def follow(sequence, config=None):
+    built = tracker.build(sequence, config or ArticulatedConfig())
+    state = built.start(jax.random.key(0), sequence[0])
+    frames = jax.tree.map(lambda *leaves: np.stack(leaves), *[sequence[i] for i in range(len(sequence))])
+    return jax.tree.map(np.asarray, built.advance(state, frames, sequence.times_s.astype(np.float32))[1])
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    """A five-fingered hand that turns and bends, seen by its 21 keypoints, 60 frames; true states beside it."""
+    hand = articulated_hand(five_fingers(), features=KEYPOINTS)
+    layout, frames = hand.layout, 60
+    n = np.arange(frames)
+    states = np.zeros((frames, layout.size))
+    states[:, layout.position] = np.stack([300 + 20 * np.sin(n / 9), 380 + 10 * np.cos(n / 7)], axis=1)
+    turn = np.deg2rad(25 * np.sin(n / 10))
+    up = np.array([0.5, -0.5, 0.5, -0.5])
+    half = np.stack([np.cos(turn / 2), 0 * turn, np.sin(turn / 2), 0 * turn], axis=1)  # about the image's vertical
+    w, x, y, z = half.T
+    a, b, c, d = up
+    states[:, layout.quaternion] = np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        1,
+    )
+    flexion = 0.35 + 0.3 * np.sin(n / 6)[:, None] * np.ones(5)
+    angles = np.stack([0 * flexion, flexion, flexion, 0.5 * flexion], axis=2)
+    states[:, layout.angles] = angles.reshape(frames, -1)
+    states[:, layout.static] = 1.5 * template_shape() * (1 + 0.08 * np.cos(np.arange(18)))
+    observed = np.asarray(jax.vmap(hand.observe)(jnp.asarray(states, dtype=float)), float)
+    observed += np.random.default_rng(0).normal(size=observed.shape)
+    sequence = FeatureSequence(5, KEYPOINTS, n / 30, observed, np.ones_like(observed), "keypoints")
+    return sequence, states, hand
+
+
+@pytest.mark.system
+def test_the_papers_sequence_is_followed_as_its_filter_says():
+    sequence = tracker.synthetic_sequence(0)
+    track = follow(sequence)
+    assert sequence.features == FULL
+    assert np.all(track.status == TRACKING)
+    angles = np.rad2deg(np.abs(track.mean - sequence.truth)[-15:, 6:14])
+    assert np.median(angles) < 4
+    assert abs(track.mean[-1, 30] - 35) < 3 * track.std[-1, 30]
+    assert 0.5 < np.mean(track.nis_per_row[5:]) < 1.5
+    assert all(np.all(np.isfinite(leaf)) for leaf in track)
+
+
+@pytest.mark.system
+def test_keypoints_need_no_start(keypoints):
+    sequence, states, hand = keypoints
+    track = follow(sequence)
+    assert np.all(track.status == TRACKING)
+    # Size is not seen by one camera; what is left is the shape of the pose: joints from the wrist, scaled.
+    truth = np.asarray(jax.vmap(hand.points)(jnp.asarray(states, dtype=float))).reshape(60, 20, 3)
+    wrist = np.pad(states[:, :2], ((0, 0), (0, 1)))[:, None]
+    found = track.points.reshape(60, 20, 3) - np.pad(track.mean[:, :2], ((0, 0), (0, 1)))[:, None]
+    truth = truth - wrist
+    scale = (found * truth).sum((1, 2)) / (found**2).sum((1, 2))
+    error = np.linalg.norm(scale[:, None, None] * found - truth, axis=-1).mean(axis=1) / 1.5
+    # In millimetres of the template; a flat hand at the wrist's depth is off by its depths.
+    flat = np.linalg.norm(truth * [1, 1, 0] - truth, axis=-1).mean(axis=1) / 1.5
+    assert error[10:].mean() < 0.5 * flat[10:].mean()
+
+
+@pytest.mark.system
+def test_a_hand_that_was_gone_is_found_again(keypoints):
+    sequence, _, _ = keypoints
+    y = sequence.y.copy()
+    y[:3] = np.nan  # not there at first
+    y[25:42] = np.nan
+    gone = FeatureSequence(5, KEYPOINTS, sequence.times_s, y, sequence.std, "gone")
+    track = follow(gone)
+    assert np.all(track.status[:3] == SEARCHING)
+    assert np.all(track.status[3:25] == TRACKING)
+    assert np.all(track.status[25:35] == LOST)
+    assert np.all(track.status[43:] == TRACKING)
+    assert all(np.all(np.isfinite(leaf)) for leaf in (track.mean, track.std, track.points))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mode": "best"}, "mode must be one of recommended, literal, unconstrained; got 'best'"),
+        ({"hypotheses": 0}, "hypotheses must be at least 1; got 0"),
+        ({"gate": -1.0}, "gate must be standard deviations, 0 or more; got -1.0"),
+        ({"hand": "third"}, "hand must be one of right, left; got 'third'"),
+    ],
+)
+def test_wrong_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ArticulatedConfig(**arguments)
+
+
+def test_features_that_are_no_keypoints_need_a_start():
+    sequence = tracker.synthetic_sequence(0)
+    without = FeatureSequence(2, FULL, sequence.times_s, sequence.y, sequence.std, "file.npz")
+    with pytest.raises(ValueError, match=r"file.npz: a start .* is needed"):
+        tracker.build(without)

@@ -1,0 +1,143 @@
+"""The hand tracker, whole: on rendered sequences with known truth, through loss and silence, and on real depth."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
+from jaxfilters.trackers.hand_depth import tracker as hand_depth
+from jaxfilters.trackers.hand_depth.tracker import LOST, SEARCHING, TRACKING, HandDepthConfig
+from jaxfilters.trackers.io.depth import open_depth
+
+pytestmark = pytest.mark.optimised
+
+CHUNK = 12
+NUM_PARTICLES = 96
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    made = simulate_sequence(jax.random.key(1), "B", num_frames=2 * CHUNK)
+    depth = np.asarray(made.depth_mm, np.float32) / 1000
+    return depth, np.asarray(made.joints)
+
+
+@pytest.fixture(scope="module")
+def tracker():
+    return hand_depth.build(kinect_v2(), HandDepthConfig(num_particles=NUM_PARTICLES))
+
+
+def follow(tracker, depth, seed=0):
+    state, rows = tracker.start(jax.random.key(seed), depth[0]), []
+    for first in range(0, len(depth), CHUNK):
+        times = np.arange(first, first + CHUNK, dtype=np.float32) / 30
+        state, track = tracker.advance(state, depth[first : first + CHUNK], times)
+        rows.append(track)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
+
+
+def joint_errors_mm(track, joints):
+    return 1000 * np.linalg.norm(track.joints - joints, axis=-1).mean(-1)
+
+
+@pytest.fixture(scope="module")
+def track(tracker, sequence):
+    return follow(tracker, sequence[0])
+
+
+@pytest.mark.system
+def test_a_moving_hand_is_followed_from_an_automatic_start(track, sequence):
+    errors = joint_errors_mm(track, sequence[1])
+    assert np.all(track.status == TRACKING)
+    assert errors.mean() < 12
+    assert np.all(np.isfinite(track.log_evidence))
+    assert np.all((track.ess >= 1) & (track.ess <= NUM_PARTICLES))
+    assert np.all(track.pose_std > 0)
+    np.testing.assert_allclose(np.linalg.norm(track.pose[:, 3:7], axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.system
+def test_the_same_key_gives_the_same_track(tracker, track, sequence):
+    again = follow(tracker, sequence[0])
+    for name in track._fields:
+        np.testing.assert_array_equal(getattr(again, name), getattr(track, name), err_msg=name)
+
+
+@pytest.mark.system
+def test_what_comes_later_changes_nothing_before(tracker, track, sequence):
+    depth = sequence[0].copy()
+    depth[7:] = np.nan
+    np.testing.assert_array_equal(follow(tracker, depth[:CHUNK]).joints[:7], track.joints[:7])
+
+
+@pytest.mark.system
+def test_a_hand_that_leaves_and_returns_is_said_lost_and_found_again(tracker, sequence):
+    depth, joints = sequence
+    away = slice(5, 14)
+    depth = depth.copy()
+    depth[away] = 3.0
+    track = follow(tracker, depth)
+    assert np.all(track.status[:5] == TRACKING)
+    assert np.all(track.status[5:10] == LOST)
+    assert np.all(track.status[10:14] == SEARCHING)
+    assert np.all(np.isnan(track.joints[10:14]))
+    assert np.all(track.status[14:] == TRACKING)
+    assert joint_errors_mm(track, joints)[14:].mean() < 20
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("value", [np.nan, 3.0])
+def test_without_any_hand_the_tracker_searches(tracker, value):
+    track = follow(tracker, np.full((CHUNK, 424, 512), value, np.float32))
+    assert np.all(track.status == SEARCHING)
+    assert np.all(np.isnan(track.joints))
+
+
+@pytest.mark.system
+def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequence):
+    blank = np.full((424, 512), 3.0, np.float32)
+    state = tracker.start(jax.random.key(0), blank)
+    assert np.isnan(state.scale)
+    depth = np.concatenate([np.stack([blank] * 2), sequence[0][: CHUNK - 2]])
+    state, track = tracker.advance(state, depth, np.arange(CHUNK, dtype=np.float32) / 30)
+    assert np.all(track.status == [SEARCHING] * 2 + [TRACKING] * (CHUNK - 2))
+    assert abs(float(state.scale) - 1) < 0.051
+    assert joint_errors_mm(track, np.concatenate([sequence[1][:2], sequence[1]])[:CHUNK])[2:].mean() < 15
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("options", [{"filter": "pf"}, {"guide": False}])
+def test_the_other_filters_follow_too(sequence, options):
+    tracker = hand_depth.build(kinect_v2(), HandDepthConfig(num_particles=256, **options))
+    track = follow(tracker, sequence[0])
+    assert np.all(np.isfinite(track.joints))
+    assert joint_errors_mm(track, sequence[1]).mean() < 60
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"filter": "kalman"}, "filter must be one of rbpf, pf"),
+        ({"hand": "both"}, "hand must be one of"),
+        ({"missing": "maybe"}, "missing must be one of"),
+        ({"num_particles": 0}, "num_particles must be at least 1"),
+        ({"stride": 0}, "stride must be at least 1"),
+        ({"scale": 5.0}, "scale must be between 0.5 and 2"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(options, named):
+    with pytest.raises(ValueError, match=named):
+        HandDepthConfig(**options)
+
+
+@pytest.mark.data
+@pytest.mark.system
+def test_a_real_hand_is_followed(data_dir):
+    # A loose fist that opens within half a second; its truth is itself a model fit, 6 mm off the depth in the median.
+    recording = open_depth(data_dir / "hpx_hand_rgbd" / "hpx.npz")
+    tracker = hand_depth.build(recording.camera, HandDepthConfig())
+    depth = np.stack([recording[i] for i in range(len(recording))])
+    times = (recording.times_s - recording.times_s[0]).astype(np.float32)
+    _, track = tracker.advance(tracker.start(jax.random.key(0), depth[0]), depth, times)
+    assert np.all(track.status == TRACKING)
+    assert joint_errors_mm(track, recording.joints).mean() < 22

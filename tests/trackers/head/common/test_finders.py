@@ -1,0 +1,63 @@
+"""Finders of the landmarks, on a drawn face and on what a face mesh might say."""
+
+import numpy as np
+import pytest
+
+from jaxfilters.trackers.head.common import finders as module
+from jaxfilters.trackers.head.common.detect import STABLE_FRAMES
+from jaxfilters.trackers.head.common.finders import FINDERS, MOST_MOVED_PX, CascadeFinder, MeshFinder
+from jaxfilters.trackers.head.common.state import CHOICES
+
+
+@pytest.fixture
+def mesh(monkeypatch):
+    """A finder whose mesh gives the answers of a list, one after another."""
+    answers = []
+
+    class Told:
+        def detect(self, image):
+            return answers.pop(0)
+
+    monkeypatch.setattr(module, "MeshDetector", Told)
+    return MeshFinder(), answers
+
+
+IMAGE = np.zeros((480, 640), np.uint8)
+
+
+def test_every_choice_has_a_finder():
+    assert tuple(FINDERS) == CHOICES["detector"]
+
+
+def test_the_cascades_wait_for_a_face_that_holds_still_and_complete_it(draw_face):
+    image, points = draw_face((330, 220), 70.0)
+    finder = CascadeFinder()
+    found = [finder.find(image) for _ in range(STABLE_FRAMES)]
+    assert all(one is None for one in found[:-1])
+    assert finder.complaints == []
+    assert np.linalg.norm(found[-1] - points, axis=1).max() < 0.15 * 70
+    finder.reset()
+    assert finder.find(image) is None
+    assert finder.find(IMAGE) is None
+    assert finder.complaints == ["no face"]
+
+
+def test_the_mesh_waits_for_a_face_that_holds_still(mesh, draw_face):
+    finder, answers = mesh
+    points = draw_face((330, 220), 70.0)[1]
+    step = np.array([0.9 * MOST_MOVED_PX, 0.0])
+    answers += [points + i * step for i in range(STABLE_FRAMES)]
+    found = [finder.find(IMAGE) for _ in range(STABLE_FRAMES)]
+    assert all(one is None for one in found[:-1])
+    np.testing.assert_array_equal(found[-1], points + (STABLE_FRAMES - 1) * step)
+    answers += [points + 50, None, points]
+    assert [finder.find(IMAGE) for _ in range(3)] == [None] * 3
+
+
+def test_the_mesh_says_why_there_is_no_face(mesh, draw_face):
+    finder, answers = mesh
+    answers += [None, draw_face((330, 220), 70.0, roll=np.radians(17))[1]]
+    assert finder.find(IMAGE) is None
+    assert finder.complaints == ["no face"]
+    assert finder.find(IMAGE) is None
+    assert finder.complaints == ["the head is tilted"]

@@ -1,0 +1,109 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from jaxfilters.trackers.app.results import begin
+from jaxfilters.trackers.head.common.report import errors, shares
+from jaxfilters.trackers.head.common.state import HeadTrack
+from jaxfilters.trackers.head.common.table import SKIPPED, TimedHeadTrack, head_table, longest_stretch, with_gaps
+
+COLUMNS = (
+    "frame,time_s,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg,sd_x_mm,sd_y_mm,sd_z_mm,sd_roll_deg,sd_pitch_deg,"
+    "sd_yaw_deg,a1_mm,a2_mm,a3_mm,a4_mm,a5_mm,score,status"
+)
+
+
+def chunk(status, modes=2, cameras=2):
+    b = len(status)
+    pose = np.tile([1.0, 2, 3, 0.1, 0.2, 0.3], (b, 1)) + np.arange(b)[:, None] * [1, 0, 0, 0, 0, 0]
+    return HeadTrack(
+        pose=pose,
+        pose_std=np.tile([0.5, 0.6, 0.7, 0.01, 0.02, 0.03], (b, 1)),
+        deformation=np.tile(np.arange(1.0, modes + 1), (b, 1)),
+        shape=np.ones((b, 10, 3)),
+        image_points=np.ones((b, cameras, 10, 2)),
+        score=np.full(b, 0.75),
+        effective_sample_size=np.full(b, 100.0),
+        status=np.asarray(status, np.int32),
+    )
+
+
+def test_rows_are_in_degrees_with_pitch_before_yaw(tmp_path):
+    writer = begin(tmp_path, {}, head_table(2))
+    times_s = np.array([0.0, 1 / 30])
+    writer.append(times_s, with_gaps(chunk([1, 2]), times_s, [True, True], head_table(2))[1:])
+    lines = (tmp_path / "track.csv").read_text().splitlines()
+    assert lines[0] == COLUMNS
+    row = next(csv.DictReader(lines))
+    expected = {"x_mm": 1, "z_mm": 3, "roll_deg": np.rad2deg(0.1), "pitch_deg": np.rad2deg(0.3), "sd_x_mm": 0.5}
+    expected |= {"yaw_deg": np.rad2deg(0.2), "sd_pitch_deg": np.rad2deg(0.03), "sd_yaw_deg": np.rad2deg(0.02)}
+    expected |= {"a1_mm": 1, "a2_mm": 2, "a3_mm": 0, "a5_mm": 0, "score": 0.75}
+    assert {name: float(row[name]) for name in expected} == pytest.approx(expected, rel=1e-6)
+    assert (row["frame"], row["time_s"], row["status"]) == ("0", "0.000000", "rigid")
+    assert lines[2].endswith("deformable")
+
+
+def test_what_is_not_tracked_has_no_numbers(tmp_path):
+    """A frozen pose must not pass for a tracked one; the score, which says why, stays."""
+    rows = with_gaps(chunk([0, 1, 3]), np.arange(5.0), [True, False, True, False, True], head_table(2))
+    np.testing.assert_array_equal(rows.status, [0, SKIPPED, 1, SKIPPED, 3])
+    np.testing.assert_array_equal(rows.times_s, np.arange(5))
+    tracked = np.array([False, False, True, False, False])
+    for name in ("pose", "pose_std", "deformation", "shape", "image_points"):
+        values = getattr(rows, name).reshape(5, -1)
+        np.testing.assert_array_equal(np.isfinite(values).all(axis=1), tracked)
+        np.testing.assert_array_equal(np.isnan(values).all(axis=1), ~tracked)
+    np.testing.assert_array_equal(rows.pose[2], np.float32([2, 2, 3, 0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(rows.score, [0.75, np.nan, 0.75, np.nan, 0.75])
+    nothing = with_gaps(None, np.arange(2.0), [False, False], head_table(1))
+    np.testing.assert_array_equal(nothing.status, [SKIPPED] * 2)
+    assert nothing.image_points.shape == (2, 1, 10, 2)
+
+
+def test_faces_with_fewer_or_more_modes_fit():
+    for modes in (0, 5, 7):
+        deformation = with_gaps(chunk([2], modes), np.zeros(1), [True], head_table(2)).deformation
+        np.testing.assert_array_equal(deformation, [[i + 1 if i < modes else 0 for i in range(5)]])
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [
+        ([0, 0, 1, 2, 3, 2, 2, 2], slice(5, 8)),
+        ([1, 4, 2, 2, 3, 2, 2, 3], slice(0, 4)),
+        ([4, 0, 4, 1, 4], slice(3, 4)),
+        ([0, 3, 4], slice(0, 0)),
+        ([], slice(0, 0)),
+    ],
+)
+def test_the_longest_stretch_passes_over_skipped_moments(status, expected):
+    assert longest_stretch(np.asarray(status, int)) == expected
+
+
+def test_shares_of_a_run(face_track):
+    track, _ = face_track
+    told = shares(track)
+    assert told["status"] == {"initialising": 2, "rigid": 13, "deformable": 21, "lost": 3, "skipped": 1}
+    assert told["share_tracked"] == pytest.approx(34 / 39, abs=1e-4)
+    # Frames 2 to 29, without the skipped one.
+    assert (told["longest_stretch_frames"], told["longest_stretch_s"]) == (27, pytest.approx(27 / 30, abs=1e-3))
+    assert json.dumps(told, allow_nan=False)
+
+
+def test_errors_are_those_of_the_tracked_frames(face_track):
+    track, truth = face_track
+    told = errors(track, truth)
+    tracked = np.isfinite(track.pose[:, 0])
+    offsets = track.pose[tracked] - truth.poses[tracked]
+    assert told["rmse"]["x_mm"] == pytest.approx(np.sqrt(np.mean(offsets[:, 0] ** 2)), abs=1e-4)
+    assert told["rmse"]["yaw_deg"] == pytest.approx(np.rad2deg(np.sqrt(np.mean(offsets[:, 4] ** 2))), abs=1e-3)
+    assert told["within_2_sigma"]["pitch_deg"] == pytest.approx(np.mean(np.abs(offsets[:, 5]) <= 0.04), abs=1e-4)
+    assert 0.1 < told["landmark_rms_px"] < 10
+    turned = track._replace(pose=track.pose + np.float32([0, 0, 0, 2 * np.pi, 0, 0]))
+    assert errors(turned, truth)["rmse"] == pytest.approx(told["rmse"], abs=1e-3)
+    assert errors(track, None) == {}
+    lost = TimedHeadTrack(*track[:-1], np.full_like(track.status, 3))
+    assert errors(lost, truth) == {}
+    assert shares(lost)["mean_score"] is None

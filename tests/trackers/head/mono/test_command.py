@@ -1,0 +1,241 @@
+"""`jaxfilters track head-mono` from end to end, with something quick in the place of the tracker."""
+
+import csv
+import dataclasses
+import json
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.person_prior import Person
+from jaxfilters.models.face.remembered import Remembered
+from jaxfilters.trackers.app.cli import main
+from jaxfilters.trackers.head.common import input as head_input
+from jaxfilters.trackers.head.common.table import with_gaps
+from jaxfilters.trackers.head.mono import command as mono_command
+from jaxfilters.trackers.head.mono.focal import FocalLength
+from jaxfilters.trackers.head.mono.state import MonoTrack
+from jaxfilters.trackers.head.mono.table import mono_table
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.face_models import default_face_model, save_face_model
+
+ROWS, COLS, FRAMES = 48, 64, 20
+OUTPUTS = {"person.npz", "track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4"}
+
+
+@pytest.fixture(autouse=True)
+def keep_environment(monkeypatch):
+    """`main` sets XLA_FLAGS for its process."""
+    monkeypatch.setenv("XLA_FLAGS", "")
+
+
+def run(*arguments):
+    return main(["track", "head-mono", *map(str, arguments)])
+
+
+def made_track(means, times, status, face):
+    b, zero = len(means), np.zeros(len(means))
+    return MonoTrack(
+        pose=np.stack([means, means, 1000 * times, zero + 0.1, zero + 0.2, zero + 0.3], axis=-1),
+        pose_std=np.full((b, 6), 0.5),
+        deformation=np.full((b, face.num_expressions), 0.25),
+        shape=np.tile(np.asarray(face.mean), (b, 1, 1)),
+        image_points=np.full((b, 1, 10, 2), 5.0),
+        score=np.full(b, 0.75),
+        effective_sample_size=np.full(b, 100.0),
+        identity=np.full((b, face.num_identities), 1.5),
+        offset=np.zeros((b, 10, 3)),
+        who=np.where(np.arange(b) < b // 2, -1, 0),
+        is_adjusted=np.arange(b) % 2 == 0,
+        status=status,
+    )
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Stands in for the session: two frames without a face, then a pose that tells of the images."""
+    made = []
+
+    class FakeSession(mono_command.MonoSession):
+        events, model, person, remembered = (), None, None, None
+
+        def __init__(self, rig, face, options, points, *, detector, remembered=None):
+            self.known = remembered
+            self.rig, self.face, self.options, self.points, self.frames = rig, face, options, points, 0
+            self.events = []
+            made.append(self)
+
+        def focal_length(self):
+            return FocalLength(np.float32(1.1), np.float32(0.1))
+
+        def process(self, images, times):
+            assert images.shape[1:] == (1, *self.rig.shape)
+            index = self.frames + np.arange(len(images))
+            self.frames += len(images)
+            if self.person is None:
+                self.person = Person(self.face.identity_mean, jnp.zeros((10, 3)))
+                who = (self.face.identity_mean, self.face.identity_covariance, self.person.offset)
+                self.remembered = Remembered(*(leaf[None] for leaf in who))
+                self.events.append((2, "registered"))
+            return made_track(images.mean(axis=(1, 2, 3)), times, np.where(index < 2, 0, 2).astype(np.int32), self.face)
+
+    monkeypatch.setattr(mono_command, "MonoSession", FakeSession)
+    return made
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for i in range(FRAMES):
+        cv2.imwrite(str(folder / f"{i:03d}.png"), np.full((ROWS, COLS, 3), 100 + i, np.uint8))
+    return folder
+
+
+@pytest.mark.system
+def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(pictures, "--out", out, "--seed", 4, "--num-particles", 60, "--eyes-apart-mm", 64.5) == 0
+    assert {file.name for file in out.iterdir()} == OUTPUTS
+    with (out / "track.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["initialising"] * 2 + ["deformable"] * (FRAMES - 2)
+    assert float(rows[7]["x_mm"]) == pytest.approx(107, rel=1e-5)
+    assert float(rows[7]["pitch_deg"]) == pytest.approx(np.rad2deg(0.3), rel=1e-5)
+    assert (float(rows[7]["a5_sd"]), float(rows[7]["s15_sd"])) == (0.25, 1.5)
+    assert np.isnan(float(rows[0]["s1_sd"]))
+    options = fake[0].options
+    assert (options.seed, options.num_particles, options.eyes_apart_mm) == (4, 60, 64.5)
+    assert fake[0].face.num_identities == 15
+    report = json.loads((out / "report.json").read_text())
+    assert report["is_focal_length_assumed"] is True
+    assert report["focal_length_px"][0] == pytest.approx(1.2 * COLS)
+    assert 50 < report["eyes_apart_mm"] < 80
+    assert report["events"] == [{"frame": 2, "what": "registered"}]
+    assert report["adjusted_frames"] > 0
+    assert "generator" in report["face_model"]["source"]
+    with np.load(out / "track.npz") as track:
+        assert track["identity"].shape == (FRAMES, 15)
+        assert track["person_identity"].shape == (15,)
+        assert track["status_names"][int(track["status"][5])] == "deformable"
+    captured = capsys.readouterr()
+    assert "assumed focal length" in captured.err
+    assert "90 % tracked" in captured.out
+
+
+def test_whom_one_run_followed_the_next_may_know(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "ann", "--no-video") == 0
+    assert run(pictures, "--out", tmp_path / "again", "--known", tmp_path / "ann" / "person.npz", "--no-video") == 0
+    assert fake[0].known is None
+    np.testing.assert_allclose(fake[1].known.identity[0], fake[1].face.identity_mean)
+    reports = [json.loads((tmp_path / name / "report.json").read_text()) for name in ("ann", "again")]
+    assert reports[0]["taken_for"] == {}
+    assert reports[1]["taken_for"] == {"ann": FRAMES // 2}
+    assert reports[1]["options"]["known"] == [str(tmp_path / "ann" / "person.npz")]
+    with (tmp_path / "again" / "track.csv").open(newline="") as file:
+        assert [float(row["who"]) for row in csv.DictReader(file)][3:5] == [-1, 0]
+    file = default_face_model()
+    other = dataclasses.replace(file.model, mean=1.01 * file.model.mean)
+    save_face_model(tmp_path / "other.npz", file._replace(model=other))
+    wrong = ("--model", tmp_path / "other.npz", "--known", tmp_path / "ann" / "person.npz")
+    assert run(pictures, "--out", tmp_path / "wrong", *wrong) == 2
+    assert "people of another model of the face" in capsys.readouterr().err
+
+
+def test_the_focal_length_is_said_if_asked_for(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "out", "--estimate-focal", "--no-video") == 0
+    estimate = json.loads((tmp_path / "out" / "report.json").read_text())["focal_length_estimate"]
+    assert estimate["px"] == pytest.approx(1.1 * 1.2 * COLS, rel=1e-5)
+    assert estimate["std_px"] == pytest.approx(0.1 * 1.1 * 1.2 * COLS, rel=1e-5)
+    assert "the focal length looks like 84 px, give or take 8" in capsys.readouterr().out
+    assert run(pictures, "--out", tmp_path / "again", "--no-video") == 0
+    assert json.loads((tmp_path / "again" / "report.json").read_text())["focal_length_estimate"] is None
+
+
+def test_marked_landmarks_reach_the_session(pictures, fake, tmp_path):
+    marks = tmp_path / "marks.csv"
+    lines = [f"{name},{10 + i},{20 + i}" for i, name in enumerate(NAMES)]
+    marks.write_text("\n".join(["name,u,v", *lines]) + "\n")
+    assert run(pictures, "--out", tmp_path / "out", "--points", marks, "--no-video") == 0
+    np.testing.assert_allclose(fake[0].points[3], (13, 23))
+    assert fake[0].options.landmarks == "aligned"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("num_expressions", [3, 8])
+def test_models_of_any_number_of_expressions_make_tables(pictures, fake, tmp_path, num_expressions):
+    file = default_face_model()
+    tensor = np.random.default_rng(0).normal(size=(10, 3, 15, num_expressions))
+    model = dataclasses.replace(
+        file.model,
+        tensor=jnp.asarray(tensor, float),
+        expression_mean=jnp.zeros(num_expressions),
+        expression_covariance=jnp.eye(num_expressions),
+    )
+    save_face_model(tmp_path / "other.npz", file._replace(model=model))
+    assert run(pictures, "--out", tmp_path / "out", "--model", tmp_path / "other.npz", "--no-video") == 0
+    with np.load(tmp_path / "out" / "track.npz") as track:
+        assert track["deformation"].shape == (FRAMES, num_expressions)
+
+
+def test_another_model_is_used_and_recorded(pictures, fake, tmp_path):
+    file = default_face_model()
+    save_face_model(tmp_path / "mine.npz", file._replace(source="my friends"))
+    assert run(pictures, "--out", tmp_path / "out", "--model", tmp_path / "mine.npz", "--no-video") == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["face_model"]["source"] == "my friends"
+    assert not (tmp_path / "out" / "overlay.mp4").exists()
+
+
+def test_what_cannot_be_used_is_said(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "a", "--eyes-apart-mm", 6) == 2
+    assert "eyes_apart_mm must be within 40 and 80" in capsys.readouterr().err
+    assert run(pictures, "--out", tmp_path / "b", "--model", tmp_path / "none.npz") == 2
+    assert "none.npz" in capsys.readouterr().err
+    assert run(tmp_path / "no_video.mp4", "--out", tmp_path / "c") == 2
+    assert run("--out", tmp_path / "d", "--camera", tmp_path / "camera.json") == 2
+    assert "--camera: of no use without a recording" in capsys.readouterr().err
+    assert not any(tmp_path.glob("[a-d]/track.csv"))
+
+
+def test_a_track_of_another_run_is_not_overwritten(pictures, fake, tmp_path, capsys):
+    assert run(pictures, "--out", tmp_path / "out") == 0
+    assert run(pictures, "--out", tmp_path / "out") == 2
+    assert "holds the track of another run" in capsys.readouterr().err
+
+
+def test_a_model_of_other_landmarks_is_refused(monkeypatch, tmp_path):
+    file = default_face_model()
+    other = file._replace(names=tuple(f"point {i}" for i in range(10)))
+    monkeypatch.setattr(mono_command, "load_face_model", lambda path: other)
+    with pytest.raises(InputError, match="which differ in right eye outer; the tracker follows the 10"):
+        mono_command.track_mono(mono_options(model=tmp_path / "m.npz", out=tmp_path))
+
+
+def mono_options(**given):
+    from argparse import Namespace
+
+    usual = dict(video_source=None, camera=None, points=None, fps=None, seed=None, num_particles=None, video=False)
+    return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, estimate_focal=False, known=None) | given)
+
+
+def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
+    monkeypatch.setattr(head_input, "_SYNTHETIC_FRAMES", 5)
+    place = head_input.place_of_one(mono_options(out=tmp_path, model=None))
+    assert place.rig.num_cameras == 1
+    assert place.points.shape == (10, 2)
+    assert place.truth.poses.shape == (5, 6)
+    assert place.sources[0].image_size == (640, 480)
+
+
+def test_rows_of_lost_and_skipped_frames_are_empty():
+    face = default_face_model().model
+    track = made_track(np.full(2, 7.0), np.zeros(2), np.array([3, 2], np.int32), face)
+    rows = with_gaps(track, np.arange(3.0), [True, False, True], mono_table(face))
+    assert np.isnan(rows.pose[:2]).all()
+    assert np.isnan(rows.identity[:2]).all()
+    assert rows.identity[2, 0] == 1.5
+    np.testing.assert_array_equal(rows.status, [3, 4, 2])

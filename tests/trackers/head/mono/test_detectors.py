@@ -1,0 +1,69 @@
+"""Landmarks of MediaPipe's mesh as the 68, on a mesh that is told and, where it is installed, on a face."""
+
+import importlib.util
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxfilters.models.face.landmarks import EYES, FROM_68
+from jaxfilters.models.face.mirroring import PAIRS_68
+from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.mono import detectors as module
+from jaxfilters.trackers.head.mono.detectors import CHIN, DETECTORS, IRISES, MESH_68, CascadeDetector, MeshLandmarks
+
+IMAGE = np.zeros((480, 640), np.uint8)
+
+
+def test_vertices_become_landmarks(monkeypatch):
+    mesh = np.random.default_rng(0).uniform(0, 400, (478, 2))
+
+    class Told:
+        def __init__(self, *, refined):
+            assert refined
+
+        def mesh(self, image):
+            return mesh if image.any() else None
+
+    monkeypatch.setattr(module, "MeshDetector", Told)
+    detector = DETECTORS["mediapipe"]()
+    assert detector.detect(IMAGE, None) == "no face"
+    seen = detector.detect(IMAGE + np.uint8(1), None)
+    assert np.flatnonzero(np.isnan(seen.dense[:, 0])).tolist() == [k for k in range(17) if k != CHIN]
+    np.testing.assert_array_equal(seen.dense[30], mesh[4])
+    np.testing.assert_allclose(seen.dense[31], (mesh[97] + mesh[98]) / 2)
+    np.testing.assert_array_equal(seen.points, seen.dense[list(FROM_68)])
+    assert seen.iris_px[1] == np.linalg.norm(mesh[474] - mesh[476])
+
+
+def test_no_vertex_is_two_landmarks_of_one_side():
+    assert len(MESH_68) == 68
+    for right, left in PAIRS_68:
+        assert len(MESH_68[right]) == len(MESH_68[left])
+        assert not set(MESH_68[right]) & set(MESH_68[left])
+    single = [vertices for vertices in MESH_68 if len(vertices) == 1]
+    assert len(set(single)) == len(single)
+    assert all(0 <= vertex < 478 for vertices in (*MESH_68, *IRISES) for vertex in vertices)
+
+
+@pytest.mark.system
+def test_the_mesh_is_where_the_cascades_see_a_face(data_dir):
+    if importlib.util.find_spec("mediapipe") is None:
+        pytest.skip("mediapipe is not installed: `pip install jaxfilters[mediapipe]`")
+    video = cv2.VideoCapture(str(data_dir / "talking_face_video" / "franck.mp4"))
+    read, image = video.read()
+    if not read:
+        pytest.skip("JAXFILTERS_DATA has no talking_face_video")
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    mesh, corners = MeshLandmarks().detect(grey, None), CascadeDetector().detect(grey, None)
+    right, left = eye_centers(corners.points[:6])
+    apart = np.linalg.norm(left - right)
+    # Corners of eyes and mouth are the same in both; people's irises are a fifth of the way between their eyes wide.
+    np.testing.assert_allclose(mesh.points[list(EYES)], corners.points[list(EYES)], atol=0.12 * apart)
+    assert np.all((mesh.iris_px > 0.14 * apart) & (mesh.iris_px < 0.24 * apart))
+    middle, up = (right + left) / 2, np.array([0.0, -1.0])
+    across = (left - right) / apart
+    for k, other in PAIRS_68:
+        if np.isfinite(mesh.dense[[k, other]]).all():
+            assert (mesh.dense[other] - mesh.dense[k]) @ across > 0
+    assert (mesh.dense[CHIN] - middle) @ up < -1.2 * apart

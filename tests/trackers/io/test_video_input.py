@@ -1,0 +1,86 @@
+"""Images from files and folders, and several sources on one clock."""
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.video_input import ImageFolder, VideoFile, open_video, together
+
+
+def _video(path, frames=12, fps=10.0, size=(64, 48)):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    for i in range(frames):
+        writer.write(np.full((size[1], size[0], 3), 20 * i % 256, np.uint8))
+    writer.release()
+    return path
+
+
+class _Stub:
+    def __init__(self, times, fps):
+        self.times, self.fps, self.name, self.image_size = times, fps, "stub", (2, 2)
+
+    def sample(self, most):
+        return []
+
+    def trouble(self):
+        return None
+
+    def images(self):
+        for i, t in enumerate(self.times):
+            yield t, np.full((2, 2, 3), i, np.uint8)
+
+
+def test_a_video_gives_all_its_frames_with_their_times(tmp_path):
+    source = open_video(str(_video(tmp_path / "a.mp4")))
+    images = list(source.images())
+    assert source.image_size == (64, 48)
+    assert len(images) == 12
+    np.testing.assert_allclose([t for t, _ in images], np.arange(12) / 10)
+    # The video coder keeps flat images to a few grey levels.
+    np.testing.assert_allclose([image.mean() for _, image in images], 20 * np.arange(12) % 256, atol=4)
+    assert source.trouble() is None
+    assert len(source.sample(4)) == 4
+
+
+def test_a_video_that_is_cut_off_says_so(tmp_path):
+    source = VideoFile(_video(tmp_path / "a.mp4"))
+    source.frames = 20
+    assert len(list(source.images())) == 12
+    assert "12 of 20" in source.trouble()
+
+
+def test_a_damaged_or_missing_video_is_refused(tmp_path):
+    (tmp_path / "b.mp4").write_bytes(b"not a video")
+    with pytest.raises(InputError, match="not a video"):
+        open_video(str(tmp_path / "b.mp4"))
+    with pytest.raises(InputError, match="no such file"):
+        open_video(str(tmp_path / "c.mp4"))
+
+
+def test_a_folder_of_images_is_read_in_order_and_must_be_of_one_size(tmp_path):
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i:03d}.png"), np.full((4, 6, 3), 10 * i, np.uint8))
+    source = open_video(str(tmp_path), fps=5.0)
+    assert isinstance(source, ImageFolder)
+    assert [(t, int(image[0, 0, 0])) for t, image in source.images()] == [(0.0, 0), (0.2, 10), (0.4, 20)]
+    cv2.imwrite(str(tmp_path / "999.png"), np.zeros((5, 6, 3), np.uint8))
+    with pytest.raises(InputError, match=r"999\.png"):
+        list(open_video(str(tmp_path)).images())
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputError, match="no images"):
+        open_video(str(empty))
+
+
+def test_a_slower_source_has_nothing_new_in_between():
+    moments = list(together([_Stub(np.arange(6) / 10, 10.0), _Stub(np.arange(3) / 5, 5.0)]))
+    assert [moment.images[1] is not None for moment in moments] == [True, False] * 3
+    assert all(moment.images[0] is not None for moment in moments)
+    np.testing.assert_allclose([moment.time_s for moment in moments], np.arange(6) / 10)
+
+
+def test_a_source_that_ends_early_leaves_the_others_going():
+    moments = list(together([_Stub(np.arange(2) / 10, 10.0), _Stub(np.arange(4) / 10, 10.0)]))
+    assert [moment.images[0] is not None for moment in moments] == [True, True, False, False]
+    assert [int(moment.images[1][0, 0, 0]) for moment in moments] == [0, 1, 2, 3]

@@ -1,0 +1,1 @@
+"""The command line, and what runs every tracker: progress, results, checkpoints, charts and videos."""

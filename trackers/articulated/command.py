@@ -1,0 +1,77 @@
+"""`jaxfilters track articulated`."""
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from jaxfilters.models.articulated.hand import ArticulatedHand
+from jaxfilters.trackers.app.track_command import Job, given, refusing
+from jaxfilters.trackers.articulated import tracker as articulated_hand
+from jaxfilters.trackers.articulated.drawing import scene, write_overlay
+from jaxfilters.trackers.articulated.recording import FeatureSequence
+from jaxfilters.trackers.articulated.summary import errors_of, write_summary
+from jaxfilters.trackers.articulated.table import TimedArticulatedTrack, articulated_table
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.features import open_features
+
+
+def articulated_job(options: argparse.Namespace) -> Job:
+    """A hand in a recording of features, as the command line says.
+
+    Raises:
+        InputError: the recording or an option cannot be used.
+    """
+    config = refusing(partial(given, articulated_hand.ArticulatedConfig, options))
+    sequence = _sequence(options, config)
+    hand = refusing(partial(articulated_hand.hand_model, sequence, config))
+    return Job(
+        sequence,
+        refusing(partial(articulated_hand.build, sequence, config)),
+        config,
+        articulated_table(hand.layout),
+        partial(_errors, sequence, hand),
+        partial(_draw_summary, sequence, hand),
+        partial(_draw_overlay, sequence, hand),
+    )
+
+
+def _sequence(options: argparse.Namespace, config: articulated_hand.ArticulatedConfig) -> FeatureSequence:
+    of_input = {"--image-size": options.image_size, "--noise": options.noise, "--fps": options.fps}
+    if options.input is None:
+        if unused := [name for name, value in of_input.items() if value is not None]:
+            raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic one has its own.")
+        return articulated_hand.synthetic_sequence(config.seed)
+    return open_features(
+        options.input,
+        hand=config.hand,
+        image_size=options.image_size,
+        noise_px=options.noise,
+        fps=options.fps,
+    )
+
+
+def _errors(
+    sequence: FeatureSequence, hand: ArticulatedHand, results: TimedArticulatedTrack
+) -> dict[str, float | None]:
+    errors = errors_of(sequence, hand.layout, results)
+    return {
+        "mean_angle_error_deg": None if errors is None else round(errors.angle_deg, 3),
+        "mean_length_error_px": None if errors is None else round(errors.length_px, 3),
+        "lengths_within_2_sigma_percent": None if errors is None else round(100 * errors.within_2_sigma, 1),
+    }
+
+
+def _draw_summary(sequence: FeatureSequence, hand: ArticulatedHand, path: Path, results: TimedArticulatedTrack) -> None:
+    write_summary(path, sequence, hand.layout, scene(sequence, hand, results), results)
+
+
+def _draw_overlay(
+    sequence: FeatureSequence,
+    hand: ArticulatedHand,
+    path: Path,
+    results: TimedArticulatedTrack,
+    rate: float,
+    on_progress: Callable[[int], None],
+) -> None:
+    write_overlay(path, scene(sequence, hand, results), results, rate, on_progress)

@@ -1,0 +1,311 @@
+"""Length and pose of an articulated hand from one camera: Gaussians with limits, several hypotheses about depth.
+
+After N. Shimada, Y. Shirai, Y. Kuno, J. Miura, "Shape and Pose Estimation of An Articulated Object from A Monocular
+Image Sequence Based on Loose Constraints". The filters are those of `jaxfilters.models.articulated.filters`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxfilters._struct import pytree_dataclass
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.gaussian_sum import GaussianSumState, map_component
+from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
+from jaxfilters.models.articulated.features import KEYPOINTS
+from jaxfilters.models.articulated.filters import (
+    Inequalities,
+    Look,
+    Report,
+    belief_of,
+    hypotheses,
+    inequalities,
+    literal,
+    recommended,
+    report_of,
+    unconstrained,
+)
+from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
+from jaxfilters.models.articulated.layout import Layout, five_fingers
+from jaxfilters.models.articulated.limits import limit_rows, table_1
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
+from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
+from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
+from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
+from jaxfilters.trackers.tracker import SequenceTracker
+
+SEARCHING, TRACKING, LOST = range(3)
+LOST_NIS = 25.0
+"""Normalised innovation squared, per measured row, above which the hand counts as not there: 5 deviations each."""
+HAND_DIAGONAL = 0.19
+"""Metres: of the box around the keypoints of an average hand; what a hand's speed in the image is measured by."""
+PATIENCE = 10
+"""Frames in a row without the hand before it is searched anew, where keypoints allow it."""
+
+
+@dataclass(frozen=True)
+class ArticulatedConfig:
+    """What a user may set; Python values, read when the tracker is built."""
+
+    mode: str = "recommended"
+    """`recommended`, `literal` (the paper's filter, one hypothesis) or `unconstrained` (one hypothesis)."""
+    hypotheses: int = 6
+    """Slots of the bank in the recommended mode."""
+    hand: str = "right"
+    """Which hand keypoints are of."""
+    gate: float = 5.0
+    """Standard deviations of its innovation beyond which a feature is left out; 0 never leaves one out."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        choices = {"mode": ("recommended", "literal", "unconstrained"), "hand": ("right", "left")}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        if self.hypotheses < 1:
+            raise ValueError(f"hypotheses must be at least 1; got {self.hypotheses}.")
+        if not self.gate >= 0:
+            raise ValueError(f"gate must be standard deviations, 0 or more; got {self.gate}.")
+
+
+class ArticulatedTrack(NamedTuple):
+    """What is known of the hand in each of `b` frames, by the heaviest hypothesis."""
+
+    mean: Float[Array | np.ndarray, "b n"]
+    """States, in the order of the layout."""
+    std: Float[Array | np.ndarray, "b n"]
+    points: Float[Array | np.ndarray, "b fingers 4 3"]
+    """Joints from base to tip in the camera frame, pixels; depth is counted from the wrist's."""
+    image_points: Float[Array | np.ndarray, "b fingers 4 2"]
+    """Pixels."""
+    scale: Float[Array | np.ndarray, " b"]
+    weight: Float[Array | np.ndarray, " b"]
+    """Share of the heaviest hypothesis."""
+    num_hypotheses: Int[Array | np.ndarray, " b"]
+    is_new_view: Bool[Array | np.ndarray, " b"]
+    """Whether lengths were learnt from this frame."""
+    nis_per_row: Float[Array | np.ndarray, " b"]
+    """Normalised innovation squared over the number of rows that count; about 1 where all is well."""
+    least_distance: Float[Array | np.ndarray, " b"]
+    """Standard deviations to the nearest limit before truncation, negative outside; infinite without limits."""
+    log_evidence: Float[Array | np.ndarray, " b"]
+    status: Int[Array | np.ndarray, " b"]
+
+
+class TrackState(NamedTuple):
+    """Everything the next frame needs."""
+
+    bank: GaussianSumState
+    time: Float[Array, ""]
+    """Of the last frame, seconds."""
+    misses: Array
+    """Frames in a row in which the hand was not seen; starts above `PATIENCE`."""
+    key: Array
+
+
+@pytree_dataclass
+class _Setup:
+    """What one tracker is made of, as data."""
+
+    hand: ArticulatedHand
+    limits: Inequalities
+    start: Start | None
+    config: ArticulatedConfig = field(metadata={"static": True})
+
+
+def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> ArticulatedHand:
+    """The model of the hand that the features are of: five fingers move about their angles at ease.
+
+    Other hands move with constant velocity, as in the paper.
+
+    Raises:
+        ValueError: where neither a start is given nor keypoints of five fingers, from which one is found.
+    """
+    if sequence.features == KEYPOINTS and sequence.num_fingers == 5:
+        layout = five_fingers(side=1.0 if config.hand == "right" else -1.0)
+        diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
+        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=diagonal / HAND_DIAGONAL)
+        return articulated_hand(layout, features=KEYPOINTS, motion=motion)
+    if sequence.start is None:
+        raise ValueError(
+            f"{sequence.name}: a start (mean and covariance of the state before the first frame) is needed for "
+            f"features other than the 21 keypoints of a hand."
+        )
+    return articulated_hand(Layout(sequence.num_fingers), features=sequence.features)
+
+
+def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> SequenceTracker:
+    """A tracker of the hand in a recording of features; limits are table 1 for two fingers, anatomy for five.
+
+    Raises:
+        ValueError: the start does not fit the layout, or see `hand_model`.
+    """
+    config = config or ArticulatedConfig()
+    hand = hand_model(sequence, config)
+    n = hand.layout.size
+    if sequence.start is not None and np.shape(sequence.start.covariance) != (n, n):
+        raise ValueError(f"{sequence.name}: start must be ({n},) and ({n}, {n}); got {np.shape(sequence.start.mean)}.")
+    start = None if sequence.start is None else Start(*(jnp.asarray(part, dtype=float) for part in sequence.start))
+    return tracker_of(hand, _limits(hand.layout), start, config)
+
+
+def tracker_of(
+    hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig
+) -> SequenceTracker:
+    """A tracker of any hand; without a start, one of five fingers whose features are points finds its own."""
+    setup = _Setup(hand, limits, start, config)
+    return SequenceTracker(partial(_start, setup), partial(_advance, setup))
+
+
+def _limits(layout: Layout) -> Inequalities:
+    if layout.num_fingers not in (2, 5):
+        raise ValueError(f"limits are known for two and for five fingers; got {layout.num_fingers}.")
+    return inequalities(limit_rows(layout, table_1() if layout.num_fingers == 2 else five_finger_limits(layout)))
+
+
+def _filter(setup: _Setup, prior: Gaussian) -> Filter:
+    make: Callable[..., Filter] = {
+        "recommended": recommended,
+        "literal": literal,
+        "unconstrained": unconstrained,
+    }[setup.config.mode]
+    return make(setup.hand, prior, setup.limits, gate=setup.config.gate or math.inf)
+
+
+def _starting_bank(setup: _Setup, starts: Starts) -> GaussianSumState:
+    def state(mean: Array, covariance: Array) -> Any:
+        filter = _filter(setup, Gaussian(mean, covariance))
+        return filter.init(filter.params, jax.random.key(0))
+
+    components = jax.vmap(state)(starts.means, starts.covariances)
+    return GaussianSumState(components, jax.nn.log_softmax(-starts.costs))
+
+
+def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
+    """State before the first frame: what is given, or hypotheses from its keypoints; searching where it has too few."""
+    if setup.start is not None:
+        starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.zeros(1), jnp.ones((), bool))
+    else:
+        starts = _keypoint_starts(setup, jax.tree.map(jnp.asarray, frame))
+    slots = setup.config.hypotheses if setup.config.mode == "recommended" else 1
+    bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, 1 if setup.start is not None else NUM_STARTS))
+    misses = jnp.where(starts.found, 0, PATIENCE + 1).astype(jnp.int32)
+    return TrackState(bank, jnp.zeros((), dtype=float), misses, key)
+
+
+def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
+    filter = hypotheses(_filter(setup, _first_belief(start)), setup.hand, capacity=capacity, start=start)
+    return filter.init(filter.params, jax.random.key(0))
+
+
+def _first_belief(bank: GaussianSumState) -> Gaussian:
+    return belief_of(jax.tree.map(lambda leaf: leaf[0], bank.components))
+
+
+def _keypoint_starts(setup: _Setup, frame: FeatureFrame) -> Starts:
+    limits = None if setup.config.mode == "unconstrained" else setup.limits.constraints
+    return starts_from_points(setup.hand, limits, frame.y, frame.mask, frame.std)
+
+
+def _advance(
+    setup: _Setup, state: TrackState, frames: FeatureFrame, times: np.ndarray
+) -> tuple[TrackState, ArticulatedTrack]:
+    """Track a chunk of frames."""
+    return _scan(setup, state, jax.tree.map(jnp.asarray, frames), jnp.asarray(times, dtype=float))
+
+
+@jax.jit
+def _scan(setup: _Setup, state: TrackState, frames: FeatureFrame, times: Array) -> tuple[TrackState, ArticulatedTrack]:
+    def body(state: TrackState, inputs: tuple) -> tuple[TrackState, ArticulatedTrack]:
+        return _step(setup, _found_again(setup, state, *inputs), *inputs)
+
+    return jax.lax.scan(body, state, (frames, times))
+
+
+def _found_again(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) -> TrackState:
+    """The state with a new start where the hand has been missed for long and its keypoints are seen."""
+    if setup.start is not None:
+        return state
+    capacity = state.bank.log_weights.shape[0]
+
+    def search() -> TrackState:
+        starts = _keypoint_starts(setup, frame)
+        bank = _with_slots(setup, _starting_bank(setup, starts), capacity)
+        return _select(starts.found, TrackState(bank, time, jnp.zeros_like(state.misses), state.key), state)
+
+    return jax.lax.cond(state.misses > PATIENCE, search, lambda: state)
+
+
+def _select(condition: Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) -> tuple[TrackState, ArticulatedTrack]:
+    """One frame: predict and update every hypothesis, and judge whether the hand was there."""
+    key, predict_key, update_key = jax.random.split(state.key, 3)
+    capacity = state.bank.log_weights.shape[0]
+    filter = hypotheses(_filter(setup, _first_belief(state.bank)), setup.hand, capacity=capacity, start=None)
+    elapsed = (time - state.time) / FRAME_INTERVAL
+    predicted = filter.predict(filter.params, predict_key, state.bank, elapsed)
+    bank, info = filter.update(filter.params, update_key, predicted, Look(frame.y, frame.mask, frame.std), elapsed)
+    measured = jnp.any(frame.mask)
+    best = jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components)
+    told = report_of(best)
+    nis = told.kalman.nis / jnp.maximum(told.kalman.rank, 1)
+    # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
+    rows = jnp.sum(frame.mask)
+    seen = measured & (nis < LOST_NIS) & (2 * told.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
+    bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
+    searching = state.misses > PATIENCE
+    misses = jnp.where(seen, 0, state.misses + 1).astype(jnp.int32)
+    status = jnp.where(searching, SEARCHING, jnp.where(seen, TRACKING, LOST)).astype(jnp.int32)
+    misses = jnp.where(searching, state.misses, misses)
+    track = _report(setup, bank, told, nis, jnp.where(measured, info.log_evidence, jnp.nan), status)
+    return TrackState(bank, time, misses, key), track
+
+
+def _report(
+    setup: _Setup, bank: GaussianSumState, told: Report, nis: Array, log_evidence: Array, status: Array
+) -> ArticulatedTrack:
+    belief = belief_of(map_component(bank))
+    hand, q = setup.hand, belief.mean[setup.hand.layout.quaternion]
+    nothing = jnp.isnan(log_evidence)
+    return ArticulatedTrack(
+        mean=belief.mean,
+        std=jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance), 0.0)),
+        points=hand.points(belief.mean),
+        image_points=hand.image_points(belief.mean),
+        scale=jnp.sum(q * q),
+        weight=jnp.exp(jnp.max(bank.log_weights)),
+        num_hypotheses=jnp.sum(bank.log_weights > -jnp.inf, dtype=jnp.int32),
+        is_new_view=told.is_new_view & ~nothing,
+        nis_per_row=jnp.where(nothing, jnp.nan, nis),
+        least_distance=jnp.where(nothing, jnp.nan, told.least_distance),
+        log_evidence=log_evidence,
+        status=status,
+    )
+
+
+def synthetic_sequence(seed: int) -> FeatureSequence:
+    """The default input: the paper's sequence of the first hand, 55 frames, with truth and start."""
+    made = simulate_paper(jax.random.key(seed))
+    y = np.where(np.asarray(made.masks), np.asarray(made.features, float), np.nan)
+    hand = paper_hand()
+    return FeatureSequence(
+        num_fingers=hand.layout.num_fingers,
+        features=hand.features,
+        times_s=FRAME_INTERVAL * np.arange(len(y)),
+        y=y,
+        std=np.broadcast_to(np.asarray(made.noise_std, float), y.shape).copy(),
+        name="synthetic articulated hand",
+        start=Start(np.asarray(made.initial_mean, float), np.asarray(made.initial_covariance, float)),
+        truth=np.asarray(made.states, float),
+    )

@@ -1,0 +1,1 @@
+"""The probability that a pixel of a fixed camera shows something other than the background."""

@@ -1,0 +1,1 @@
+"""`jaxfilters calibrate`: intrinsic and extrinsic parameters of cameras."""

@@ -1,0 +1,223 @@
+"""`jaxfilters track fingertips`."""
+
+import argparse
+import dataclasses
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxfilters.models.fingertip.thumb import ThumbAngles, calibrated, usual
+from jaxfilters.models.gesture import coded
+from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.results import versions
+from jaxfilters.trackers.app.video import OverlayVideo
+from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
+from jaxfilters.trackers.fingertips.files import FingertipFiles
+from jaxfilters.trackers.fingertips.input import DemoHand, User, hands_in, know_user, open_hands, shown
+from jaxfilters.trackers.fingertips.pictures import FingertipPictures
+from jaxfilters.trackers.fingertips.session import FingertipSession
+from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.head.common.outcome import finite
+from jaxfilters.trackers.head.common.run import warn
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
+from jaxfilters.trackers.people.files import write_report
+
+_UNKNOWN_LENGTH = 1_000_000
+
+
+class Followed(NamedTuple):
+    """What came of a run."""
+
+    frames: int
+    frames_per_second: float
+    """Without the first frame, which compiles; NaN with one."""
+    names: Counter[str]
+    """Frames in which each fingertip was there."""
+    counts: list[int]
+    """Fingertips in each frame."""
+    errors: list[float]
+    """Pixels from the truth, where there is one."""
+    interrupted: bool
+    failure: InputError | None
+
+
+def track_fingertips(options: argparse.Namespace) -> str:
+    """Follow hands, leave the results in `options.out`, and say in a few lines what came of it.
+
+    Raises:
+        InputError: the source, a file or an option cannot be used. What was tracked before is written.
+        OutputError: the results cannot be written.
+        KeyboardInterrupt: before anything was tracked.
+    """
+    symbols = _symbols(options.gestures)
+    source = open_hands(options.video_source, options.mask, fps=options.fps, seed=options.seed)
+    files = FingertipFiles(options.out)
+    began = time.perf_counter()
+    try:
+        user = know_user(source, options.mask)
+        if not user.has_open_hand:
+            warn(f"{source.name}: no open hand in the first images; thumbs are told by the usual angles")
+        session = FingertipSession(
+            _angles(user),
+            handedness=user.parameters.handedness,
+            num_hands=options.hands,
+            height=float(source.image_size[1]),
+            fps=source.fps,
+            recogniser=recogniser_of(symbols),
+        )
+        followed = _follow(source, user, session, files, options)
+    finally:
+        files.close()
+    if not followed.frames:
+        if followed.interrupted:
+            raise KeyboardInterrupt("nothing was kept")
+        raise followed.failure or InputError(f"{source.name}: no image.")
+    report = _report(source, user, session, followed, options, time.perf_counter() - began)
+    write_report(options.out / "report.json", report)
+    for trouble in report["trouble"]:
+        warn(trouble)
+    if followed.failure is not None:
+        kept = f"the first {followed.frames} frames are in {files.tips}"
+        raise InputError(f"{str(followed.failure).removesuffix('.')}; {kept}.")
+    return _told(report, options)
+
+
+def recogniser_of(file: SymbolsFile) -> Recogniser:
+    """What names strokes by the models of a file: of paths, or of direction codes."""
+
+    def recognise(stroke: Stroke) -> Recognised:
+        if file.dimensions:
+            found = coded.recognise_path(file.symbols, stroke.points, stroke.counts)
+        else:
+            found = coded.recognise(file.symbols, stroke.codes, stroke.counts, margin=0.0)
+        label = int(found.label)
+        return Recognised(file.symbols.names[label] if label >= 0 else None, float(np.max(found.confidence)))
+
+    return recognise
+
+
+def _symbols(path: str) -> SymbolsFile:
+    file = default_symbols() if path == "default" else read_symbols(path)
+    if file.dimensions == 3:
+        raise InputError(f"--gestures: {path} is of strokes in space; fingertips are seen in a plane.")
+    return file
+
+
+def _angles(user: User) -> ThumbAngles:
+    if not user.has_open_hand:
+        return usual()
+    return calibrated(np.array([user.parameters.phi_thumb]), np.array([user.parameters.phi_index]))
+
+
+def _follow(
+    source: Any, user: User, session: FingertipSession, files: FingertipFiles, options: argparse.Namespace
+) -> Followed:
+    pictures, video = FingertipPictures(), None
+    names, counts, errors, ends = Counter[str](), list[int](), list[float](), list[float]()
+    interrupted, failure, told = False, None, 0
+    total = getattr(source, "frames", 0) or _UNKNOWN_LENGTH
+    try:
+        with ProgressLine("tracking", total) as line:
+            for time_s, image in _images(source, options.seconds):
+                found = session.process(hands_in(image, user, options.hands), np.array([time_s]))
+                report = HandReport(*(field[0] for field in found))
+                events, told = session.events[told:], len(session.events)
+                files.append(len(counts), time_s, report, events)
+                if options.video:
+                    picture = pictures.drawn(shown(image), len(counts), time_s, report, events)
+                    video = video or OverlayVideo(options.out / "overlay.mp4", source.fps, picture.shape)
+                    video.write(picture)
+                names.update(f"{hand}-{report.identity[hand, slot]}" for hand, slot in np.argwhere(report.is_tip))
+                counts.append(int(report.num_tips.sum()))
+                errors += _errors(source, report)
+                ends.append(time.perf_counter())
+                line.show(min(len(counts), total), f"{counts[-1]} fingertips")
+    except InputError as error:
+        failure = error
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        if video is not None:
+            video.close()
+    if video is not None:
+        video.check()
+    session.finish()
+    if session.events[told:]:
+        files.append(len(counts), 0.0, _NOTHING, session.events[told:])
+    rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else math.nan
+    return Followed(len(counts), rate, names, counts, errors, interrupted, failure)
+
+
+_NOTHING: Any = HandReport(*[np.zeros((0, 0), bool)] * len(HandReport._fields))  # type: ignore[arg-type]
+
+
+def _images(source: Any, seconds: float | None) -> Iterator[tuple[float, np.ndarray]]:
+    first = None
+    for time_s, image in source.images():
+        first = time_s if first is None else first
+        if image is not None:
+            yield time_s - first, image
+        if seconds and time_s - first >= seconds:
+            return
+
+
+def _errors(source: Any, report: HandReport) -> list[float]:
+    """Pixels of every fingertip from the nearest true one of a synthetic hand."""
+    if not isinstance(source, DemoHand):
+        return []
+    truth = source.truth[-1]
+    if not truth.extended.any():
+        return []
+    places = report.position[report.is_tip]
+    return np.linalg.norm(places[:, None] - truth.tips[truth.extended], axis=-1).min(axis=1).tolist()
+
+
+def _report(
+    source: Any,
+    user: User,
+    session: FingertipSession,
+    followed: Followed,
+    options: argparse.Namespace,
+    seconds: float,
+) -> dict[str, Any]:
+    truth = [int(frame.extended.sum()) for frame in getattr(source, "truth", [])][: followed.frames]
+    right = np.equal(truth, followed.counts).mean() if truth else math.nan
+    return {
+        "input": source.name,
+        "frames": followed.frames,
+        "frames_per_second": finite(followed.frames_per_second),
+        "seconds": round(seconds, 2),
+        "fingertips": len(followed.names),
+        "frames_by_fingertip": dict(followed.names),
+        "frames_by_count": {str(count): n for count, n in sorted(Counter(followed.counts).items())},
+        "events": dict(Counter(f"{event.name} {event.phase}" for event in session.events)),
+        "mean_error_px": finite(float(np.mean(followed.errors))) if followed.errors else None,
+        "share_of_right_counts": finite(float(right)),
+        "interrupted": followed.interrupted,
+        "trouble": [trouble] if (trouble := source.trouble()) else [],
+        "open_hand": user.has_open_hand,
+        "hand": dataclasses.asdict(user.parameters),
+        "mask": options.mask,
+        "gestures": str(options.gestures),
+        "config": dataclasses.asdict(session.config) | {"posture": session.config.posture._asdict()},
+        "versions": versions(),
+    }
+
+
+def _told(report: dict[str, Any], options: argparse.Namespace) -> str:
+    speed, error = report["frames_per_second"], report["mean_error_px"]
+    symbols = report["events"].get("symbol end", 0)
+    lines = [
+        f"{report['frames']} frames in {report['seconds']:.1f} s"
+        + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
+        + f", {report['fingertips']} fingertips, {symbols} {'symbol' if symbols == 1 else 'symbols'}"
+        + (f", mean error {error:.2f} px" if error is not None else "")
+        + (", interrupted" if report["interrupted"] else ""),
+        f"results in {options.out}: tips.csv, events.jsonl, report.json" + (", overlay.mp4" if options.video else ""),
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,82 @@
+"""Pictures of fingertips: names, ways, palms, and what the hands do."""
+
+from collections import deque
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxfilters.trackers.app.video import caption
+from jaxfilters.trackers.fingertips.events import SYMBOL, Event
+from jaxfilters.trackers.fingertips.files import name_of
+from jaxfilters.trackers.fingertips.state import MODE_NAMES, HandReport
+from jaxfilters.trackers.people.drawing import color_of
+
+WAY_FRAMES = 25
+EVENT_FRAMES = 45
+"""For which an event is shown."""
+_PALM, _THUMB = (230, 230, 230), (60, 60, 255)
+
+
+class FingertipPictures:
+    """Frames with what was found in them; ways and events stay for a while."""
+
+    def __init__(self) -> None:
+        self._ways: dict[str, deque[tuple[int, int]]] = {}
+        self._events: deque[tuple[int, str]] = deque(maxlen=4)
+
+    def drawn(
+        self, image: np.ndarray, frame: int, time_s: float, report: HandReport, events: list[Event]
+    ) -> np.ndarray:
+        """A copy of an image (rows, cols, 3) with the fingertips of all hands; of even size, for video coders."""
+        picture = image[: len(image) // 2 * 2, : image.shape[1] // 2 * 2].copy()
+        now = set()
+        for hand in range(len(report.num_tips)):
+            if report.has_palm[hand]:
+                _draw_palm(picture, report, hand)
+            for slot in np.flatnonzero(report.is_tip[hand]):
+                now.add(self._draw_tip(picture, report, hand, int(slot)))
+        self._ways = {name: way for name, way in self._ways.items() if name in now}
+        modes = ", ".join(MODE_NAMES[int(mode)] for mode in report.mode)
+        caption(picture, f"{time_s:.1f} s  {modes}", 0)
+        self._events.extend((frame, in_words(event)) for event in events)
+        for line, (_, text) in enumerate([told for told in self._events if frame - told[0] < EVENT_FRAMES], 1):
+            caption(picture, text, line)
+        return picture
+
+    def _draw_tip(self, picture: np.ndarray, report: HandReport, hand: int, slot: int) -> str:
+        identity = int(report.identity[hand, slot])
+        name, color = name_of(hand, identity), color_of(5 * hand + identity)
+        place = _pixel(report.position[hand, slot])
+        way = self._ways.setdefault(name, deque(maxlen=WAY_FRAMES))
+        way.append(place)
+        cv2.polylines(picture, [np.asarray(way, np.int32)], False, color, 1, cv2.LINE_AA)
+        thickness = 2 if report.is_observed[hand, slot] else 1
+        cv2.circle(picture, place, 9, color, thickness, cv2.LINE_AA)
+        if report.is_thumb[hand, slot]:
+            cv2.circle(picture, place, 13, _THUMB, 2, cv2.LINE_AA)
+        at = (place[0] + 12, place[1] - 8)
+        cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
+        return name
+
+
+def in_words(event: Event) -> str:
+    """An event for people."""
+    numbers = {name: value for name, value in event.quantities.items() if isinstance(value, float)}
+    if event.name == SYMBOL:
+        return f"symbol: {event.quantities['label'] or 'unknown'}"
+    told = ", ".join(f"{name.rsplit('_', 1)[0]} {value:.4g}" for name, value in numbers.items())
+    return f"{event.name} {event.phase}s" + (f": {told}" if told else "")
+
+
+def _draw_palm(picture: np.ndarray, report: HandReport, hand: int) -> None:
+    palm = report.palm[hand]
+    cv2.circle(picture, _pixel(palm), 4, _PALM, -1, cv2.LINE_AA)
+    if report.has_axis[hand]:
+        cv2.line(picture, _pixel(palm), _pixel(palm + 40 * report.axis[hand]), _PALM, 1, cv2.LINE_AA)
+
+
+def _pixel(point: Any) -> tuple[int, int]:
+    x, y = np.clip(np.rint(point), -10_000, 10_000).astype(int)
+    return int(x), int(y)

@@ -1,0 +1,1 @@
+"""`jaxfilters fit`: models and noise parameters estimated from recordings."""

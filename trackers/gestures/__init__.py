@@ -1,0 +1,1 @@
+"""Gestures drawn as strokes: models fitted to examples, and strokes recognised."""

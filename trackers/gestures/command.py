@@ -1,0 +1,177 @@
+"""`jaxfilters fit gestures` and `jaxfilters recognise`: symbols learnt from strokes, and strokes told apart."""
+
+import argparse
+import csv
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxfilters.models.gesture.coded import codes_of, recognise_each
+from jaxfilters.models.gesture.learning import LeftOut, accuracy, learn_strokes, leave_one_out
+from jaxfilters.models.gesture.stroke import Drawn, to_judge
+from jaxfilters.models.gesture.symbols import Recognition, extended, recognise_all
+from jaxfilters.models.synthetic.strokes import drawn, tracked
+from jaxfilters.trackers.app.track_command import refusing
+from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
+from jaxfilters.trackers.head.common.run import warn
+from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
+from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
+
+COLUMNS = ("stroke", "symbol", "confidence", "lead_nats", "label")
+"""Of a table: the symbol is empty where a stroke is rejected; the label is what the data call it."""
+_MOST_ROWS, _MOST_WARNINGS = 40, 5
+_SHOWN_TRIALS = 2
+
+
+def fit_gestures(options: argparse.Namespace) -> str:
+    """Learn symbols, write `options.out`, and say in a few lines what they are.
+
+    Training is in double precision, so that the same examples give the same model on every machine.
+
+    Raises:
+        InputError: the strokes cannot be used, or do not go with the model that they are added to.
+        OutputError: the model cannot be written.
+    """
+    with jax.enable_x64(True):
+        examples, source = _examples(options)
+        # The generator draws every shape in one way.
+        ways = 1 if options.ways is None and not options.data else options.ways
+        if "" in examples.labels:
+            raise InputError(f"{source}: stroke {examples.ids[examples.labels.index('')]} has no label.")
+        before = read_symbols(options.add) if options.add else None
+        if before and before.dimensions != examples.dimensions:
+            raise InputError(
+                f"--add: {options.add} is of strokes in {before.dimensions} dimensions, DATA in {examples.dimensions}."
+            )
+        states = before.symbols.models.log_initial.shape[-1] if before else options.states
+        floor = before.min_variance if before else None
+        learnt = refusing(
+            lambda: learn_strokes(
+                examples.strokes,
+                examples.labels,
+                num_states=states,
+                num_variants=ways,
+                min_variance=floor,
+            )
+        )
+        parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
+        symbols = refusing(lambda: extended(before.symbols, learnt)) if before else learnt
+        source = f"{before.source}; {source}" if before else source
+        write_symbols(options.out, SymbolsFile(symbols, source, parameters))
+        num_models, num_states = symbols.models.log_initial.shape
+        told = [
+            f"{source}: {len(examples.strokes)} strokes of {len(learnt.names)} symbols",
+            f"{len(symbols.names)} symbols, {num_models} models of {num_states} states",
+        ]
+        if options.held_out:
+            told += _held_out(examples, options.states, ways)
+    return "\n".join([*told, f"model in {options.out}"])
+
+
+def recognise(options: argparse.Namespace) -> str:
+    """Say which symbols strokes are; with `options.out` also write that there, a row for each stroke.
+
+    Raises:
+        InputError: the model or the strokes cannot be used.
+        OutputError: the table cannot be written.
+    """
+    path = DEFAULT_FILE if str(options.model) == "default" else options.model
+    file = read_symbols(path)
+    if options.data is None and file.dimensions == 3:
+        raise InputError(f"{path} is of strokes in space: DATA must hold some.")
+    strokes = _read(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
+    found = refusing(lambda: _judged(file, strokes, options.margin))
+    rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
+    if options.out:
+        _write(options.out, rows)
+    widths = [max(len(row[k]) for row in [COLUMNS, *rows[:_MOST_ROWS]]) for k in range(len(COLUMNS))]
+    lines = [
+        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip()
+        for row in [COLUMNS, *rows[:_MOST_ROWS]]
+    ]
+    if len(rows) > _MOST_ROWS:
+        lines.append(f"... and {len(rows) - _MOST_ROWS} more")
+    return "\n".join([*lines, _summary(rows), *([f"table in {options.out}"] if options.out else [])])
+
+
+def _read(path: Path) -> StrokeSet:
+    strokes = read_strokes(path)
+    for text in strokes.warnings[:_MOST_WARNINGS]:
+        warn(text)
+    if len(strokes.warnings) > _MOST_WARNINGS:
+        warn(f"{path}: {len(strokes.warnings) - _MOST_WARNINGS} more such segments")
+    return strokes
+
+
+def _examples(options: argparse.Namespace) -> tuple[StrokeSet, str]:
+    if options.data:
+        return _read(options.data), options.data.name
+    return _drawn(WRITERS, TRIALS, options.seed), "symbols drawn by the generator"
+
+
+def _drawn(num_writers: int, num_trials: int, seed: int) -> StrokeSet:
+    """Twelve shapes with one finger and with two, by writers of consecutive seeds."""
+    strokes: list[Drawn] = []
+    labels: list[str] = []
+    people: list[str] = []
+    for writer in range(seed, seed + num_writers):
+        found = tracked(drawn(writer % 2**63, num_trials))
+        strokes += [([points], int(label[-1])) for (points, _), label in zip(found.paths, found.labels, strict=True)]
+        labels += found.labels
+        people += [f"writer {writer}"] * len(found.labels)
+    ids = tuple(str(i) for i in range(len(strokes)))
+    return StrokeSet(tuple(strokes), ids, tuple(labels), tuple(people), 2)
+
+
+def _judged(file: SymbolsFile, strokes: StrokeSet, margin: float) -> Recognition:
+    if file.dimensions:
+        return recognise_all(file.symbols, to_judge(strokes.strokes, file.dimensions), margin=margin)
+    if strokes.dimensions != 2:
+        raise ValueError("models of direction codes know strokes in a plane; these are in space.")
+    paths = [np.concatenate([np.zeros((0, 2)), *pieces]) for pieces, _ in strokes.strokes]
+    counts = [np.full(len(path), fingers) for path, (_, fingers) in zip(paths, strokes.strokes, strict=True)]
+    usable = [path if np.isfinite(path).all() else path[:0] for path in paths]
+    codes = [(own, count[: len(own)]) for own, count in zip(codes_of(usable), counts, strict=True)]
+    return recognise_each(file.symbols, codes, margin=margin)
+
+
+def _row(names: tuple[str, ...], strokes: StrokeSet, found: Recognition, i: int) -> tuple[str, ...]:
+    label = int(found.label[i])
+    confidence, lead = float(found.confidence[:, i].max()), float(found.lead[i])
+    told = (names[label], f"{confidence:.3f}") if label >= 0 else ("", "")
+    return strokes.ids[i], *told, f"{lead:.3f}" if np.isfinite(lead) else "", strokes.labels[i]
+
+
+def _summary(rows: list[tuple[str, ...]]) -> str:
+    rejected = sum(not row[1] for row in rows)
+    told = f"{len(rows)} strokes, {rejected} rejected"
+    labelled = [row for row in rows if row[4]]
+    if not labelled:
+        return told
+    right = sum(row[1] == row[4] for row in labelled)
+    return f"{told}; of {len(labelled)} with a label {right} are right, {100 * right / len(labelled):.1f} %"
+
+
+def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as content:
+            csv.writer(content).writerows([COLUMNS, *rows])
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}.") from None
+
+
+def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[str]:
+    found: list[LeftOut] = refusing(
+        lambda: leave_one_out(
+            examples.strokes,
+            examples.labels,
+            examples.people,
+            num_states=states,
+            num_variants=ways,
+        )
+    )
+    lines = [f"  {one.person}: {100 * one.right / one.total:.1f} % of {one.total}" for one in found]
+    return [f"people left out in turn: {accuracy(found):.2f} % right", *lines]

@@ -1,0 +1,56 @@
+"""`jaxfilters track hand-depth` and `jaxfilters demo`."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jaxfilters.trackers.app.track_command import Job, given, refusing
+from jaxfilters.trackers.hand_depth import tracker as hand_depth
+from jaxfilters.trackers.hand_depth.drawing import write_overlay
+from jaxfilters.trackers.hand_depth.recording import DepthSequence
+from jaxfilters.trackers.hand_depth.summary import mean_joint_error, write_summary
+from jaxfilters.trackers.hand_depth.table import HAND_TABLE, TimedHandTrack
+from jaxfilters.trackers.io.depth import open_depth
+
+
+def hand_job(options: argparse.Namespace) -> Job:
+    """A hand in a depth recording, as the command line says.
+
+    Raises:
+        InputError: the recording or an option cannot be used.
+    """
+    config = refusing(partial(given, hand_depth.HandDepthConfig, options))
+    sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
+    return Job(
+        sequence,
+        refusing(partial(hand_depth.build, sequence.camera, config)),
+        config,
+        HAND_TABLE,
+        partial(_errors, sequence),
+        partial(_draw_summary, sequence),
+        partial(_draw_overlay, sequence),
+    )
+
+
+def _synthetic(seed: int) -> DepthSequence:
+    sequence, joints = hand_depth.synthetic_sequence(seed)
+    return dataclasses.replace(sequence, joints=np.asarray(joints))
+
+
+def _errors(sequence: DepthSequence, results: TimedHandTrack) -> dict[str, float | None]:
+    error = mean_joint_error(sequence, results)
+    return {"mean_joint_error_mm": None if error is None else round(1000 * error, 2)}
+
+
+def _draw_summary(sequence: DepthSequence, path: Path, results: TimedHandTrack) -> None:
+    write_summary(path, sequence, results)
+
+
+def _draw_overlay(
+    sequence: DepthSequence, path: Path, results: TimedHandTrack, rate: float, on_progress: Callable[[int], None]
+) -> None:
+    write_overlay(path, sequence, results, rate, on_progress)

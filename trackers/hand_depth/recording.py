@@ -1,0 +1,64 @@
+"""A depth recording: camera, times and frames."""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.recording import check_times
+
+
+@dataclass(frozen=True)
+class DepthSequence:
+    """A depth recording: camera, times, and frames that are read when asked for.
+
+    `sequence[i]` is a float32 image (rows, cols) in metres, depth along z, NaN where the sensor has no reading.
+    """
+
+    camera: Pinhole
+    times_s: np.ndarray
+    """(frames,) float64 seconds, strictly increasing."""
+    read: Callable[[int], np.ndarray]
+    """`index -> (rows, cols)` float32 metres; raises `InputError` that names the file when it cannot be read."""
+    name: str
+    """For messages and reports."""
+    joints: np.ndarray | None = None
+    """True joints (frames, 21, 3) in metres, where they are known."""
+
+    def __post_init__(self) -> None:
+        check_times(self.times_s, self.name)
+        if self.joints is not None and self.joints.shape != (len(self), 21, 3):
+            raise InputError(f"{self.name}: joints must be ({len(self)}, 21, 3); got {self.joints.shape}.")
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name}: frame {index} of {len(self)}.")
+        return self.read(index)
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self[i] for i in range(len(self)))
+
+    def fingerprint(self) -> str:
+        """A hash of camera, times and the first frame: equal for the same recording wherever it lies."""
+        digest = hashlib.sha256()
+        for part in (np.asarray(self.camera.matrix(), np.float64), self.times_s, self[0]):
+            digest.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
+        return digest.hexdigest()[:16]
+
+
+def from_array(camera: Pinhole, times_s: np.ndarray, depth: np.ndarray, name: str = "array") -> DepthSequence:
+    """A recording in memory; `depth` is (frames, rows, cols) in metres, NaN, 0 or inf where nothing was read."""
+    if depth.shape != (len(times_s), *camera.shape):
+        raise InputError(f"{name}: depth must be {(len(times_s), *camera.shape)}; got {depth.shape}.")
+
+    def read(index: int) -> np.ndarray:
+        frame = depth[index].astype(np.float32)
+        return np.where(np.isfinite(frame) & (frame > 0), frame, np.float32(np.nan))
+
+    return DepthSequence(camera, np.asarray(times_s, np.float64), read, name)

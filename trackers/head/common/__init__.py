@@ -1,0 +1,1 @@
+"""What the head trackers of one and of two cameras share."""

@@ -1,0 +1,97 @@
+"""Pictures of a tracked head: its axes and landmarks over the images of all cameras."""
+
+from itertools import pairwise
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
+from jaxfilters.models.face.pose import place
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.app.video import caption, side_by_side
+from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, in_degrees
+
+HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (190, 190, 190))
+"""Blue, green, red, in the order of `STATUS_WORDS`."""
+AXIS_COLORS = ((84, 92, 255), (110, 220, 90), (255, 150, 70))
+"""Of the axes to the image's right, downwards, and out of the face."""
+OUTLINES = (EYES[:2], EYES[2:], MOUTH, (BROWS[0], *NOSTRILS, BROWS[1]))
+"""Landmarks that lines join."""
+_AXES_MM = np.array([[0.0, 0, 0], [50, 0, 0], [0, 50, 0], [0, 0, -80]], np.float32)
+_LANDMARK, _LINE = (255, 255, 255), (220, 220, 120)
+_SUBPIXEL = 4
+"""Fractional bits of the coordinates that OpenCV draws with."""
+
+
+def draw_frame(images: list[np.ndarray | None], rig: CameraRig, track: HeadRows, i: int) -> np.ndarray:
+    """(rows, cols, 3) uint8: the images of all cameras side by side with row `i` of the track.
+
+    `images` are straightened, (rows, cols, 3) uint8, or None where there is none; they are not changed.
+    """
+    axes = _axes(rig, track.pose[i]) if int(track.status[i]) in TRACKED else None
+    pictures = []
+    for camera, image in enumerate(images):
+        picture = np.full((*rig.shape, 3), 40, np.uint8) if image is None else image.copy()
+        if image is None:
+            caption(picture, "no image of this moment", 3, HEAD_STATUS_COLORS[-1])
+        if axes is not None:
+            _draw_face(picture, track.image_points[i, camera])
+            _draw_axes(picture, axes[camera])
+        pictures.append(picture)
+    whole = side_by_side(pictures, float(track.times_s[i]))
+    _write_state(whole, track, i)
+    return whole
+
+
+def draw_points(image: np.ndarray, points: np.ndarray, color: tuple, line: tuple, size: float) -> None:
+    """Landmarks (10, 2) in pixels of the picture, joined to eyes, mouth, and the outline of the nose."""
+    for outline in OUTLINES:
+        for a, b in pairwise(outline):
+            if can_be_drawn(points[[a, b]]):
+                cv2.line(image, _fixed(points[a]), _fixed(points[b]), line, 1, cv2.LINE_AA, _SUBPIXEL)
+    for point in points:
+        if can_be_drawn(point):
+            cv2.circle(image, _fixed(point), round(size * 2**_SUBPIXEL), color, -1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def can_be_drawn(points: np.ndarray) -> bool:
+    """Whether points are somewhere near the picture."""
+    return bool(np.isfinite(points).all()) and float(np.abs(points).max()) < 1e4
+
+
+def _axes(rig: CameraRig, pose: np.ndarray) -> np.ndarray:
+    """(C, 4, 2) pixels of the head's origin and of the ends of its axes."""
+    return np.asarray(_placed_axes(rig, jnp.asarray(pose)))
+
+
+@jax.jit
+def _placed_axes(rig: CameraRig, pose: jax.Array) -> jax.Array:
+    return rig.project(place(jnp.asarray(_AXES_MM), pose))[0]
+
+
+def _draw_face(picture: np.ndarray, points: np.ndarray) -> None:
+    draw_points(picture, points, (0, 0, 0), (0, 0, 0), 3.4)
+    draw_points(picture, points, _LANDMARK, _LINE, 2.2)
+
+
+def _draw_axes(picture: np.ndarray, ends: np.ndarray) -> None:
+    for end, color in zip(ends[1:], AXIS_COLORS, strict=True):
+        if can_be_drawn(np.stack([ends[0], end])):
+            cv2.line(picture, _fixed(ends[0]), _fixed(end), (0, 0, 0), 5, cv2.LINE_AA, _SUBPIXEL)
+            cv2.line(picture, _fixed(ends[0]), _fixed(end), color, 3, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
+    status, score = int(track.status[i]), float(track.score[i])
+    scored = f"   score {score:.2f}" if np.isfinite(score) else ""
+    caption(picture, f"{STATUS_WORDS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])
+    if status in TRACKED:
+        x, y, z, roll, pitch, yaw = in_degrees(track.pose[i])
+        caption(picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm", 2)
+        caption(picture, f"roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 3)
+
+
+def _fixed(point: np.ndarray) -> tuple[int, int]:
+    return round(float(point[0]) * 2**_SUBPIXEL), round(float(point[1]) * 2**_SUBPIXEL)

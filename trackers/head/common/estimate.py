@@ -1,0 +1,187 @@
+"""From particles to an estimate: the mean around their mode, or the best fit near it.
+
+The fit is made for a face at rest (the registered shape, held tightly) and for one that may deform (the learnt model,
+each landmark as loose as it has proved to be, or as expressions of several strengths make it). Their evidences say how
+far each is to be believed; a face that rests keeps the accuracy of a rigid one.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.models.face.alignment import Alignment, align
+from jaxfilters.models.face.patches import Slopes, learn_slopes
+from jaxfilters.models.face.pose import rotation, turning_axes
+from jaxfilters.models.face.refinement import Refined, displaced, refine
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
+from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.trackers.head.common import recent
+from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
+from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, HeadState, Recent
+
+FEWEST_SEEN = 4
+"""Landmarks without which there is no fit."""
+RESTING_STD = 0.012
+"""Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
+MEMORY = 0.95
+"""Of the running variances, a frame."""
+LOOSENESS = (0.02**2, 10.0**2)
+MISFIT = (0.05, 20.0)
+STRENGTHS = (0.0, 1.0, 3.0)
+"""Of expressions that no mode describes, in those of `EXPRESSION_STD`."""
+ALIKE, ALIKE_ANEW = 4.0, 2.0
+"""The landmarks of a face move together in an expression: ten of them say no more than some three would; and as much
+again that the next frame, with another expression, is not told."""
+ORDINARY_EXPRESSION = float(np.linalg.norm(EXPRESSION_STD))
+"""Millimetres, root of the sum over all landmarks."""
+MEASURED_STD = 10.0
+"""Millimetres about the model within which a landmark's place is measured."""
+
+
+class Estimate(NamedTuple):
+    """What one frame says."""
+
+    belief: Gaussian
+    """Of pose and mode coefficients."""
+    doubt: Float[Array, "6 6"]
+    """Covariance of the pose beside that of the belief, which the next frame does not start from."""
+    shape: Float[Array, "K 3"]
+    """Landmarks in the model frame, millimetres."""
+    measured: Float[Array, "K 3"]
+    """The same as the images alone have it."""
+    is_found: Bool[Array, ""]
+    num_anchored: Float[Array, ""]
+    """Landmarks that look as registered, and are where the model has them."""
+    recent: Recent
+    slopes: Slopes
+    looseness: Float[Array, " K"]
+    misfit: Float[Array, ""]
+
+
+def around_mode(search: AdaptiveDiffusionState, state: HeadState, model: FaceModel) -> Estimate:
+    """The paper's estimate ([P18], [P19]), which the search has made, with the spread of the particles."""
+    belief = spread(search)
+    x = belief.mean
+    M = shape(model, x[POSE:])
+    found = jnp.ones((), bool)
+    all_of_them = jnp.full((), float(len(M)), x.dtype)
+    doubt = jnp.zeros((POSE, POSE), x.dtype)
+    return Estimate(belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.looseness, state.misfit)
+
+
+def refined(
+    search: AdaptiveDiffusionState,
+    state: HeadState,
+    model: FaceModel,
+    images: Float[Array, "C rows cols"],
+    rig: CameraRig,
+    moved: Float[Array, " 6"],
+) -> Estimate:
+    """The best fit near the particles' mode.
+
+    Args:
+        search: After this frame's update.
+        state: Before this frame.
+        model: Rigid, or with the modes that may be used.
+        images: Grey levels.
+        rig: Cameras.
+        moved: What the head was predicted to move since the last estimate, millimetres and radians.
+    """
+    prior = predicted(search, state.belief, model, moved)
+    x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
+    found, _, _ = looked_for(align, state, model, images, rig, x)
+    x = refine(prior, found, state.slopes, model, _looseness(state, 1.0), rig, x).belief.mean
+    found, anchored, is_followed = looked_for(anywhere, state, model, images, rig, x)
+
+    fit = lambda strength: refine(prior, found, state.slopes, model, _looseness(state, strength), rig, x, ~is_followed)
+    # One by one: batches of factorisations can stand still on two cores.
+    fits = jax.lax.map(fit, jnp.asarray(STRENGTHS, x.dtype))
+    rest, rest_belief = _at_rest(prior, found, state, model, rig, x, ~is_followed)
+    resting, among = _shares(rest, fits)
+    average = lambda values: jnp.tensordot(among, values, 1)
+    is_unknown = jnp.asarray(STRENGTHS) > 0
+    doubt = ALIKE_ANEW * (1 - resting) * jnp.tensordot(among * is_unknown, fits.belief.covariance, 1)[:POSE, :POSE]
+    alike = jnp.where(is_unknown, ALIKE, 1.0)[:, None, None]
+    free = _mixed(among, Gaussian(fits.belief.mean, alike * fits.belief.covariance))
+    M = resting * state.registered.shape + (1 - resting) * shape(model, free.mean[POSE:])
+    beliefs = jax.tree.map(lambda a, b: jnp.stack([a, b]), rest_belief, free)
+    belief = _mixed(jnp.stack([resting, 1 - resting]), beliefs)
+    belief = _with_gauge(belief, M - state.registered.shape, state, model)
+    wide = MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1))
+    measured = displaced(free.mean, found, state.slopes, model, wide, rig)
+    sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
+    is_found = sound & (rest.num_seen >= FEWEST_SEEN)
+    lacking = lambda fit: fit.misfit_share * (fit.misfit - 1)
+    misfit = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
+    drift = recent.drifted(state.recent, is_followed)
+    seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
+    return Estimate(
+        belief,
+        doubt,
+        M,
+        measured,
+        is_found,
+        jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
+        seen,
+        learn_slopes(state.slopes, found.slope_information, found.slope_score),
+        jnp.clip(MEMORY * state.looseness + (1 - MEMORY) * average(fits.excess), *LOOSENESS),
+        jnp.clip(state.misfit * (1 + (1 - MEMORY) * misfit), *MISFIT),
+    )
+
+
+def _shares(rest: Refined, fits: Refined) -> tuple[Array, Array]:
+    """How far the face is believed to be at rest; and otherwise, to be as each of the other fits has it."""
+    known = lambda evidence: jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf)
+    among = jax.nn.softmax(known(fits.log_evidence))
+    among = jnp.where(jnp.all(jnp.isfinite(among)), among, jnp.zeros_like(among).at[0].set(1.0))
+    resting = jax.nn.sigmoid(rest.log_evidence - jax.nn.logsumexp(known(fits.log_evidence)))
+    return jnp.where(jnp.isfinite(resting), resting, 0.0), among
+
+
+def _looseness(state: HeadState, strength: Array | float) -> Array:
+    """Covariance of each landmark about the model of a face whose expression is so strong, mm^2."""
+    expression = jnp.asarray(EXPRESSION_STD**2, state.looseness.dtype)
+    learnt = jnp.minimum(state.looseness[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
+    return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learnt, strength**2 * expression))
+
+
+def _at_rest(
+    prior: Gaussian, found: Alignment, state: HeadState, model: FaceModel, rig: CameraRig, x: Array, is_own: Array
+) -> tuple[Refined, Gaussian]:
+    """The fit of the registered face, and its belief with the mode coefficients of that face."""
+    face = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
+    tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
+    covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
+    covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
+    prior = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
+    rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0), is_own)
+    a = model.basis.T @ (state.registered.shape - model.mean).ravel()
+    return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
+
+
+def _with_gauge(belief: Gaussian, deformation: Array, state: HeadState, model: FaceModel) -> Gaussian:
+    """The belief, with what cannot be known of the skull.
+
+    Registration may have it all too near or too far, and beside a deformation of this size its motion is hidden.
+    """
+    share = jnp.minimum(1.0, jnp.sum(deformation**2) / ORDINARY_EXPRESSION**2)
+    R = rotation(belief.mean[3:POSE])
+    to_angles = jnp.linalg.solve(turning_axes(belief.mean[3:POSE]).T, R)
+    turn = jnp.zeros((POSE, POSE), R.dtype).at[:3, :3].set(R).at[3:, 3:].set(to_angles)
+    extra = share * turn @ motion_covariance(model.mean) @ turn.T
+    extra = extra.at[:3, :3].add(R @ state.registered.alike @ R.T)
+    return Gaussian(belief.mean, belief.covariance.at[:POSE, :POSE].add(extra))
+
+
+def _mixed(shares: Array, each: Gaussian) -> Gaussian:
+    """One Gaussian with the moments of several."""
+    mean = shares @ each.mean
+    off = each.mean - mean
+    spread = each.covariance + off[:, :, None] * off[:, None]
+    return Gaussian(mean, jnp.tensordot(shares, spread, 1))

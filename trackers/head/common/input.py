@@ -1,0 +1,174 @@
+"""What the head trackers watch: two cameras of a rig, one camera, or a synthetic face."""
+
+import argparse
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import numpy as np
+
+from jaxfilters.models.calibration import Calibration
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.rig import CameraRig, monocular
+from jaxfilters.models.synthetic.face_motion import FPS, MONOCULAR_PLACE_MM, motion, speech_schedule
+from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence, sequence
+from jaxfilters.trackers.head.common.report import HeadTruth
+from jaxfilters.trackers.io.cameras import open_intrinsics
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.landmarks import read_landmarks
+from jaxfilters.trackers.io.rigs import open_rig
+from jaxfilters.trackers.io.undistortion import Undistortion
+from jaxfilters.trackers.io.video_input import VideoSource, open_video
+
+FOCAL_WIDTHS = 1.2
+"""Assumed focal length of a single camera, image widths: a horizontal field of view of 45 degrees."""
+_SYNTHETIC_FRAMES, _MOTION = 600, "mix"
+_SYNTHETIC_FOCAL = 800.0
+"""Pixels, of the one camera before a synthetic face."""
+
+
+class Place(NamedTuple):
+    """What is watched, and by what."""
+
+    rig: CameraRig
+    undistortions: list[Undistortion]
+    sources: list[VideoSource]
+    points: np.ndarray | None
+    """(10, 2) landmarks, or (68, 2), in the first image of the first camera, without lens distortion; None where to be
+    detected."""
+    truth: HeadTruth | None
+    """Of the synthetic face."""
+    note: str | None
+    """What was assumed, for a person."""
+
+
+def place_of(options: argparse.Namespace) -> Place:
+    """The cameras and sources that the command line of `track head-stereo` names.
+
+    Raises:
+        InputError: a source or a file cannot be used, they do not fit each other, or one is missing.
+    """
+    if not options.sources:
+        return _synthetic(options)
+    if len(options.sources) == 1:
+        place = _single(options, options.sources[0])
+        return place._replace(note="; ".join(["one camera: a rigid face of average size", *filter(None, [place.note])]))
+    if options.camera:
+        raise InputError("--camera: for one source alone; two cameras are described by --rig RIG.json.")
+    if not options.rig:
+        raise InputError("--rig: missing; `jaxfilters calibrate stereo` makes a RIG.json of two cameras.")
+    described = open_rig(options.rig)
+    if len(described.cameras) != len(options.sources):
+        raise InputError(
+            f"{options.rig}: {len(described.cameras)} cameras; got {len(options.sources)} sources, expected one each."
+        )
+    sources = [open_video(source, fps=options.fps) for source in options.sources]
+    for source, camera in zip(sources, described.cameras, strict=True):
+        _check_size(source, camera.image_size, f"{options.rig}: {camera.name}")
+    return Place(
+        described.rig, described.undistortions, sources, _points(options, described.undistortions[0]), None, None
+    )
+
+
+def place_of_one(options: argparse.Namespace) -> Place:
+    """The camera and source that the command line of `track head-mono` names.
+
+    Raises:
+        InputError: the source or a file cannot be used, or they do not fit each other.
+    """
+    if options.video_source is not None:
+        return _single(options, options.video_source)
+    _refuse_unused({"--camera": options.camera, "--points": options.points, "--fps": options.fps})
+    seed = options.seed or 0
+    camera = Pinhole.from_intrinsics(_SYNTHETIC_FOCAL, (319.5, 239.5), (480, 640))
+    poses = motion(_MOTION, _SYNTHETIC_FRAMES, seed, place_mm=MONOCULAR_PLACE_MM)
+    talking = speech_schedule(_SYNTHETIC_FRAMES)
+    return _rendered(face_sequence(jax.random.key(seed), poses, rig=monocular(camera), expressions=talking))
+
+
+def _single(options: argparse.Namespace, name: str) -> Place:
+    if getattr(options, "rig", None):
+        raise InputError(
+            "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
+        )
+    source = open_video(name, fps=options.fps)
+    cols, rows = source.image_size
+    note = None
+    if options.camera:
+        K, distortion, image_size = open_intrinsics(options.camera)
+        _check_size(source, image_size, str(options.camera))
+    else:
+        focal = FOCAL_WIDTHS * cols
+        K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
+        note = f"an assumed focal length of {focal:.0f} px"
+    undistortion = Undistortion((rows, cols), K, distortion)
+    rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
+    return Place(rig, [undistortion], [source], _points(options, undistortion), None, note)
+
+
+def _synthetic(options: argparse.Namespace) -> Place:
+    _refuse_unused({"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps})
+    seed = options.seed or 0
+    return _rendered(sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True))
+
+
+def _refuse_unused(given: dict[str, Any]) -> None:
+    if unused := [name for name, value in given.items() if value is not None]:
+        raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic face has its own.")
+
+
+def _rendered(made: FaceSequence) -> Place:
+    image = _remembered(made)
+    sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
+    truth = HeadTruth(made.poses, made.uv)
+    undistortions = [Undistortion(made.rig.shape) for _ in sources]
+    return Place(made.rig, undistortions, sources, np.asarray(made.uv[0, 0], float), truth, None)
+
+
+class _SyntheticSource:
+    """One camera of the synthetic face as a source of images."""
+
+    def __init__(self, made: FaceSequence, camera: int, image):
+        self.name, self.fps, self.frames = f"synthetic camera {camera}", FPS, len(made)
+        rows, cols = made.rig.shape
+        self.image_size = (cols, rows)
+        self._made, self._camera, self._image = made, camera, image
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        every = max(1, self.frames // most)
+        return [self._image(i)[self._camera] for i in range(0, self.frames, every)][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        for i, time_s in enumerate(self._made.times):
+            yield float(time_s), self._image(i)[self._camera]
+
+    def trouble(self) -> str | None:
+        return None
+
+
+def _remembered(made: FaceSequence):
+    """`index -> images` in colour of all cameras, which are rendered together and asked for one after the other."""
+
+    @lru_cache(maxsize=4)
+    def images(index: int) -> list[np.ndarray]:
+        return [cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR) for grey in np.asarray(made.frames(index, index + 1)[0])]
+
+    return images
+
+
+def _points(options: argparse.Namespace, undistortion: Undistortion) -> np.ndarray | None:
+    if options.points is None:
+        return None
+    rows, cols = undistortion.shape
+    pixels = read_landmarks(options.points, (cols, rows))
+    if undistortion.K is None or undistortion.is_identity:
+        return pixels
+    return Calibration(undistortion.K, undistortion.distortion, np.eye(3), np.zeros(3), 0.0).undistort(pixels)
+
+
+def _check_size(source: VideoSource, size: tuple[int, int], described_by: str) -> None:
+    if source.image_size != size:
+        got, wanted = (f"{cols}x{rows}" for cols, rows in (source.image_size, size))
+        raise InputError(f"{described_by}: calibrated for images of {wanted}; {source.name} has {got}.")

@@ -1,0 +1,56 @@
+"""What came of a run of a head: `report.json`, and a few lines for a person."""
+
+import argparse
+import math
+from typing import Any
+
+from jaxfilters.trackers.app.results import versions
+from jaxfilters.trackers.head.common.report import errors, shares
+from jaxfilters.trackers.head.common.run import Followed, HeadRun
+from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED
+
+
+def run_report(run: HeadRun, followed: Followed) -> dict[str, Any]:
+    """What `report.json` says of any run of a head."""
+    results, place = run.writer.results, run.place
+    events = [{"frame": run.frame_of[min(i, len(run.frame_of) - 1)], "what": what} for i, what in run.session.events]
+    return {
+        "input": [source.name for source in place.sources],
+        **shares(results),
+        "frames_per_second": finite(followed.frames_per_second),
+        "tracking_ms_per_frame": finite(followed.tracking_ms),
+        "interrupted": followed.interrupted,
+        "trouble": followed.trouble,
+        "note": place.note,
+        "events": events,
+        "errors": errors(results, place.truth),
+        "versions": versions(),
+    }
+
+
+def told(report: dict[str, Any], options: argparse.Namespace) -> str:
+    """The report in a few lines for a person."""
+    speed, share = report["frames_per_second"], report["share_tracked"]
+    lines = [
+        f"{report['frames']} frames"
+        + (f" at {speed:.0f} frames/s" if speed else "")
+        + (f", {100 * share:.0f} % tracked" if share is not None else "")
+        + f", longest stretch without loss {report['longest_stretch_s']:.1f} s"
+        + (", interrupted" if report["interrupted"] else "")
+    ]
+    if report["errors"]:
+        rmse = ", ".join(f"{axis.replace('_', ' ')} {value:.2f}" for axis, value in report["errors"]["rmse"].items())
+        lines.append(f"errors, root mean square: {rmse}")
+    if not any(report["status"][STATUS_WORDS[code]] for code in TRACKED):
+        last = f"; last: {report['events'][-1]['what']}" if report["events"] else ""
+        lines.append(f"no face was followed{last}")
+    lines.append(
+        f"results in {options.out}: track.csv, track.npz, report.json, summary.png"
+        + (", overlay.mp4" if options.video else "")
+    )
+    return "\n".join(lines)
+
+
+def finite(value: float) -> float | None:
+    """A number for JSON."""
+    return round(value, 3) if math.isfinite(value) else None

@@ -1,0 +1,190 @@
+"""The way of a head's images from the cameras through a session into rows and pictures."""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+
+from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.results import TrackTable, begin
+from jaxfilters.trackers.app.video import OverlayVideo
+from jaxfilters.trackers.head.common.drawing import draw_frame
+from jaxfilters.trackers.head.common.input import Place
+from jaxfilters.trackers.head.common.table import STATUS_WORDS, HeadRows, with_gaps
+from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.paired_input import PairedInput
+from jaxfilters.trackers.io.video_input import Moment
+
+MOST_WAITING = 32
+"""Moments after which rows are written, however few of them are whole."""
+_UNKNOWN_LENGTH = 1_000_000
+
+
+@runtime_checkable
+class Session(Protocol):
+    """What follows a head."""
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """(frame index, what happened), in order."""
+        ...
+
+    def process(self, images: np.ndarray, times: np.ndarray) -> Any:
+        """Track of the next frames, a row each, with the fields of `HeadTrack`."""
+        ...
+
+
+class Followed(NamedTuple):
+    """What came of a run beside its rows."""
+
+    frames_per_second: float
+    """Reading, drawing and writing included, without the first chunk, which compiles; NaN with one chunk."""
+    tracking_ms: float
+    """Median time of the session alone, milliseconds a frame; NaN with one chunk."""
+    interrupted: bool
+    failure: InputError | None
+    """A source that could not be read any further."""
+    trouble: list[str]
+
+
+class HeadRun:
+    """The way of images from the cameras through the session into rows and pictures."""
+
+    def __init__(self, options: argparse.Namespace, place: Place, session: Session, table: TrackTable, *, chunk: int):
+        """A run before its first image.
+
+        Raises:
+            OutputError: the folder holds another run's track, or cannot be written.
+        """
+        if (path := options.out / "track.csv").exists():
+            raise OutputError(f"{path}: holds the track of another run; choose another --out.")
+        self.session, self.frame_of = session, list[int]()
+        self.place, self._options, self._table = place, options, table
+        self.writer = begin(options.out, {}, table, overwrite=True)
+        self._video: OverlayVideo | None = None
+        self._failure: InputError | None = None
+        self._last = "no images of one moment"
+        self._ends, self._costs = list[tuple[float, int]](), list[float]()
+        self._chunk = chunk
+
+    def follow(self) -> Followed:
+        """Track until the sources end, the time is over, or Ctrl-C.
+
+        Raises:
+            InputError: nothing could be read.
+            KeyboardInterrupt: before anything was tracked.
+        """
+        followed = self._followed()
+        if not self.writer.frames:
+            if followed.interrupted:
+                raise KeyboardInterrupt(self.writer.kept())
+            raise followed.failure or InputError("; ".join(followed.trouble or ["the sources hold no images"]) + ".")
+        return followed
+
+    def conclude(self, followed: Followed) -> None:
+        """Say what went wrong on the way.
+
+        Raises:
+            InputError: a source could not be read to its end.
+        """
+        for trouble in followed.trouble:
+            warn(trouble)
+        if followed.failure is not None:
+            raise InputError(f"{str(followed.failure).removesuffix('.')}; {self.writer.kept()}.")
+
+    def _followed(self) -> Followed:
+        paired = PairedInput(self.place.sources)
+        interrupted = False
+        try:
+            self._take(paired)
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            if self._video is not None:
+                self._video.close()
+        if self._video is not None:
+            self._video.check()
+        seconds = self._ends[-1][0] - self._ends[0][0] if self._ends else 0.0
+        rate = (self._ends[-1][1] - self._ends[0][1]) / seconds if seconds else math.nan
+        cost = float(np.median(self._costs[1:])) if len(self._costs) > 1 else math.nan
+        return Followed(rate, 1000 * cost, interrupted, self._failure, paired.trouble())
+
+    def _take(self, paired: PairedInput) -> None:
+        total = min((getattr(source, "frames", 0) for source in self.place.sources), default=0) or _UNKNOWN_LENGTH
+        waiting: list[Moment] = []
+        with ProgressLine("tracking", total) as line:
+            for moment in self._readable(paired):
+                waiting.append(moment)
+                is_last = bool(self._options.seconds) and moment.time_s >= self._options.seconds
+                if is_last or sum(map(_is_whole, waiting)) == self._chunk or len(waiting) == MOST_WAITING:
+                    self._advance(waiting)
+                    line.show(min(self.writer.frames, total), self._last)
+                    waiting = []
+                if is_last:
+                    return
+            if waiting:
+                self._advance(waiting)
+                line.show(min(self.writer.frames, total), self._last)
+
+    def _readable(self, paired: PairedInput) -> Iterator[Moment]:
+        """The straightened images up to the first that cannot be read."""
+        try:
+            for moment in paired:
+                yield self._straightened(moment)
+        except InputError as error:
+            self._failure = error
+
+    def _straightened(self, moment: Moment) -> Moment:
+        return moment._replace(
+            images=tuple(
+                None if image is None else undistortion.apply(image)
+                for image, undistortion in zip(moment.images, self.place.undistortions, strict=True)
+            )
+        )
+
+    def _advance(self, moments: list[Moment]) -> None:
+        """Track the moments that are whole, and write a row for every one."""
+        whole = [_is_whole(moment) for moment in moments]
+        track = self._track([moment for moment, is_whole in zip(moments, whole, strict=True) if is_whole])
+        self.frame_of += [self.writer.frames + int(i) for i in np.flatnonzero(whole)]
+        times_s = np.asarray([moment.time_s for moment in moments])
+        rows = with_gaps(track, times_s, whole, self._table)
+        self.writer.append(times_s, rows[1:])
+        if self._options.video:
+            self._draw(moments, rows)
+        self._ends.append((time.perf_counter(), self.writer.frames))
+
+    def _track(self, moments: list[Moment]) -> Any:
+        if not moments:
+            return None
+        grey = [
+            [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in moment.images if image is not None]
+            for moment in moments
+        ]
+        began = time.perf_counter()
+        track = self.session.process(np.asarray(grey), np.asarray([moment.time_s for moment in moments]))
+        self._costs.append((time.perf_counter() - began) / len(moments))
+        self._last = STATUS_WORDS[int(track.status[-1])]
+        return track
+
+    def _draw(self, moments: list[Moment], rows: HeadRows) -> None:
+        for i, moment in enumerate(moments):
+            picture = draw_frame(list(moment.images), self.place.rig, rows, i)
+            if self._video is None:
+                fps = max(source.fps for source in self.place.sources)
+                self._video = OverlayVideo(self._options.out / "overlay.mp4", fps, picture.shape)
+            self._video.write(picture)
+
+
+def _is_whole(moment: Moment) -> bool:
+    return all(image is not None for image in moment.images)
+
+
+def warn(text: str) -> None:
+    """A line for a person, beside the results."""
+    sys.stderr.write(f"jaxfilters: warning: {text}\n")

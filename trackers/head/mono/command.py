@@ -1,0 +1,133 @@
+"""`jaxfilters track head-mono`."""
+
+import argparse
+import dataclasses
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.person_prior import eyes_apart
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.app.track_command import given, refusing
+from jaxfilters.trackers.head.common.input import place_of_one
+from jaxfilters.trackers.head.common.outcome import finite, run_report, told
+from jaxfilters.trackers.head.common.run import HeadRun, warn
+from jaxfilters.trackers.head.common.summary import Labels, write_summary
+from jaxfilters.trackers.head.common.table import STATUS_WORDS
+from jaxfilters.trackers.head.mono.dense import tracked
+from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
+from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.head.mono.table import mono_table
+from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model
+from jaxfilters.trackers.io.landmark_sets import NAMES_68
+from jaxfilters.trackers.io.video_input import LiveCamera
+
+PERSON_FILE = "person.npz"
+_GIVEN = ("model", "camera", "points", "known", "detector")
+"""Options that the report repeats as they were given."""
+LABELS = Labels("expression, standard deviations", "a", "mode ", "how this face changes with expressions")
+"""Of the summary: what is a parameter of the expression, and what moves the most."""
+
+
+def track_mono(options: argparse.Namespace) -> str:
+    """Follow a head, leave the results in `options.out`, and say in a few lines what came of it.
+
+    Raises:
+        InputError: the source, a file or an option cannot be used. What was tracked before is written.
+        OutputError: the results cannot be written.
+        KeyboardInterrupt: before anything was tracked.
+    """
+    settings = refusing(partial(given, MonoOptions, options))
+    model = _model(options)
+    place = place_of_one(options)
+    if any(isinstance(source, LiveCamera) for source in place.sources):
+        settings = dataclasses.replace(settings, chunk=1, live=True)
+    face = tracked(model.model)
+    known = None if options.known is None else read_people(options.known, face)
+    remembered = None if known is None else known.remembered
+    detector = _detector(options)
+    session = refusing(
+        lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
+    )
+    run = HeadRun(options, place, session, mono_table(face), chunk=settings.chunk)
+    if place.note:
+        warn(f"{place.note}: distances are wrong in proportion")
+    followed = run.follow()
+    person = session.person
+    report = run_report(run, followed) | {
+        "focal_length_px": np.asarray(place.rig.focal[0], float).tolist(),
+        "is_focal_length_assumed": place.truth is None and options.camera is None,
+        "eyes_apart_mm": None if person is None else finite(float(eyes_apart(face, person))),
+        "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
+        "taken_for": _taken_for(run, known),
+        "face_model": {"source": model.source, "parameters": model.parameters},
+        "config": dataclasses.asdict(settings),
+        "options": {
+            name: None if value is None else [str(one) for one in value] if isinstance(value, list) else str(value)
+            for name, value in ((name, getattr(options, name)) for name in _GIVEN)
+        },
+    }
+    focal = _focal(session, place.rig) if options.estimate_focal else None
+    report |= {"focal_length_estimate": focal}
+    run.writer.finish(report, **_learnt(session))
+    if session.remembered is not None:
+        write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.remembered), face)
+    truth = None if place.truth is None else place.truth.poses
+    write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
+    run.conclude(followed)
+    return told(report, options) if focal is None else f"{told(report, options)}\n{_in_words(focal)}"
+
+
+def _model(options: argparse.Namespace) -> FaceModelFile:
+    file = default_face_model() if options.model is None else load_face_model(options.model)
+    if file.names not in (NAMES, NAMES_68):
+        other = next((name for name in NAMES if name not in file.names), "their order")
+        raise InputError(
+            f"{options.model}: {len(file.names)} landmarks, which differ in {other}; the tracker follows the "
+            f"{len(NAMES)} that `jaxfilters fit face-model --points 10` makes a model of, and starts from those or "
+            f"from the {len(NAMES_68)} of iBUG (--points 68)."
+        )
+    return file
+
+
+def _detector(options: argparse.Namespace) -> Detector:
+    name = options.detector or "cascades"
+    try:
+        return DETECTORS[name]()
+    except ImportError as error:
+        raise InputError(f"--detector {name}: {error}") from error
+
+
+def _focal(session: MonoSession, rig: CameraRig) -> dict[str, Any] | None:
+    """What the face tells of the focal length along x, for the report; nothing without a face."""
+    found = session.focal_length()
+    if found is None:
+        return None
+    mean = float(rig.focal[0, 0] * found.factor)
+    return {"px": finite(mean), "std_px": finite(mean * float(found.log_std)), "is_determined": found.is_determined}
+
+
+def _in_words(focal: dict[str, Any]) -> str:
+    if not focal["is_determined"]:
+        return "the focal length is not determined by these images: heads that turn further tell more"
+    return f"the focal length looks like {focal['px']:.0f} px, give or take {focal['std_px']:.0f}"
+
+
+def _taken_for(run: HeadRun, known: People | None) -> dict[str, int]:
+    """In how many frames each of those who are known was before the camera; nobody without frames."""
+    who = np.asarray(run.writer.results.who)
+    names = () if known is None else known.names
+    return {name: int(np.sum(who == i)) for i, name in enumerate(names) if np.any(who == i)}
+
+
+def _learnt(session: MonoSession) -> dict[str, np.ndarray]:
+    """What `track.npz` holds beside the track."""
+    learnt = {"status_names": np.asarray(STATUS_WORDS)}
+    if session.person is not None:
+        learnt |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
+    return learnt

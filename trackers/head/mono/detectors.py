@@ -1,0 +1,109 @@
+"""What finds landmarks in one image: OpenCV's cascades, which give the ten, or MediaPipe's mesh, which gives more."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxfilters.models.face.landmarks import FROM_68
+from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.detect import complete, detect
+from jaxfilters.trackers.head.common.mesh import MeshDetector
+from jaxfilters.trackers.head.mono.dense import NUM_DENSE
+
+MESH_68: tuple[tuple[int, ...], ...] = (
+    *((),) * 8,
+    (152,),
+    *((),) * 8,
+    *((70,), (63,), (105,), (66,), (107,), (336,), (296,), (334,), (293,), (300,)),
+    *((168,), (197,), (195, 5), (4,), (97, 98), (97,), (2,), (326,), (326, 327)),
+    *((33,), (160,), (158,), (133,), (153,), (144,), (362,), (385,), (387,), (263,), (373,), (380,)),
+    *((61,), (39,), (37,), (0,), (267,), (269,), (291,), (321,), (314,), (17,), (84,), (91,)),
+    *((78,), (81,), (13,), (311,), (308,), (402,), (14,), (178,)),
+)
+"""Vertices of MediaPipe's mesh whose mean is each of iBUG's 68 landmarks. Along lips and lids they are those that
+divide the mesh's contour as the landmarks of the ICT face model divide its own (within 5 % of the contour's length);
+nose and brows are those next to that model's landmarks, seen from the front. Of the jaw only the chin is taken: the
+others slide along the cheeks as a head turns."""
+CHIN = 8
+IRISES = ((469, 471), (474, 476))
+"""Of the refined mesh: vertices on the right iris's and the left iris's edge, on either side of the pupil."""
+MESH_SHARE, LEAST_PX = 0.01, 0.5
+"""Standard deviation of a coordinate of the mesh from frame to frame: a share of the distance between the eyes, and
+never less than so many pixels; twice that at the chin."""
+MESH_MM = 1.5
+"""Standard deviation by which the mesh's landmarks lie beside the model's in all frames alike."""
+
+
+class Seen(NamedTuple):
+    """One face in one image; pixels (u, v)."""
+
+    points: Float[np.ndarray, "10 2"]
+    num_faces: int = 1
+    """In the image, as far as they were looked for."""
+    dense: Float[np.ndarray, "68 2"] | None = None
+    """In iBUG's order; NaN where there is none."""
+    iris_px: Float[np.ndarray, " 2"] | None = None
+    """Width of the right and the left iris."""
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds a face in an image."""
+
+    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
+        """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+        ...
+
+
+class CascadeDetector:
+    """By OpenCV's cascades and the corners of eyes, mouth, nostrils and brows."""
+
+    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
+        """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+        found = detect(image, near=near)
+        if found is None:
+            return "no face whose eyes and lips are seen"
+        points = complete(image, found.points)
+        if points is None:
+            return "nostrils or brows are not seen"
+        return Seen(points, found.num_faces)
+
+
+class MeshLandmarks:
+    """By MediaPipe's face mesh: most of the 68 landmarks, and the irises."""
+
+    def __init__(self) -> None:
+        """Loads the mesh.
+
+        Raises:
+            ImportError: without MediaPipe, or with one that has no face mesh of its own.
+        """
+        self._mesh = MeshDetector(refined=True)
+
+    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
+        """The most evident face, or why there is none; the mesh looks for one face alone, wherever it is."""
+        del near
+        mesh = self._mesh.mesh(image)
+        if mesh is None:
+            return "no face"
+        dense = np.array([mesh[list(vertices)].mean(axis=0) if vertices else (np.nan, np.nan) for vertices in MESH_68])
+        iris_px = np.array([np.linalg.norm(mesh[a] - mesh[b]) for a, b in IRISES])
+        return Seen(dense[list(FROM_68)], 1, dense, iris_px)
+
+
+DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {
+    "cascades": CascadeDetector,
+    "mediapipe": MeshLandmarks,
+}
+"""By the name that the command line has for them."""
+
+
+def dense_noise(
+    dense: Float[np.ndarray, "n 68 2"],
+) -> tuple[Float[np.ndarray, "n 68 2 2"], Bool[np.ndarray, "n 68"]]:
+    """Covariance of the mesh's landmarks in each frame, pixels squared, and which of them there are."""
+    apart = [np.linalg.norm(np.subtract(*eye_centers(points[list(FROM_68[:6])]))) for points in dense]
+    std_px = np.maximum(MESH_SHARE * np.array(apart), LEAST_PX)[:, None] * np.ones(NUM_DENSE)
+    std_px[:, CHIN] *= 2
+    return std_px[..., None, None] ** 2 * np.eye(2), np.isfinite(dense).all(axis=-1)

@@ -1,0 +1,106 @@
+"""The width of the irises, which is nearly the same in all people, as a measure of a face's size.
+
+An iris that is w pixels wide is `f 11.7 mm / w` away. Where the face as adjusted so far has its eyes farther or nearer,
+the whole face is larger or smaller in proportion: one number for a person, as good as people's irises are alike.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfilters.models.face.bundle import Bundle, Views, projected
+from jaxfilters.models.face.frame_selection import told
+from jaxfilters.models.face.landmarks import EYES
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.past import Past, joined, of_measurements
+from jaxfilters.models.face.person_prior import Person, Prior, log_size, nothing_past, posed_shape
+from jaxfilters.models.face.pose import place
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.mono.adjustment import prior_information
+from jaxfilters.trackers.head.mono.past import units
+from jaxfilters.trackers.head.mono.start import Start
+
+IRIS_MM, IRIS_STD_MM = 11.7, 0.5
+"""Horizontal width of the iris in people (F. Ruefer, A. Schroeder, C. Erb, "White-to-white corneal diameter", 2005)."""
+MEASURED_SHARE, MEASURED_PX = 0.02, 1.0
+"""Standard deviation of a detector's widths, a share and pixels: the same in all frames, so that more do not help."""
+BEFORE_MM = 5.0
+"""By how much an iris is nearer than the middle of the eye's corners; assumed."""
+
+
+def with_irises(
+    face: MultilinearFace,
+    rig: CameraRig,
+    start: Start,
+    views: Views,
+    past: Past | None,
+    iris_px: Float[np.ndarray, "n 2"],
+    prior: Prior,
+) -> tuple[Start, Past]:
+    """The start as large as the irises say, weighed against what else tells the size; and what is known beside `views`.
+
+    Args:
+        face: Model of the ten landmarks.
+        rig: One camera, which is the world.
+        start: From the landmarks.
+        views: Those of them that count.
+        past: What is known beside them, if anything.
+        iris_px: Widths of the right and the left iris in each frame, pixels.
+        prior: What holds the face; its weight is not 0.
+    """
+    numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, start.uv.dtype), tree)
+    past = nothing_past(face) if past is None else past
+    return _resized(face, rig, start, views, past, numbers(iris_px), numbers(prior))
+
+
+@jax.jit
+def _resized(
+    face: MultilinearFace, rig: CameraRig, start: Start, views: Views, past: Past, iris_px: Array, prior: Prior
+) -> tuple[Start, Past]:
+    bundle, count = start.bundle, face.num_identities
+    person = bundle.person
+    larger, std = measured(face, rig, start, iris_px)
+    slope = jax.grad(lambda identity: log_size(face, identity))(person.identity)
+    size = (larger + jnp.sum(slope * person.identity)) / std
+    more = of_measurements(jnp.pad(slope / std, (0, face.mean.size))[None], size[None])
+    # The start is the likeliest without the irises; to first order this is the likeliest with them.
+    past, unit = joined(past, more), units(face, prior)
+    total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
+    total = total + _told(face, rig, views, bundle, prior)
+    moved = unit * jnp.linalg.solve(total, unit * jnp.pad(slope / jnp.square(std) * larger, (0, face.mean.size)))
+    factor = jnp.exp(jnp.sum(slope * moved[:count]))
+    person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
+    bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
+    return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), past
+
+
+def _told(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Array:
+    """Information of all views about identity and offset, in standard deviations."""
+
+    def one(inputs: tuple) -> Array:
+        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
+        return told(face, rig, view, Bundle(pose, expression, bundle.person), prior).information
+
+    # One by one: batches of factorisations can stand still on two cores.
+    return jnp.sum(jax.lax.map(one, (views, bundle.poses, bundle.expressions)), axis=0)
+
+
+def measured(
+    face: MultilinearFace, rig: CameraRig, start: Start, iris_px: Float[Array, "n 2"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """By how much the irises say that the face is larger than it is in the start, as a logarithm; standard deviation.
+
+    The median over frames and eyes: eyes that look aside or blink are narrower now and then.
+    """
+    bundle = start.bundle
+
+    def depth(pose: Array, expression: Array) -> Array:
+        corners = place(posed_shape(face, bundle.person, expression), pose)[jnp.asarray(EYES)]
+        return jnp.stack([jnp.mean(corners[:2, 2]), jnp.mean(corners[2:, 2])]) - BEFORE_MM
+
+    depths = jax.vmap(depth)(bundle.poses, bundle.expressions)
+    apart = jnp.log(rig.focal[0, 0] * IRIS_MM / (iris_px * depths))
+    width = jnp.median(iris_px)
+    variance = (IRIS_STD_MM / IRIS_MM) ** 2 + MEASURED_SHARE**2 + jnp.square(MEASURED_PX / width)
+    return jnp.median(apart), jnp.sqrt(variance)

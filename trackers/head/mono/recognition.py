@@ -1,0 +1,147 @@
+"""Who is before the camera: a stranger, or one of the people who are remembered.
+
+Each is a model of the face of its own (`jaxfilters.models.face.remembered`). The window is adjusted to each, and the
+one of most evidence is believed: the density of the window's landmarks with everything else integrated out, by
+Laplace's approximation about each adjustment.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from jaxfilters.models.face.bundle import Bundle
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
+from jaxfilters.models.face.remembered import Remembered, hypotheses
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.common.state import POSE
+from jaxfilters.trackers.head.mono.adjustment import fitted, informed, known, prior_information, settled
+from jaxfilters.trackers.head.mono.past import units
+from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState
+
+STEPS = (10, 20)
+"""Of both stages of an adjustment: from one person's face to another's is farther than from frame to frame."""
+FAMILIAR = 0.5
+"""Probability, before anything is seen, that a face is one of those who are remembered."""
+
+
+class People(NamedTuple):
+    """Whom a face may be taken for."""
+
+    faces: MultilinearFace
+    """Of a stranger and of P people, stacked: leaves (1 + P, ...)."""
+    log_prior: Float[Array, " n"]
+
+
+def one_of(people: People, who: Int[ArrayLike, ""]) -> MultilinearFace:
+    """The face of one of them, 0 for a stranger."""
+    return jax.tree.map(lambda leaf: leaf[who], people.faces)
+
+
+def people(face: MultilinearFace, remembered: Remembered | None) -> People:
+    """A stranger, and everybody who is remembered."""
+    if remembered is None or not len(remembered.identity):
+        return People(jax.tree.map(lambda leaf: leaf[None], face), jnp.zeros(1, face.mean.dtype))
+    count = len(remembered.identity)
+    shares = jnp.array([1 - FAMILIAR] + [FAMILIAR / count] * count, face.mean.dtype)
+    return People(hypotheses(face, remembered), jnp.log(shares))
+
+
+@partial(jax.jit, static_argnames="options")
+def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoOptions) -> MonoState:
+    """The state as it is for whoever the window tells most of; unchanged if nobody's face can be fitted.
+
+    Args:
+        people: Whom it may be.
+        rig: One camera.
+        state: Between two frames; its window has the last adjusted frame.
+        options: Constants.
+    """
+    bundles, log_evidence = tried(people, rig, state, options)
+    log_posterior = jnp.where(jnp.isfinite(log_evidence), log_evidence, -jnp.inf) + people.log_prior
+    who = jnp.argmax(log_posterior)
+    face, bundle = one_of(people, who), jax.tree.map(lambda leaf: leaf[who], bundles)
+    # The last frame of the window may lie back a little: what changes there changes in the frame at hand.
+    window, place, x = state.window, jnp.argmin(state.window.ages), state.belief.mean
+    pose = x[:POSE] + bundle.poses[place] - window.poses[place]
+    expression = state.modes.expression(one_of(people, state.who), x[POSE:])
+    expression = expression + bundle.expressions[place] - window.expressions[place]
+    state_of = state._replace(who=who.astype(state.who.dtype))
+    anew = settled(face, rig, state_of, bundle, pose, expression, options)
+    sound = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((anew.person, anew.belief, anew.model))]
+    changes = jnp.isfinite(log_posterior[who]) & (who != state.who) & jnp.all(jnp.stack(sound))
+    return jax.tree.map(lambda a, b: jnp.where(changes, a, b), anew, state)
+
+
+def tried(people: People, rig: CameraRig, state: MonoState, options: MonoOptions) -> tuple[Bundle, Float[Array, " n"]]:
+    """The window adjusted to each of the faces, and the logarithms of their evidence but for a common constant.
+
+    Arguments are those of `recognised`.
+    """
+    now = one_of(people, state.who)
+    one = lambda face: weighed(one_of(people, 0), face, rig, state, _start(face, now, state), options)
+    # One by one: batches of factorisations can stand still on two cores.
+    return jax.lax.map(one, people.faces)
+
+
+def weighed(
+    stranger: MultilinearFace,
+    face: MultilinearFace,
+    rig: CameraRig,
+    state: MonoState,
+    start: Bundle,
+    options: MonoOptions,
+) -> tuple[Bundle, Float[Array, ""]]:
+    """The window adjusted to one face from a start, and the logarithm of its evidence but for a common constant.
+
+    What is integrated out is identity and offset, by Laplace's approximation; poses count by direction and in
+    proportion to the distance, of which no value is likelier than another.
+
+    Args:
+        stranger: The model.
+        face: The same, or somebody who is remembered.
+        rig: One camera.
+        state: With the window.
+        start: Of all frames.
+        options: Constants.
+    """
+    bundle, info = fitted(stranger, face, rig, state, start, options, STEPS)
+    window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
+    told = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
+    people = Prior(state.prior.weight, state.prior.offset_std)
+    before = prior_information(face, bundle.person, people)
+    after = known(face, state.prior, bundle.person) + told
+    return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
+
+
+def as_remembered(stranger: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
+    """The person who is followed, as one to remember: identity with what is not known of it, and offset.
+
+    Args:
+        stranger: The model.
+        face: Whom the state is about: the same, or somebody who is remembered.
+        state: With a window that has been informed of that person.
+    """
+    total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
+    unit, count = units(face, state.prior), face.num_identities
+    covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
+    offset = state.person.offset + face.mean - stranger.mean
+    return Remembered(state.person.identity[None], covariance[None], offset[None])
+
+
+def _start(face: MultilinearFace, now: MultilinearFace, state: MonoState) -> Bundle:
+    """The window for another face: as near to the believed one as may be, and as much farther away as it is larger."""
+    most = 2 * face.identity_std
+    identity = jnp.clip(state.person.identity, face.identity_mean - most, face.identity_mean + most)
+    person = Person(identity, state.person.offset + now.mean - face.mean)
+    size = lambda face, who: jnp.sqrt(jnp.sum(jnp.square(posed_shape(face, who, face.expression_mean))))
+    ratio = size(face, person) / size(now, state.person)
+    return Bundle(state.window.poses.at[:, :3].multiply(ratio), state.window.expressions, person)
+
+
+def _log_det(A: Array) -> Array:
+    return 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(A))))

@@ -1,0 +1,304 @@
+"""The one-camera head tracker from the first image on: waiting for a face, following it, finding it again."""
+
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxfilters.models.face.bundle import Views
+from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.past import Past
+from jaxfilters.models.face.person_prior import Person
+from jaxfilters.models.face.remembered import Remembered, joined
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.trackers.head.common.following import Beginning, Following
+from jaxfilters.trackers.head.common.state import INITIALISING, POSE
+from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
+from jaxfilters.trackers.head.mono.detections import Collector, Detections
+from jaxfilters.trackers.head.mono.detectors import Detector
+from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
+from jaxfilters.trackers.head.mono.irises import with_irises
+from jaxfilters.trackers.head.mono.recognition import People, as_remembered, one_of, people, recognised
+from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, search_of
+from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
+from jaxfilters.trackers.head.mono.track import System, advance
+from jaxfilters.trackers.head.stereo.session import check_points
+
+MOST_REPROJECTION = 0.05
+"""Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
+DEPTH_MM = (100.0, 5000.0)
+"""In which a face may be."""
+_STATIC = ("num_particles", "landmarks", "selection", "past", "adjust")
+"""Options that a compiled program is for; the others reach it as numbers, or do not concern it."""
+_begun = jax.jit(begin, static_argnames="options")
+
+
+class _Found:
+    """What a track begins with."""
+
+    def __init__(self, detections: Detections, start: Start, views: Views, past: Past | None) -> None:
+        self.detections, self.start, self.views, self.past = detections, start, views, past
+        turned = np.abs(np.asarray(start.bundle.poses[:, 4:])).sum(axis=1)
+        self.frame = int(turned.argmin())
+        """The one most turned to the camera."""
+
+
+class MonoSession:
+    """Tracks one head through frames of one camera that are handed over in pieces."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        face: MultilinearFace,
+        options: MonoOptions | None = None,
+        points: Float[np.ndarray, "K 2"] | None = None,
+        *,
+        detections: Detections | None = None,
+        detector: Detector | None = None,
+        remembered: Remembered | None = None,
+    ) -> None:
+        """A session before its first frame.
+
+        Args:
+            rig: One camera.
+            face: Model of ten landmarks, or of the 68 of iBUG: the start is then from all that are known, and ten of
+                them are followed.
+            options: Constants.
+            points: The ten landmarks, or 68, in the first image, pixels, (u, v); detected in several images where not
+                given.
+            detections: Landmarks that were found otherwise in several images, the last of which is still to come.
+            detector: What finds landmarks; OpenCV's cascades if none.
+            remembered: People of the same model who may be before the camera, beside strangers.
+
+        Raises:
+            ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
+                `points` are not ten or 68 finite pixels, or `remembered` is not of the model or for the tracker of the
+                thesis, which knows nobody.
+        """
+        if rig.num_cameras != 1:
+            raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
+        if np.any(np.asarray(rig.rotation[0]) != np.eye(3)) or np.any(np.asarray(rig.translation[0]) != 0):
+            raise ValueError("rig must have its camera at the origin, without a rotation: its frame is the world.")
+        if points is None or len(points) != NUM_DENSE:
+            check_points(points)
+        else:
+            check_points(np.asarray(points)[list(FROM_68)])
+        options = options or MonoOptions()
+        _check_remembered(remembered, tracked(face), options)
+        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, remembered)
+        self._following = Following(self._tracker)
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """(frame index, what happened), in order."""
+        return self._following.events
+
+    @property
+    def model(self) -> FaceModel | None:
+        """The person's face as adjusted so far; `None` before there was one."""
+        return None if self._following.state is None else self._following.state.model
+
+    @property
+    def person(self) -> Person | None:
+        """Who it is, as adjusted so far; `None` before there was a face."""
+        return None if self._following.state is None else self._following.state.person
+
+    @property
+    def remembered(self) -> Remembered | None:
+        """The person who is followed, for later sessions with the same model; `None` before there was a face."""
+        return None if self._following.state is None else self._tracker.remembered(self._following.state)
+
+    def focal_length(self) -> FocalLength | None:
+        """What the frames that the face is adjusted to say of the focal length; `None` before there was a face."""
+        return None if self._following.state is None else self._tracker.focal_length(self._following.state)
+
+    def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
+        """Track of the next frames, a row each.
+
+        Args:
+            images: Grey, without lens distortion.
+            times: Seconds, growing.
+
+        Raises:
+            ValueError: if images or times do not fit the rig and each other.
+        """
+        return self._following.process(images, times)
+
+
+class _MonoTracker:
+    """What `Following` asks of a tracker."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        face: MultilinearFace,
+        options: MonoOptions,
+        points: np.ndarray | None,
+        detections: Detections | None,
+        detector: Detector | None,
+        remembered: Remembered | None,
+    ) -> None:
+        self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self._whole, face = face, tracked(face)
+        """With all its landmarks."""
+        self._face, self._options, self._points, self._detections = face, options, points, detections
+        # What is compiled knows its options, but need not be compiled anew for other numbers.
+        self._compiled = replace(MonoOptions(), **{name: getattr(options, name) for name in _STATIC})
+        self._remembered = remembered
+        self._people = people(face, remembered)
+        self._system = System(face, face, rig, search_of(rig, options))
+        self._num_told = 0
+        """Adjustments when it was last asked who it is."""
+        self._detector = detector
+        self._collector = Collector(detector)
+        self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
+        self._ready: Future[MonoState] | None = None
+        """What a face that comes back needs first, compiled beside the frames."""
+
+    @property
+    def can_wait(self) -> bool:
+        return self.is_live and self._points is None and self._detections is None
+
+    def search(self, images: np.ndarray, time: float) -> tuple[_Found | None, list[str]]:
+        collector = self._collector
+        if self._points is not None:
+            points, self._points = self._points, None
+            return self._checked(collector.given(points, images[0], time))
+        if self._detections is not None:
+            if time < self._detections.time:
+                return None, []
+            detections, self._detections = self._detections, None
+            return self._checked(detections)
+        gathered = collector.update(images[0], time)
+        wrong = [collector.reason] if collector.reason else []
+        if collector.several:
+            wrong.append(f"{collector.several} faces; the largest is taken")
+        if gathered is None:
+            return None, wrong
+        found, more = self._checked(gathered)
+        return found, wrong + more
+
+    def forget(self) -> None:
+        # Not cleared: a search beside the tracking may be at work with the old one.
+        self._collector = Collector(self._detector)
+
+    def begin(self, found: _Found, old: MonoState | None, frame: int) -> Beginning:
+        key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
+        start, detections = found.start, found.detections
+        if old is not None:
+            self._remember(old)
+        zero = jnp.zeros((), start.uv.dtype)
+        state = _begun(
+            key,
+            self._face,
+            self.rig,
+            start,
+            found.views,
+            jnp.asarray(found.frame),
+            detections.images[[found.frame, -1]],
+            zero,
+            options=self._compiled,
+            prior=self._options.prior._replace(past=found.past),
+        )
+        self._num_told, self._system = 0, self._system._replace(face=self._face)
+        state = self._recognised(state)
+        if self._pool is not None and self._ready is None:
+            self._ready = self._pool.submit(self._asked_who, self._system, state)
+        what = "registered, a face that is known" if int(state.who) else "registered"
+        return Beginning(state, detections.time, what)
+
+    def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
+        state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
+        return self._recognised(state), track
+
+    def remembered(self, state: MonoState) -> Remembered:
+        return as_remembered(self._system.stranger, self._system.face, state)
+
+    def focal_length(self, state: MonoState) -> FocalLength:
+        return focal_length(self._system.stranger, self._system.face, self.rig, state, self._compiled)
+
+    def _recognised(self, state: MonoState) -> MonoState:
+        """Asked again whenever the face has been adjusted twice as often: what is learnt of it grows ever slower."""
+        if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_told:
+            self._num_told = int(state.num_adjusted)
+            state = recognised(self._people, self.rig, state, self._compiled)
+            self._system = self._system._replace(face=one_of(self._people, int(state.who)))
+        return state
+
+    def _remember(self, old: MonoState) -> None:
+        """Who was followed may come back, beside those who were remembered from the first."""
+        if not self._options.is_published:
+            self._people = self._people_with(self._system, old)
+
+    def _people_with(self, system: System, state: MonoState) -> People:
+        last = as_remembered(system.stranger, system.face, state)
+        return people(self._face, last if self._remembered is None else joined(self._remembered, last))
+
+    def _asked_who(self, system: System, state: MonoState) -> MonoState:
+        """As when a face comes back. Frames of a camera must not wait while this is compiled for one person more."""
+        return recognised(self._people_with(system, state), self.rig, state, self._compiled)
+
+    def empty(self, count: int) -> MonoTrack:
+        nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)
+        return MonoTrack(
+            pose=nothing(POSE),
+            pose_std=nothing(POSE),
+            deformation=nothing(self._face.num_expressions),
+            shape=nothing(NUM_LANDMARKS, 3),
+            image_points=nothing(1, NUM_LANDMARKS, 2),
+            score=nothing(),
+            effective_sample_size=np.zeros(count, np.float32),
+            identity=nothing(self._face.num_identities),
+            offset=nothing(NUM_LANDMARKS, 3),
+            who=np.full(count, -1, np.int32),
+            is_adjusted=np.zeros(count, bool),
+            status=np.full(count, INITIALISING, np.int32),
+        )
+
+    def _checked(self, detections: Detections) -> tuple[_Found | None, list[str]]:
+        """A start, if the landmarks are those of a face before the camera."""
+        points = jnp.asarray(detections.points, float)
+        start = initialise(self._face, self.rig, points, self._options.prior, detected_px=detections.std_px)
+        eyes = detections.points[:, :4].reshape(-1, 2, 2, 2).mean(axis=2)
+        apart = float(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=-1).mean())
+        error, depth = float(start.adjustment.reprojection_px), np.asarray(start.bundle.poses[:, 2])
+        if not math.isfinite(float(start.adjustment.energy)):
+            return None, ["the face cannot be fitted: the model's covariances are singular, or the prior's scale is"]
+        if not math.isfinite(error) or error > MOST_REPROJECTION * apart:
+            return None, [f"the points are no face's: the best one is {error:.1f} px from them"]
+        if depth.min() < DEPTH_MM[0] or depth.max() > DEPTH_MM[1]:
+            return None, [f"the face would be {depth.mean():.0f} mm away"]
+        return self._told(detections, start), []
+
+    def _told(self, detections: Detections, start: Start) -> _Found:
+        """The start with all that the detections tell beside the ten landmarks."""
+        points = jnp.asarray(detections.points, float)
+        views, past = detected(points, jnp.asarray(detections.std_px, points.dtype)), None
+        options = self._options
+        if options.is_published or not options.prior_weight:
+            return _Found(detections, start, views, past)
+        if detections.dense is not None and self._whole.num_landmarks == NUM_DENSE:
+            start, past = start_densely(self._whole, self.rig, start, detections.dense, options.prior)
+            # What they tell of the person is in the past already.
+            views = views._replace(seen=jnp.zeros_like(views.seen))
+        if detections.iris_px is not None and options.eyes_apart_mm is None:
+            start, past = with_irises(self._face, self.rig, start, views, past, detections.iris_px, options.prior)
+        return _Found(detections, start, views, past)
+
+
+def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoOptions) -> None:
+    if remembered is None:
+        return
+    if options.is_published:
+        raise ValueError('remembered must be None where options.landmarks is not "aligned": that tracker knows nobody.')
+    count, num_identities = len(remembered.identity), face.num_identities
+    expected = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
+    shapes = tuple(jnp.shape(leaf) for leaf in remembered)
+    if shapes != expected:
+        raise ValueError(f"remembered must be of the model, with shapes {expected}; got {shapes}.")

@@ -1,0 +1,231 @@
+"""The start of a track: landmarks that were detected in a few frames become a person, and where the head was."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Num
+
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.models.face.bundle import Adjustment, Bundle, Reach, Views, adjust, projected
+from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.patches import SIZE, SKIN_NORMALS, WIDE_SIZE, patches_of, unknown_slopes, windows
+from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, posed_shape
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.common.recent import nothing_changed
+from jaxfilters.trackers.head.common.search import Searches, searches
+from jaxfilters.trackers.head.common.search import start as start_search
+from jaxfilters.trackers.head.common.state import POSE, HeadOptions
+from jaxfilters.trackers.head.mono.adjustment import informed
+from jaxfilters.trackers.head.mono.person import model_of
+from jaxfilters.trackers.head.mono.state import AVERAGED, MonoOptions, MonoState, Registered, Window
+from jaxfilters.typing import AnyKey
+
+STEPS = (10, 10)
+"""Of both stages of the first adjustment (specification, section 3)."""
+MOST_TURNED = np.radians(60.0)
+WIDE = Reach(pose=np.array([300.0, 300.0, 400.0, *[MOST_TURNED] * 3]), expression=4.0, identity=4.0, deviations=2.0)
+"""Of the first adjustment."""
+DETECTED_PX = 1.0
+"""Standard deviation of a detected landmark."""
+ANCHORED_PX = 0.1
+"""Of a landmark in the frame whose picture defines it."""
+MOST_UNEVEN = np.radians(6.0)
+"""Standard deviation of the directions of left-right pairs from which on a detection is a mistake (section 1)."""
+PUBLISHED_SIGMA = 1.0
+"""Of the sum of the scores ([4.41])."""
+FIRST_LOOSENESS = 0.5**2
+"""mm^2."""
+FIRST_STD = np.array([1.0, 1.0, 3.0, 0.02, 0.05, 0.05])
+"""Of the pose at the start, millimetres and radians, if the person is as believed."""
+_PAIRS = np.array([(EYES[0], EYES[3]), (EYES[1], EYES[2]), MOUTH, NOSTRILS, BROWS])
+
+
+class Start(NamedTuple):
+    """What several frames of detected landmarks say."""
+
+    bundle: Bundle
+    adjustment: Adjustment
+    uv: Float[Array, "n K 2"]
+    """The landmarks as adjusted, pixels."""
+
+
+def is_symmetric(points: Float[np.ndarray, "K 2"], most: float = MOST_UNEVEN) -> bool:
+    """Whether the segments between left and right landmarks have about one direction (specification, section 1)."""
+    right, left = points[_PAIRS[:, 0]], points[_PAIRS[:, 1]]
+    across = left - right
+    return bool(np.std(np.arctan2(across[:, 1], across[:, 0])) <= most)
+
+
+def initialise(
+    face: MultilinearFace,
+    rig: CameraRig,
+    points: Float[Array, "n K 2"],
+    prior: Prior,
+    *,
+    detected_px: float = DETECTED_PX,
+) -> Start:
+    """Person and poses from detected landmarks, from heads that look into the camera on the ray of their middle.
+
+    Args:
+        face: Model.
+        rig: One camera, which is the world.
+        points: Landmarks in n frames, pixels.
+        prior: What holds the face.
+        detected_px: Standard deviation of each coordinate of the points.
+    """
+    n = len(points)
+    person = Person(face.identity_mean, jnp.zeros_like(face.mean))
+    expressions = jnp.tile(face.expression_mean, (n, 1))
+    mean = posed_shape(face, person, face.expression_mean)
+    poses = jax.vmap(lambda uv: _facing(rig, mean, uv))(points)
+    return _fitted(face, rig, points, Bundle(poses, expressions, person), prior, WIDE, detected_px)
+
+
+def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
+    numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, points.dtype), tree)
+    return _adjusted(face, rig, points, bundle, numbers(prior), numbers(reach), numbers(detected_px))
+
+
+@jax.jit
+def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
+    found, info = adjust(face, rig, detected(points, detected_px), bundle, prior, reach, steps=STEPS)
+    return Start(found, info, projected(face, rig, found))
+
+
+def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, ""]) -> Views:
+    """Landmarks that were all detected equally well, with the standard deviation of each coordinate."""
+    covariance = jnp.square(std_px) * jnp.tile(jnp.eye(2), (*points.shape[:2], 1, 1))
+    return Views(points, covariance, jnp.ones(points.shape[:2], bool))
+
+
+def begin(
+    key: AnyKey,
+    face: MultilinearFace,
+    rig: CameraRig,
+    start: Start,
+    views: Views,
+    frame: Int[ArrayLike, ""],
+    images: Num[Array, "2 rows cols"],
+    time: Float[Array, ""],
+    options: MonoOptions,
+    prior: Prior,
+) -> MonoState:
+    """State in the last frame of the start, with templates from one of its frames.
+
+    Args:
+        key: Random key; it lives in the state from here on.
+        face: Model.
+        rig: One camera.
+        start: From `initialise`.
+        views: Landmarks in its frames; not seen where what they tell is known otherwise (`past`).
+        frame: Which of its frames the templates are taken from: the one most turned to the camera.
+        images: That frame, and the last one.
+        time: Of the last frame, seconds.
+        options: Constants.
+        prior: What holds the person, with what is known beside these landmarks.
+    """
+    bundle, uv, person = start.bundle, start.uv[frame], start.bundle.person
+    first, last = jnp.asarray(images, uv.dtype)[:, None]
+    registered = _registered(face, rig, bundle, uv, frame, first)
+    model, modes = model_of(face, person, registered.templates)
+    here, expressed = bundle.poses[-1], bundle.expressions[-1]
+    x = jnp.concatenate([here, modes.coefficients(face, expressed)])
+    variance = jnp.square(jnp.concatenate([jnp.asarray(FIRST_STD, x.dtype), jnp.maximum(model.deviation, 0.1)]))
+    window = informed(face, rig, _first_window(bundle, views, uv, frame, options), person, prior)
+    size = window.information.shape[-1]
+    return MonoState(
+        search=start_search(x, search_options(options)),
+        belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
+        who=jnp.zeros((), jnp.int32),
+        person=person,
+        prior=_held(face, prior, options),
+        model=model,
+        modes=modes,
+        response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
+        registered=registered,
+        window=window,
+        identities=jnp.tile(person.identity, (AVERAGED, 1)),
+        num_adjusted=jnp.ones((), jnp.int32),
+        recent=nothing_changed(last, posed_shape(face, person, expressed), here, rig),
+        windows=registered.templates,
+        is_fresh=jnp.zeros((), bool),
+        slopes=unknown_slopes(face.num_landmarks),
+        looseness=jnp.full(face.num_landmarks, FIRST_LOOSENESS, x.dtype),
+        misfit=jnp.ones((), x.dtype),
+        last_good=x,
+        misses=jnp.zeros((), jnp.int32),
+        strange=jnp.zeros((), jnp.int32),
+        time=jnp.asarray(time, x.dtype),
+        key=key,
+    )
+
+
+def _held(face: MultilinearFace, prior: Prior, options: MonoOptions) -> Prior:
+    """As a state has it: arrays, and a past from the first where frames will leave one."""
+    if prior.past is None and options.past == "marginalised":
+        prior = prior._replace(past=nothing_past(face))
+    return jax.tree.map(lambda a: jnp.asarray(a, face.mean.dtype), prior)
+
+
+def search_options(options: MonoOptions) -> HeadOptions:
+    """Of the particle filter, which is that of the tracker with several cameras."""
+    return HeadOptions(num_particles=options.num_particles)
+
+
+def search_of(rig: CameraRig, options: MonoOptions) -> Searches:
+    """The particle filters for a camera; for the published tracker with its standard deviation of the scores."""
+    usual = searches(rig, search_options(options))
+    if not options.is_published:
+        return usual
+
+    def sharper(filter: Filter) -> Filter:
+        likelihood = replace(filter.params.log_likelihood, sigma=PUBLISHED_SIGMA)
+        return replace(filter, params=replace(filter.params, log_likelihood=likelihood))
+
+    return Searches(*map(sharper, usual))
+
+
+def _registered(face, rig, bundle, uv, frame, image) -> Registered:
+    """What the landmarks look like in one frame of the start."""
+    wide = windows(image, uv[None])
+    border = (WIDE_SIZE - SIZE) // 2
+    shape = posed_shape(face, bundle.person, bundle.expressions[frame])
+    seen = patches_of(wide, shape, bundle.poses[frame], rig, jnp.asarray(SKIN_NORMALS, uv.dtype))
+    return Registered(wide, wide[..., border:-border, border:-border], seen)
+
+
+def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike, ""], options: MonoOptions) -> Window:
+    """The frames of the start; that of the templates comes first, where they are exact by definition."""
+    n = len(views.uv)
+    order = jnp.arange(n).at[0].set(frame).at[frame].set(0)
+    points, covariance, seen = (leaf[order] for leaf in views)
+    if not options.is_published:
+        points = points.at[0].set(uv)
+        covariance = covariance.at[0].set(ANCHORED_PX**2 * jnp.eye(2))
+        seen = seen.at[0].set(True)
+    views = Views(points, covariance, seen)
+    size = bundle.person.identity.size + bundle.person.offset.size
+    return Window(
+        views,
+        bundle.poses[order],
+        bundle.expressions[order],
+        jnp.arange(n)[::-1][order],
+        jnp.zeros((n, size, size)),
+        jnp.zeros((n, size)),
+    )
+
+
+def _facing(rig: CameraRig, shape: Array, uv: Array) -> Array:
+    """The pose of a head that looks into the camera where its landmarks are on average, as large as they spread."""
+    rays = (uv - rig.center[0]) / rig.focal[0]
+    middle = jnp.mean(rays, axis=0)
+    spread = lambda points: jnp.sqrt(jnp.sum(jnp.square(points - jnp.mean(points, axis=0))))
+    z = spread(shape[:, :2]) / spread(rays)
+    in_camera = z * jnp.append(middle, 1.0) - jnp.mean(shape, axis=0)
+    return jnp.concatenate([in_camera, jnp.zeros(3, in_camera.dtype)])

@@ -1,0 +1,226 @@
+"""One frame after another: search, estimate, verdict, adjustment."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Num
+
+from jaxfilters.filter import Filter
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.models.face.alignment import facing
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.patches import stretch, turned
+from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
+from jaxfilters.models.face.shape_model import shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.particle.weighting import ParticleInfo
+from jaxfilters.trackers.head.common.near_mode import spread
+from jaxfilters.trackers.head.common.recent import latest_templates
+from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
+from jaxfilters.trackers.head.common.state import DEFORMABLE, FRAME_S, LOST, PATIENCE, POSE
+from jaxfilters.trackers.head.mono import adjustment
+from jaxfilters.trackers.head.mono.estimate import Estimate, aligned, projected, recalculated
+from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
+from jaxfilters.trackers.head.stereo.track import (
+    FEWEST_ANCHORED,
+    LEAST_SCORE,
+    MOST_STEPS,
+    MOST_STRANGE,
+    REGAINED_SCORE,
+    at_last_good,
+)
+from jaxfilters.typing import AnyKey
+
+ESTIMATES = {"aligned": aligned, "recalculated": recalculated, "projected": projected}
+
+PUBLISHED_KAPPA = 0.2
+"""Diffusion of the expression in its standard deviations (Sugano 2007, section 4.4.2)."""
+LEAST_STEPS = 0.1
+"""Frame times between two images from which on they tell a velocity."""
+
+
+class System(NamedTuple):
+    """What does not change while a head is followed."""
+
+    stranger: MultilinearFace
+    """The model."""
+    face: MultilinearFace
+    """Whom the state is about: the same, or somebody who is remembered."""
+    rig: CameraRig
+    searches: Searches
+
+
+@partial(jax.jit, static_argnames="options")
+def advance(
+    system: System,
+    state: MonoState,
+    images: Num[Array, "b 1 rows cols"],
+    times: Float[Array, " b"],
+    is_frame: Bool[Array, " b"],
+    options: MonoOptions,
+) -> tuple[MonoState, MonoTrack]:
+    """State and track after `b` frames; those that are none leave the state alone, and their rows mean nothing."""
+
+    def one(state: MonoState, inputs: tuple) -> tuple[MonoState, MonoTrack]:
+        images, time, is_frame = inputs
+        step = lambda: _step(system, state, images, time, options)
+        _, empty = jax.eval_shape(step)
+        nothing = lambda: (state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), empty))
+        return jax.lax.cond(is_frame, step, nothing)
+
+    return jax.lax.scan(one, state, (images, times, is_frame))
+
+
+@partial(jax.jit, static_argnames="options")  # traced once for its shapes and its program
+def _step(
+    system: System, state: MonoState, images: Array, time: Array, options: MonoOptions
+) -> tuple[MonoState, MonoTrack]:
+    rig = system.rig
+    images = images.astype(state.belief.mean.dtype)
+    key, search_key, lost_key = jax.random.split(state.key, 3)
+    state = at_last_good(lost_key, state)
+    steps = jnp.clip((time - state.time) / FRAME_S, 0.0, MOST_STEPS)
+    moved = state.search.velocity * steps
+    templates, looks = _templates(state, rig, moved, options)
+    search, info = _searched(search_key, system.searches, state, looks, images, steps, options)
+    estimate = ESTIMATES[options.landmarks](search, state, images, rig, moved)
+    if not options.is_published:
+        search = _followed(search, state, estimate, steps)
+    belief = jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, spread(search))
+    score = score_at(state.model, templates, rig, belief.mean, images)
+    likeness = jnp.maximum(score, score_at(state.model, looks, rig, belief.mean, images))
+    strange = jnp.where(estimate.num_anchored < FEWEST_ANCHORED, state.strange + 1, jnp.maximum(state.strange - 2, 0))
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (strange > MOST_STRANGE)
+    missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
+    state = _after(state, search, belief, estimate, missed)
+    state, is_adjusted = _adjusted(system, state, estimate, score, missed, options)
+    state = state._replace(
+        misses=jnp.where(missed, state.misses + 1, 0),
+        strange=strange,
+        time=jnp.maximum(time, state.time),
+        key=key,
+        last_good=jnp.where(missed, state.last_good, state.belief.mean),
+        is_fresh=~missed,
+        window=state.window._replace(ages=state.window.ages + 1),
+    )
+    return state, _track(system, state, score, info.effective_sample_size, is_adjusted)
+
+
+def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoOptions) -> tuple[Array, Array]:
+    """What landmarks look like as the head is expected to be turned: as at registration; and, if changed, of late."""
+    if options.is_published:
+        return state.registered.templates, state.registered.templates
+    x, seen = state.belief.mean, state.registered.patches
+    pose, M = x[:POSE] + moved, shape(state.model, x[POSE:])
+    by_shape, _ = jacobian(rig, M, pose)
+    is_facing = facing(seen, by_shape)[..., None, None]
+    affine = jnp.where(is_facing, stretch(seen, state.slopes, by_shape), jnp.eye(2))
+    templates = jnp.where(is_facing, turned(seen, affine), 0.0)
+    latest = latest_templates(state.recent, state.slopes, templates, M, pose, rig)
+    return templates, jnp.where(state.misses < PATIENCE, latest, templates)
+
+
+def _searched(
+    key: AnyKey,
+    searches: Searches,
+    state: MonoState,
+    templates: Array,
+    images: Array,
+    steps: Array,
+    options: MonoOptions,
+) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
+    """Particles after this frame; where they make the estimate, half of them move in the expression."""
+
+    def run(filter: Filter, deviation: Array) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
+        filter = at(filter, state.model, templates, deviation)
+        predict_key, update_key = jax.random.split(key)
+        search = filter.predict(filter.params, predict_key, state.search, steps)
+        return filter.update(filter.params, update_key, search, images, steps)
+
+    if not options.is_published:
+        return run(searches.rigid, jnp.zeros_like(state.model.deviation))
+    return run(searches.layered, PUBLISHED_KAPPA / KAPPA * state.model.deviation)
+
+
+def _followed(
+    search: AdaptiveDiffusionState, state: MonoState, estimate: Estimate, steps: Array
+) -> AdaptiveDiffusionState:
+    """The search after the fit has said where the head is: particles and velocity follow the fit."""
+    before, x = state.search, estimate.belief.mean
+    elapsed = before.elapsed + steps
+    has_gone_on = elapsed > LEAST_STEPS
+    moved = (x - before.estimate)[:POSE] / jnp.where(has_gone_on, elapsed, 1.0)
+    velocity = jnp.where(has_gone_on, moved, before.velocity)
+    followed = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=before.fit)
+    return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), followed, search)
+
+
+def _after(
+    state: MonoState, search: AdaptiveDiffusionState, belief: Gaussian, estimate: Estimate, missed: Array
+) -> MonoState:
+    """The state after a frame but for the person, and for what counts frames."""
+    found = ~missed
+    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(found, a, b), new, old)
+    # A face that is not found is not headed anywhere.
+    search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
+    return state._replace(
+        search=search,
+        belief=belief,
+        recent=keep(estimate.recent, state.recent),
+        windows=keep(estimate.windows, state.windows),
+        slopes=keep(estimate.slopes, state.slopes),
+        looseness=keep(estimate.looseness, state.looseness),
+        misfit=keep(estimate.misfit, state.misfit),
+    )
+
+
+def _adjusted(
+    system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoOptions
+) -> tuple[MonoState, Array]:
+    """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
+    stranger, face, rig, _ = system
+    frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, state.prior)
+    response = jnp.where(missed, state.response, frame.told.response)
+    state = state._replace(response=jnp.where(jnp.all(jnp.isfinite(response)), response, state.response))
+    if not options.adjust:
+        return state, jnp.zeros((), bool)
+    further = 1.0 if options.is_published else adjustment.FURTHER
+    allowed = ~missed & (score >= adjustment.LEAST_SCORE)
+    allowed &= jnp.abs(frame.pose[4]) <= further * adjustment.MOST_YAW
+    allowed &= jnp.abs(frame.pose[5]) <= further * adjustment.MOST_PITCH
+    place, deserves = adjustment.choose(face, state.window, state.prior, state.person, frame, options)
+    tried = allowed & deserves
+    anew = lambda: adjustment.adjusted(stranger, face, rig, state, frame, place, options)
+    after = jax.lax.cond(tried, anew, lambda: state)
+    parts = ("person", "prior", "belief", "model", "modes", "window", "registered")
+    believed = lambda state: [getattr(state, part) for part in parts]
+    sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(believed(after))]))
+    return jax.lax.cond(sound, lambda: after, lambda: state), tried & sound
+
+
+def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array) -> MonoTrack:
+    stranger, face, rig, _ = system
+    lost = state.misses >= PATIENCE
+    known = lambda a: jnp.where(lost, jnp.nan, a)
+    x = state.belief.mean
+    M = shape(state.model, x[POSE:])
+    uv, _ = project_shape(rig, M, x[:POSE])
+    of_person = adjustment.uncertainty(face, state.window, state.prior, state.person, state.response)
+    variance = jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
+    expression = state.modes.expression(face, x[POSE:])
+    return MonoTrack(
+        pose=known(x[:POSE]),
+        pose_std=known(jnp.sqrt(variance)),
+        deformation=known((expression - stranger.expression_mean) / stranger.expression_std),
+        shape=known(M),
+        image_points=known(uv),
+        score=score,
+        effective_sample_size=ess,
+        identity=known((state.person.identity - stranger.identity_mean) / stranger.identity_std),
+        offset=known(state.person.offset + face.mean - stranger.mean),
+        who=jnp.where(lost, -1, state.who - 1).astype(jnp.int32),
+        is_adjusted=is_adjusted,
+        status=jnp.where(lost, LOST, DEFORMABLE).astype(jnp.int32),
+    )

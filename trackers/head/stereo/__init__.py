@@ -1,0 +1,1 @@
+"""Head pose and face deformation from two calibrated cameras."""

@@ -1,0 +1,183 @@
+"""The head tracker from the first images on: waiting for a face, registering it, following it, finding it again."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxfilters.models.face.landmarks import NUM_LANDMARKS
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.rigid import align
+from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.finders import FINDERS, Finder
+from jaxfilters.trackers.head.common.following import Beginning, Following
+from jaxfilters.trackers.head.common.search import first_diffusion, searches
+from jaxfilters.trackers.head.common.state import (
+    INITIALISING,
+    NUM_MODES,
+    POSE,
+    HeadOptions,
+    HeadState,
+    HeadTrack,
+    compiled,
+)
+from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
+from jaxfilters.trackers.head.stereo.track import advance, begin
+
+SAME_FACE_MM = 4.0
+"""Root mean square distance between two registered shapes up to which they are of one person."""
+
+
+class _Found(NamedTuple):
+    """A face, and the images in which it was registered."""
+
+    registration: Registration
+    images: np.ndarray
+    time: float
+
+
+_begun = jax.jit(begin, static_argnames="options")
+
+
+class HeadSession:
+    """Tracks one head through frames that are handed over in pieces."""
+
+    def __init__(
+        self, rig: CameraRig, options: HeadOptions | None = None, points: Float[np.ndarray, "K 2"] | None = None
+    ) -> None:
+        """A session before its first frame.
+
+        Args:
+            rig: One camera or more.
+            options: Constants.
+            points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
+
+        Raises:
+            ValueError: if `points` are not ten finite pixels.
+            ImportError: if the detector of the options is not installed.
+        """
+        check_points(points)
+        self._following = Following(_HeadTracker(rig, options or HeadOptions(), points))
+
+    @property
+    def events(self) -> list[tuple[int, str]]:
+        """(frame index, what happened), in order."""
+        return self._following.events
+
+    @property
+    def model(self) -> FaceModel | None:
+        """The face as learnt so far; `None` before registration."""
+        return None if self._following.state is None else self._following.state.model
+
+    @property
+    def contribution(self) -> float:
+        """Share of the deformation seen so far that the modes explain, 0 to 1; 0 before there was any."""
+        state = self._following.state
+        return 0.0 if state is None else float(learning.contribution(state.learner))
+
+    def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> HeadTrack:
+        """Track of the next frames, a row each.
+
+        Args:
+            images: Grey, of all cameras at one moment each, without lens distortion.
+            times: Seconds, growing.
+
+        Raises:
+            ValueError: if images or times do not fit the rig and each other.
+        """
+        return self._following.process(images, times)
+
+
+def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:
+    """Whether landmarks given by a person can be used.
+
+    Raises:
+        ValueError: if they are not ten finite pixels.
+    """
+    if points is not None and (np.shape(points) != (NUM_LANDMARKS, 2) or not np.all(np.isfinite(points))):
+        raise ValueError(f"points must be ({NUM_LANDMARKS}, 2) finite pixels; got shape {np.shape(points)}.")
+
+
+class _HeadTracker:
+    """What `Following` asks of a tracker."""
+
+    def __init__(self, rig: CameraRig, options: HeadOptions, points: Float[np.ndarray, "K 2"] | None) -> None:
+        self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self._options, self._points = options, points
+        self._compiled, self._diffusion = compiled(options), first_diffusion(options)
+        self._searches = searches(rig, options)
+        self._finder: Finder = FINDERS[options.detector]()
+
+    @property
+    def can_wait(self) -> bool:
+        return self.is_live and self._points is None
+
+    def search(self, images: np.ndarray, time: float) -> tuple[_Found | None, list[str]]:
+        points, self._points = self._points, None
+        wrong: list[str] = []
+        if points is None:
+            finder = self._finder
+            points = finder.find(images[0])
+            wrong = list(finder.complaints)
+        if points is None:
+            return None, wrong
+        try:
+            if self.rig.num_cameras == 1:
+                registration = register_monocular(images[0], points, self.rig, num_modes=NUM_MODES)
+            else:
+                registration = register(images, points, self.rig, num_modes=NUM_MODES)
+        except RegistrationError as error:
+            return None, [*wrong, str(error)]
+        return _Found(registration, images, time), wrong
+
+    def forget(self) -> None:
+        self._finder.reset()
+
+    def begin(self, found: _Found, old: HeadState | None, frame: int) -> Beginning:
+        key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
+        face = found.registration
+        pose = jnp.asarray(face.pose, float)
+        start = jnp.zeros((), pose.dtype)
+        state = _begun(
+            key, face.model, pose, found.images, start, self.rig, options=self._compiled, diffusion=self._diffusion
+        )
+        kept = False
+        if old is not None:
+            state, kept = _with_known_face(state, old)
+        return Beginning(state, found.time, "registered" + (", a face that is known" if kept else ""))
+
+    def advance(
+        self, state: HeadState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray
+    ) -> tuple[HeadState, HeadTrack]:
+        return advance(self.rig, self._searches, state, images, clock, is_frame, self._compiled)
+
+    def empty(self, count: int) -> HeadTrack:
+        nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)
+        return HeadTrack(
+            pose=nothing(POSE),
+            pose_std=nothing(POSE),
+            deformation=nothing(NUM_MODES),
+            shape=nothing(NUM_LANDMARKS, 3),
+            image_points=nothing(self.rig.num_cameras, NUM_LANDMARKS, 2),
+            score=nothing(),
+            effective_sample_size=np.zeros(count, np.float32),
+            status=np.full(count, INITIALISING, np.int32),
+        )
+
+
+def _with_known_face(state: HeadState, old: HeadState) -> tuple[HeadState, bool]:
+    """The new state with what was learnt of deformations, if the face is that of before (specification, section 1)."""
+    R, t = align(old.registered.shape, state.registered.shape)
+    moved = old.registered.shape @ R.T + t
+    apart = float(jnp.sqrt(jnp.mean(jnp.sum((moved - state.registered.shape) ** 2, axis=-1))))
+    if not apart <= SAME_FACE_MM:
+        return state, False
+    turn = lambda vectors: (vectors.reshape(-1, NUM_LANDMARKS, 3) @ R.T).reshape(vectors.shape)
+    basis = turn(old.model.basis.T).T
+    modes = old.learner.subspace._replace(vectors=turn(old.learner.subspace.vectors))
+    model = FaceModel(state.model.mean, basis, old.model.deviation, state.model.templates)
+    learner = state.learner._replace(subspace=modes)
+    return state._replace(model=model, learner=learner, age=old.age), True

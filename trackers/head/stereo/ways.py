@@ -1,0 +1,137 @@
+"""What the modern tracker and the paper's do in a frame, side by side: `track` runs either, and knows of neither."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxfilters.filter import Filter
+from jaxfilters.math import diffusion
+from jaxfilters.models.face.alignment import facing
+from jaxfilters.models.face.patches import stretch, turned
+from jaxfilters.models.face.rig import CameraRig, jacobian
+from jaxfilters.models.face.rigid import remove_motion
+from jaxfilters.models.face.shape_model import FaceModel, shape
+from jaxfilters.particle.adaptive import AdaptiveDiffusionState
+from jaxfilters.particle.weighting import ParticleInfo
+from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.estimate import Estimate, around_mode, refined
+from jaxfilters.trackers.head.common.recent import latest_templates
+from jaxfilters.trackers.head.common.search import Searches, gathered
+from jaxfilters.trackers.head.common.state import PATIENCE, POSE, HeadOptions, HeadState
+
+Templates = tuple[Array, Array]
+"""(C, K, T, T) each: of the registered face, and of the face as it looked last."""
+
+
+class Way(NamedTuple):
+    """One tracker's part of every step."""
+
+    templates: Callable[[HeadState, FaceModel, CameraRig, Array], Templates]
+    """`(state, model, rig, predicted motion)`; templates are flat where a landmark is turned away."""
+    search: Callable[
+        [Callable[[Filter, Array], tuple[AdaptiveDiffusionState, ParticleInfo]], Searches, FaceModel], tuple
+    ]
+    """`(run, searches, model)`: one of the searches, run with a diffusion of the mode coefficients."""
+    estimate: Callable[..., tuple[Estimate, AdaptiveDiffusionState]]
+    """`(search, state, model, images, rig, predicted motion, frame times, options)`, and the search after it."""
+    measured: Callable[..., Templates]
+    """`(state, estimate, images, rig, whether it is measured)`: the shape that is learnt, the windows about it."""
+    follow: float
+    """How far the mean shape goes along with those that are measured."""
+    still: learning.Still
+    """How the skull's motion is taken out of them."""
+    sharpens: bool
+    """Whether the registered shape is triangulated anew."""
+
+
+def _turned_templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array) -> Templates:
+    """As the head is expected to be turned; landmarks that have changed since registration also as they looked last.
+
+    Where a face was lost the last frame shows something else.
+    """
+    x, face = state.belief.mean, state.registered.patches
+    M, pose = shape(model, x[POSE:]), x[:POSE] + moved
+    by_shape, _ = jacobian(rig, M, pose)
+    is_facing = facing(face, by_shape)[..., None, None]
+    affine = jnp.where(is_facing, stretch(face, state.slopes, by_shape), jnp.eye(2))
+    templates = jnp.where(is_facing, turned(face, affine), 0.0)
+    latest = latest_templates(state.recent, state.slopes, templates, M, pose, rig)
+    return templates, jnp.where(state.misses < PATIENCE, latest, templates)
+
+
+def _flat_templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array) -> Templates:
+    """As registered."""
+    del state, rig, moved
+    return model.templates, model.templates
+
+
+def _rigid_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
+    return run(searches.rigid, jnp.zeros_like(model.deviation))
+
+
+def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
+    """Particles deform where the model does."""
+    learnt = jnp.any(model.deviation > 0)
+    return jax.lax.cond(
+        learnt, lambda: run(searches.layered, model.deviation), lambda: _rigid_search(run, searches, model)
+    )
+
+
+def _refined(
+    search: AdaptiveDiffusionState,
+    state: HeadState,
+    model: FaceModel,
+    images: Array,
+    rig: CameraRig,
+    moved: Array,
+    steps: Array,
+    options: HeadOptions,
+) -> tuple[Estimate, AdaptiveDiffusionState]:
+    """The fit; particles, velocity and diffusion follow it."""
+    estimate = refined(search, state, model, images, rig, moved)
+    before, x = state.search, estimate.belief.mean
+    velocity = (x - before.estimate)[:POSE] / jnp.maximum(before.elapsed + steps, 1e-3)
+    fit = before.fit
+    if options.diffusion == "learnt":
+        fit = diffusion.update(fit, before.velocity, velocity - before.velocity)
+    after = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=fit)
+    return estimate, jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), after, search)
+
+
+def _around_mode(
+    search: AdaptiveDiffusionState,
+    state: HeadState,
+    model: FaceModel,
+    images: Array,
+    rig: CameraRig,
+    moved: Array,
+    steps: Array,
+    options: HeadOptions,
+) -> tuple[Estimate, AdaptiveDiffusionState]:
+    """What the search itself has made."""
+    del images, rig, moved, steps, options
+    return around_mode(search, state, model), search
+
+
+def _as_estimated(state: HeadState, estimate: Estimate, images: Array, rig: CameraRig, is_measured: Array) -> Templates:
+    del images, rig, is_measured
+    return estimate.measured, state.learner.windows
+
+
+def _recalculated(state: HeadState, estimate: Estimate, images: Array, rig: CameraRig, is_measured: Array) -> Templates:
+    again = partial(learning.recalculated, state.learner, estimate.shape, images, state.model.templates)
+    nothing = lambda: (estimate.measured, state.learner.windows)
+    return jax.lax.cond(is_measured, lambda: again(estimate.belief.mean[:POSE], rig), nothing)
+
+
+WAYS = {
+    "modern": Way(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
+    "paper": Way(
+        _flat_templates, _layered_search, _around_mode, _recalculated, 1.0, learning.without_weighted_motion, False
+    ),
+}
+"""By `HeadOptions.mode`."""

@@ -1,0 +1,140 @@
+"""Multilinear models of the face on disk, and the one that comes with the package.
+
+An `.npz` with the arrays `mean` (K, 3) and `tensor` (K, 3, S, A) in millimetres, `identity_mean` (S,),
+`identity_covariance` (S, S), `expression_mean` (A,), `expression_covariance` (A, A), and `header`, a text in JSON:
+
+    {"format": "jaxfilters face model", "version": 1, "source": "where the faces are from", "units": "mm",
+     "names": [K names of landmarks], "pairs": [[right, left], ...], "parameters": {...}}
+
+x is to the image's right, y down, z away from a camera that the face faces. `jaxfilters fit face-model` writes them.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.models.face.mirroring import Pairs, mirror_map
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.trackers.io.checkpoint import write_npz
+from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.npz import read_npz
+from jaxfilters.trackers.io.npz_headers import read_header
+
+FORMAT, VERSION = "jaxfilters face model", 1
+DEFAULT_FILE = Path(__file__).with_name("face_model.npz")
+"""What `jaxfilters fit face-model` makes without data: faces of the generator."""
+_ARRAYS = {
+    "mean": ("K", 3),
+    "tensor": ("K", 3, "S", "A"),
+    "identity_mean": ("S",),
+    "identity_covariance": ("S", "S"),
+    "expression_mean": ("A",),
+    "expression_covariance": ("A", "A"),
+}
+_WANTED = f"expected an .npz of `jaxfilters fit face-model`, with {', '.join(_ARRAYS)} and header"
+
+
+class FaceModelFile(NamedTuple):
+    """A model of the face, and what is known of it."""
+
+    model: MultilinearFace
+    names: tuple[str, ...]
+    """Of the landmarks."""
+    pairs: Pairs
+    """(right, left) indices of landmarks."""
+    source: str
+    """Where the faces are from."""
+    parameters: dict[str, Any]
+    """How the model was made."""
+
+
+def save_face_model(path: str | Path, file: FaceModelFile) -> None:
+    """Write a model; its folder is made if need be.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "source": file.source,
+        "units": "mm",
+        "names": list(file.names),
+        "pairs": [[int(index) for index in pair] for pair in file.pairs],
+        "parameters": file.parameters,
+    }
+    arrays = {name: np.asarray(getattr(file.model, name)) for name in _ARRAYS}
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_npz(Path(path), {"header": np.asarray(json.dumps(header, allow_nan=False)), **arrays})
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}.") from None
+
+
+def load_face_model(path: str | Path) -> FaceModelFile:
+    """A model as it was written, in JAX's default precision.
+
+    Raises:
+        InputError: an unreadable or foreign file, another version, arrays that do not fit each other or are not finite,
+            or covariances that are none.
+    """
+    path = Path(path)
+    arrays, header = _read(path)
+    sizes: dict[str, int] = {}
+    for name, shape in _ARRAYS.items():
+        _check_array(arrays[name], name, shape, sizes, path)
+    for name in ("identity_covariance", "expression_covariance"):
+        _check_covariance(arrays[name], name, path)
+    names, pairs = _landmarks(header, sizes["K"], path)
+    model = MultilinearFace(**{name: jnp.asarray(arrays[name], float) for name in _ARRAYS})
+    parameters = header.get("parameters", {})
+    return FaceModelFile(model, names, pairs, str(header.get("source", "")), parameters)
+
+
+def default_face_model() -> FaceModelFile:
+    """The model that comes with the package: ten landmarks, learnt from faces of the generator."""
+    return load_face_model(DEFAULT_FILE)
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = read_npz(path, _WANTED)
+    if missing := [name for name in (*_ARRAYS, "header") if name not in arrays]:
+        raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
+    return arrays, read_header(arrays, path, FORMAT, VERSION)
+
+
+def _check_array(array: np.ndarray, name: str, shape: tuple, sizes: dict[str, int], path: Path) -> None:
+    """Sizes that arrays share are those of the first that has them."""
+    fits = array.ndim == len(shape) and array.dtype.kind == "f"
+    if fits:
+        expected = tuple(
+            sizes.setdefault(s, n) if isinstance(s, str) else s for s, n in zip(shape, array.shape, strict=True)
+        )
+        fits = array.shape == expected and array.size > 0
+    if not fits:
+        raise InputError(f"{path}: {name} must be numbers {shape} with {sizes}; got {array.shape} {array.dtype}.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{path}: {name} must be finite.")
+
+
+def _check_covariance(array: np.ndarray, name: str, path: Path) -> None:
+    scale = np.abs(array).max()
+    if np.abs(array - array.T).max() > 1e-5 * scale or np.linalg.eigvalsh(array).min() < -1e-5 * scale:
+        raise InputError(f"{path}: {name} must be symmetric and positive semidefinite.")
+    if np.any(np.diagonal(array) <= 0):
+        raise InputError(f"{path}: {name} must have positive variances; got {np.diagonal(array)}.")
+
+
+def _landmarks(header: dict[str, Any], num_landmarks: int, path: Path) -> tuple[tuple[str, ...], Pairs]:
+    names, pairs = header.get("names"), header.get("pairs", ())
+    if not isinstance(names, list) or len(names) != num_landmarks:
+        raise InputError(f"{path}: names must be of {num_landmarks} landmarks; got {names!r}.")
+    try:
+        checked = tuple((int(right), int(left)) for right, left in pairs)
+        mirror_map(checked, num_landmarks)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: pairs must be [right, left] indices of landmarks ({error}).") from None
+    return tuple(str(name) for name in names), checked

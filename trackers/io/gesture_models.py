@@ -1,0 +1,169 @@
+"""Models of symbols on disk, and the one that comes with the package.
+
+An `.npz` with the arrays `owner` (m,), the symbol that each model is a way to draw; `log_initial` (m, Q) and
+`log_transition` (m, Q, Q) of the models; those of their emission, and `header`, a text in JSON:
+
+    {"format": "jaxfilters symbols", "version": 1, "names": [...], "emission": "shape" or "codes",
+     "settings": {...}, "source": "what was learnt from", "parameters": {...}}
+
+States of kind `shape` have `mean` and `variance` (m, Q, 3 d + 2) of the features of strokes in d dimensions, those of
+kind `codes` `log_codes` (m, Q, 17) and `log_counts` (m, Q, 6). `jaxfilters fit gestures` writes such files.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters import hmm
+from jaxfilters.hmm import HiddenMarkovModel
+from jaxfilters.models.gesture.codes import MOST_TIPS, STILL
+from jaxfilters.models.gesture.symbols import Symbols
+from jaxfilters.trackers.io.checkpoint import write_npz
+from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.json_text import parse_json
+from jaxfilters.trackers.io.npz import read_npz
+
+FORMAT, VERSION = "jaxfilters symbols", 1
+DEFAULT_FILE = Path(__file__).with_name("gesture_model.npz")
+"""What `jaxfilters fit gestures` makes without data: twelve shapes, drawn by writers of the generator."""
+SHAPE, CODES = "shape", "codes"
+_ARRAYS = {SHAPE: ("mean", "variance"), CODES: ("log_codes", "log_counts")}
+_SETTINGS = {SHAPE: "min_variance", CODES: "pseudo_count"}
+_WANTED = "expected an .npz of `jaxfilters fit gestures`"
+
+
+class SymbolsFile(NamedTuple):
+    """Models of symbols, and what is known of them."""
+
+    symbols: Symbols
+    source: str
+    """What was learnt from."""
+    parameters: dict[str, Any]
+    """How."""
+
+    @property
+    def dimensions(self) -> int:
+        """Of strokes that the models know; 0 for models of direction codes."""
+        emission = self.symbols.models.emission
+        return (emission.mean.shape[-1] - 2) // 3 if isinstance(emission, hmm.DiagonalGaussian) else 0
+
+    @property
+    def min_variance(self) -> float | None:
+        """Floor of the variances of features, with which they were trained; `None` for models of direction codes."""
+        emission = self.symbols.models.emission
+        return emission.min_variance if isinstance(emission, hmm.DiagonalGaussian) else None
+
+
+def write_symbols(path: str | Path, file: SymbolsFile) -> None:
+    """Write models; their folder is made if need be.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    models = file.symbols.models
+    emission: Any = models.emission
+    if isinstance(emission, hmm.DiagonalGaussian):
+        kind, values, setting = SHAPE, (emission.mean, emission.variance), emission.min_variance
+    else:
+        directions, tips = emission.parts
+        kind, values = CODES, (directions.log_probability, tips.log_probability)
+        setting = directions.pseudo_count
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "names": list(file.symbols.names),
+        "emission": kind,
+        "settings": {_SETTINGS[kind]: setting},
+        "source": file.source,
+        "parameters": file.parameters,
+    }
+    arrays = {
+        "header": np.asarray(json.dumps(header, allow_nan=False)),
+        "owner": np.asarray(file.symbols.owner, np.int32),
+        "log_initial": np.asarray(models.log_initial, np.float32),
+        "log_transition": np.asarray(models.log_transition, np.float32),
+        **{name: np.asarray(value, np.float32) for name, value in zip(_ARRAYS[kind], values, strict=True)},
+    }
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_npz(Path(path), arrays)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}.") from None
+
+
+def read_symbols(path: str | Path) -> SymbolsFile:
+    """Models as they were written, in JAX's default precision.
+
+    Raises:
+        InputError: an unreadable or foreign file, another version, an unknown kind of emission, or arrays that do not
+            fit each other or hold what no model has.
+    """
+    path = Path(path)
+    arrays, header = _read(path)
+    kind, names = header.get("emission"), header.get("names")
+    if kind not in _ARRAYS:
+        raise InputError(f"{path}: emission must be one of {', '.join(_ARRAYS)}; got {kind!r}.")
+    if not isinstance(names, list) or not names or len(set(names)) != len(names):
+        raise InputError(f"{path}: names must be of one symbol or more, none twice; got {names!r}.")
+    _check(arrays, kind, len(names), path)
+    setting = header.get("settings", {}).get(_SETTINGS[kind])
+    if not isinstance(setting, int | float) or not setting >= 0:
+        raise InputError(f"{path}: settings must say {_SETTINGS[kind]}, not negative; got {setting!r}.")
+    first, second = (jnp.asarray(arrays[name], float) for name in _ARRAYS[kind])
+    emission: hmm.Emission
+    if kind == SHAPE:
+        emission = hmm.DiagonalGaussian(first, second, float(setting))
+    else:
+        emission = hmm.Independent((hmm.Codes(first, float(setting)), hmm.Codes(second, float(setting))))
+    models = HiddenMarkovModel(
+        jnp.asarray(arrays["log_initial"], float), jnp.asarray(arrays["log_transition"], float), emission
+    )
+    symbols = Symbols(models, jnp.asarray(arrays["owner"], jnp.int32), tuple(str(name) for name in names))
+    return SymbolsFile(symbols, str(header.get("source", "")), header.get("parameters", {}))
+
+
+def default_symbols() -> SymbolsFile:
+    """The models that come with the package: twelve shapes, each drawn with one finger or with two."""
+    return read_symbols(DEFAULT_FILE)
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = read_npz(path, _WANTED)
+    header = parse_json(str(arrays.get("header", "")), f"{path}: header", _WANTED)
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f'{path}: header must say format "{FORMAT}"; {_WANTED}.')
+    if header.get("version") != VERSION:
+        raise InputError(f"{path}: version {header.get('version')}; this program reads version {VERSION}.")
+    return arrays, header
+
+
+def _check(arrays: dict[str, np.ndarray], kind: str, num_names: int, path: Path) -> None:
+    needed = ("owner", "log_initial", "log_transition", *_ARRAYS[kind])
+    if missing := [name for name in needed if name not in arrays]:
+        raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
+    num_models, num_states = (*arrays["log_initial"].shape, 0, 0)[:2]
+    symbols = (arrays[_ARRAYS[kind][0]].shape or (0,))[-1:]
+    shapes = {
+        "owner": (num_models,),
+        "log_initial": (num_models, num_states),
+        "log_transition": (num_models, num_states, num_states),
+        "mean": (num_models, num_states, *symbols),
+        "variance": (num_models, num_states, *symbols),
+        "log_codes": (num_models, num_states, STILL),
+        "log_counts": (num_models, num_states, MOST_TIPS + 1),
+    }
+    for name in needed:
+        if arrays[name].shape != shapes[name] or arrays[name].dtype.kind != ("i" if name == "owner" else "f"):
+            raise InputError(
+                f"{path}: {name} must be numbers {shapes[name]}; got {arrays[name].shape} {arrays[name].dtype}."
+            )
+        logs = name.startswith("log")
+        if np.any(np.isnan(arrays[name])) or np.any(arrays[name] > 1e-3 if logs else np.isinf(arrays[name])):
+            raise InputError(f"{path}: {name} must be {'logarithms of probabilities' if logs else 'finite'}.")
+    if set(arrays["owner"].tolist()) != set(range(num_names)):
+        raise InputError(f"{path}: owner must give each of {num_names} symbols a model; got {arrays['owner']}.")
+    if kind == SHAPE and ((symbols[0] - 2) not in (6, 9) or np.any(arrays["variance"] <= 0)):
+        raise InputError(f"{path}: mean and variance must be of 8 or 11 features, variances positive.")

@@ -1,0 +1,285 @@
+"""21 keypoints of a hand over time, as detectors write them: OpenPose's folders, MediaPipe's landmarks, tables.
+
+Formats, as their authors document them. OpenPose (`--hand --write_json`): one `*_keypoints.json` a frame with `people`,
+each with `hand_left_keypoints_2d` and `hand_right_keypoints_2d`, 63 numbers x, y, confidence; 0, 0, 0 for a keypoint
+that was not found, no numbers without a hand, no people without a person. MediaPipe: `x` and `y` as shares of the
+image's width and height, `z` a depth that is not used, and `visibility` that its model of hands leaves at 0. Both count
+wrist, thumb 1-4, index, middle, ring, little finger, base to tip.
+"""
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxfilters.trackers.articulated.recording import NUM_KEYPOINTS
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.json_text import read_json_text
+
+_SHORTEST_STEP_US = 1000
+"""Numbers of frames that step by less count frames, not microseconds: no camera runs at 1 kHz."""
+_LARGEST_SHARE = 2.0
+"""Coordinates that all stay within it are shares of the image, some of them outside: no hand fits into two pixels."""
+_MOST_GAPS = 100
+"""Missing frames per frame that is there, at most: beyond it the numbers are no frame numbers."""
+_HANDS = ("landmarks", "hand_landmarks", "multi_hand_landmarks", "multiHandLandmarks", "landmark")
+"""What the detector's own interfaces call a frame's hands, or a hand's landmarks."""
+
+
+class Detections(NamedTuple):
+    """One hand over time; pixels or shares of the image."""
+
+    times_s: np.ndarray
+    """(frames,)."""
+    points: np.ndarray
+    """(frames, 21, 2), NaN where nothing was found."""
+    confidence: np.ndarray
+    """(frames, 21), 0 where nothing was found."""
+
+
+def read(path: Path, hand: str, fps: float) -> Detections:
+    """A folder of OpenPose's files, or a `.json` or `.csv` of MediaPipe's landmarks.
+
+    Args:
+        path: The folder or file, which exists.
+        hand: `right` or `left`, where files hold both.
+        fps: Frames per second where there are no times.
+
+    Raises:
+        InputError: the file is damaged or of another form, or shows several hands at once.
+    """
+    if path.is_dir():
+        return _read_openpose(path, hand, fps)
+    readers: dict[str, Callable[[Path, float], Detections]] = {".json": _read_mediapipe, ".csv": _read_table}
+    if path.suffix not in readers:
+        raise InputError(
+            f"{path}: expected a folder of OpenPose's *_keypoints.json, or a .json, .csv or .npz file; "
+            f"got suffix {path.suffix!r}."
+        )
+    return readers[path.suffix](path, fps)
+
+
+def looks_normalized(points: np.ndarray) -> bool:
+    """Whether coordinates, NaN aside, can only be shares of the image's width and height."""
+    seen = points[np.isfinite(points)]
+    return bool(seen.size) and float(np.abs(seen).max()) <= _LARGEST_SHARE
+
+
+def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
+    files = sorted(folder.glob("*_keypoints.json"))
+    if not files:
+        raise InputError(f"{folder}: no *_keypoints.json in it, which OpenPose's --write_json writes.")
+    found = [re.search(r"(\d+)_keypoints$", file.stem) for file in files]
+    numbers = np.arange(len(files), dtype=float)
+    if all(found):
+        numbers = np.asarray([float(match[1]) for match in found if match])
+        order = np.argsort(numbers, kind="stable")
+        files, numbers = [files[i] for i in order], numbers[order]
+        if (same := np.flatnonzero(np.diff(numbers) == 0)).size:
+            one, other = files[same[0]].name, files[same[0] + 1].name
+            raise InputError(f"{folder}: {one} and {other} have one frame number; a folder must hold one recording.")
+    hands = {side: [_openpose_hand(file, side) for file in files] for side in ("right", "left")}
+    seen = {side: any(numbers.any() for numbers in frames) for side, frames in hands.items()}
+    other = "left" if hand == "right" else "right"
+    if not seen[hand]:
+        hint = f"; there are {other} hands: --hand {other}" if seen[other] else " (OpenPose needs --hand)"
+        raise InputError(f"{folder}: no {hand} hand in any of {len(files)} frames{hint}.")
+    values = np.stack(hands[hand])
+    confidence = values[..., 2]
+    points = np.where(confidence[..., None] == 0, np.nan, values[..., :2])
+    return Detections(_times_of(numbers, fps), points, confidence)
+
+
+def _openpose_hand(file: Path, side: str) -> np.ndarray:
+    """(21, 3): x, y, confidence; zeros without a hand."""
+    frame = _json(file)
+    people = frame.get("people") if isinstance(frame, dict) else None
+    if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
+        raise InputError(f'{file}: expected {{"people": [...]}} as OpenPose writes it.')
+    key, hands = f"hand_{side}_keypoints_2d", []
+    for person in people:
+        numbers = _array(file, key, person.get(key) or [])
+        if numbers.size and numbers.shape != (3 * NUM_KEYPOINTS,):
+            raise InputError(f"{file}: {key} must be {3 * NUM_KEYPOINTS} numbers or none; got shape {numbers.shape}.")
+        if numbers.any():
+            hands.append(numbers.reshape(NUM_KEYPOINTS, 3))
+    if len(hands) > 1:
+        raise InputError(
+            f"{file}: {len(hands)} people with a {side} hand; expected at most one (OpenPose's --number_people_max 1)."
+        )
+    return hands[0] if hands else np.zeros((NUM_KEYPOINTS, 3))
+
+
+def _read_mediapipe(file: Path, fps: float) -> Detections:
+    frames = _json(file)
+    if isinstance(frames, dict) and "people" in frames:
+        raise InputError(f"{file}: one frame of OpenPose; give the folder that holds it.")
+    if not isinstance(frames, list):
+        raise InputError(f"{file}: expected a list with 21 landmarks for each frame; got a {type(frames).__name__}.")
+    named = [(frame, f"{file}: frame {i}") for i, frame in enumerate(frames)]
+    hands = [_mediapipe_hand(_hand_of(frame, name), name) for frame, name in named]
+    values = np.stack(hands) if hands else np.zeros((0, NUM_KEYPOINTS, 3))
+    times = [frame.get("time_s") if isinstance(frame, dict) else None for frame in frames]
+    if len(known := [time for time in times if time is not None]) not in (0, len(frames)):
+        raise InputError(f"{file}: time_s must be in every frame or in none; {len(known)} of {len(frames)} have it.")
+    times_s = _array(file, "time_s", known) if known else np.arange(len(frames)) / fps
+    return _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+
+
+def _hand_of(frame: Any, name: str) -> list[Any]:
+    """The landmarks of the one hand in a frame, an empty list without a hand."""
+    while isinstance(frame, dict):
+        keys = [key for key in _HANDS if key in frame]
+        if not keys:
+            raise InputError(f"{name}: expected landmarks; got an object with {sorted(frame)}.")
+        frame = frame[keys[0]]
+    if frame is None or frame == []:
+        return []
+    if not isinstance(frame, list):
+        raise InputError(f"{name}: expected a list of landmarks; got a {type(frame).__name__}.")
+    is_landmark = isinstance(frame[0], dict) and "x" in frame[0]
+    if is_landmark:
+        return frame
+    if len(frame) > 1:
+        raise InputError(f"{name}: {len(frame)} hands; expected at most one (MediaPipe's num_hands=1).")
+    return _hand_of(frame[0], name)
+
+
+def _mediapipe_hand(landmarks: list[Any], name: str) -> np.ndarray:
+    """(21, 3): x, y, visibility; NaN for what is not there."""
+    if not landmarks:
+        return np.full((NUM_KEYPOINTS, 3), np.nan)
+    if len(landmarks) != NUM_KEYPOINTS:
+        raise InputError(f"{name}: expected {NUM_KEYPOINTS} landmarks; got {len(landmarks)}.")
+    rows = []
+    for i, landmark in enumerate(landmarks):
+        if not isinstance(landmark, dict) or not {"x", "y"} <= set(landmark):
+            raise InputError(f'{name}, landmark {i}: expected {{"x", "y"}}; got {landmark!r}.')
+        visibility = landmark.get("visibility")
+        rows.append([landmark["x"], landmark["y"], np.nan if visibility is None else visibility])
+    return _array(name, "landmarks", rows)
+
+
+def _read_table(file: Path, fps: float) -> Detections:
+    """One landmark a row (frame, landmark, x, y) or one frame a row (x0, y0 to x20, y20)."""
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as content:
+            header, *lines = [row for row in csv.reader(content) if row] or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file}: not a table ({error}).") from None
+    columns = {name.strip().lower(): place for place, name in enumerate(header)}
+    table = np.full((len(lines), len(header)), np.nan)
+    wanted = {"frame", "landmark", "x", "y", "visibility", "confidence", "time_s"}
+    wanted |= {f"{letter}{i}" for letter in "xyc" for i in range(NUM_KEYPOINTS)}
+    for i, line in enumerate(lines):
+        if len(line) != len(header):
+            raise InputError(f"{file}: row {i + 1} has {len(line)} entries, its header {len(header)} (truncated?).")
+        for name in wanted & set(columns):
+            table[i, columns[name]] = _number(file, line[columns[name]], name, i + 1)
+    cells = {name: table[:, columns[name]] for name in wanted & set(columns)}
+    if {"frame", "landmark", "x", "y"} <= set(cells):
+        numbers, values, times = _from_long(file, cells)
+    elif all(f"{letter}{i}" in cells for letter in "xy" for i in range(NUM_KEYPOINTS)):
+        numbers, values, times = _from_wide(file, cells)
+    else:
+        raise InputError(
+            f"{file}: expected the columns frame, landmark, x, y (and visibility, time_s), or x0, y0 to x20, y20 (and "
+            f"c0 to c20, frame, time_s); got {', '.join(header) or 'nothing'}."
+        )
+    if not len(numbers):
+        raise InputError(f"{file}: no rows in it.")
+    return _with_gaps(file, numbers, values, times, fps)
+
+
+def _from_long(file: Path, cells: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    frames, landmarks = (_whole(file, name, cells[name]) for name in ("frame", "landmark"))
+    if (wrong := (landmarks < 0) | (landmarks >= NUM_KEYPOINTS)).any():
+        raise InputError(f"{file}: landmark must be 0 to {NUM_KEYPOINTS - 1}; got {landmarks[wrong][0]}.")
+    numbers, places = np.unique(frames, return_inverse=True)
+    pairs, counts = np.unique(np.stack([frames, landmarks]), axis=1, return_counts=True)
+    if (counts > 1).any():
+        frame, landmark = pairs[:, np.argmax(counts > 1)]
+        raise InputError(
+            f"{file}: {counts.max()} hands; expected at most one: landmark {landmark} of frame {frame} is there again."
+        )
+    values = np.full((len(numbers), NUM_KEYPOINTS, 3), np.nan)
+    missing = np.full(len(frames), np.nan)
+    confidence = cells.get("confidence", _visibility(cells.get("visibility", missing)))
+    values[places, landmarks] = np.stack([cells["x"], cells["y"], confidence], axis=1)
+    if "time_s" not in cells:
+        return numbers, values, None
+    times = np.full(len(numbers), np.nan)
+    times[places] = cells["time_s"]
+    return numbers, values, times
+
+
+def _from_wide(file: Path, cells: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    rows = len(cells["x0"])
+    missing = np.full(rows, np.nan)
+    columns = [[cells.get(f"{letter}{i}", missing) for letter in "xyc"] for i in range(NUM_KEYPOINTS)]
+    values = np.moveaxis(np.asarray(columns), -1, 0)
+    numbers = _whole(file, "frame", cells["frame"]) if "frame" in cells else np.arange(rows)
+    return numbers, values, cells.get("time_s")
+
+
+def _with_gaps(file: Path, numbers: np.ndarray, values: np.ndarray, times: np.ndarray | None, fps: float) -> Detections:
+    """Frames that the table leaves out, because nothing was found in them, as frames in which nothing was found."""
+    steps = np.diff(numbers)
+    if (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        raise InputError(f"{file}: frames must increase; frame {numbers[i + 1]} follows frame {numbers[i]}.")
+    if times is not None and not np.isfinite(times).all():
+        frame = numbers[~np.isfinite(times)][0]
+        raise InputError(f"{file}: time_s must be a number in every row; frame {frame} lacks it.")
+    step = int(np.gcd.reduce(steps)) if len(steps) else 1
+    places = (numbers - numbers[0]) // step
+    if places[-1] + 1 > _MOST_GAPS * len(numbers):
+        raise InputError(f"{file}: {len(numbers)} frames numbered from {numbers[0]} to {numbers[-1]}: too many gaps.")
+    whole = np.full((places[-1] + 1, NUM_KEYPOINTS, 3), np.nan)
+    whole[places] = values
+    every = numbers[0] + step * np.arange(len(whole))
+    times_s = _times_of(every.astype(float), fps) if times is None else np.interp(every, numbers, times)
+    return _detections(times_s, whole[..., :2], whole[..., 2])
+
+
+def _detections(times_s: np.ndarray, points: np.ndarray, confidence: np.ndarray) -> Detections:
+    """Confidence 1 where a keypoint has none, 0 where it was not found."""
+    found = ~np.isnan(points).any(axis=-1)
+    return Detections(times_s, points, np.where(found, np.where(np.isnan(confidence), 1.0, confidence), 0.0))
+
+
+def _visibility(values: np.ndarray) -> np.ndarray:
+    """As it is, or NaN where the detector left all of them at 0: they mean nothing then."""
+    return values if np.nan_to_num(values).any() else np.full_like(values, np.nan)
+
+
+def _times_of(numbers: np.ndarray, fps: float) -> np.ndarray:
+    in_microseconds = len(numbers) > 1 and np.median(np.diff(numbers)) >= _SHORTEST_STEP_US
+    return numbers * 1e-6 if in_microseconds else numbers / fps
+
+
+def _json(file: Path) -> Any:
+    return read_json_text(file, "expected landmarks of a hand")
+
+
+def _array(name: Any, what: str, numbers: Any) -> np.ndarray:
+    try:
+        return np.asarray(numbers, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {what} must be numbers.") from None
+
+
+def _number(file: Path, text: str, column: str, row: int) -> float:
+    try:
+        return float(text) if text.strip() else np.nan
+    except ValueError:
+        raise InputError(f"{file}: row {row}, {column}: expected a number; got {text!r}.") from None
+
+
+def _whole(file: Path, name: str, values: np.ndarray) -> np.ndarray:
+    if not (np.isfinite(values) & (values == np.floor(values))).all():
+        raise InputError(f"{file}: {name} must be whole numbers.")
+    return values.astype(np.int64)

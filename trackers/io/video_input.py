@@ -1,0 +1,241 @@
+"""Where images come from: video files, folders of images, and live cameras; several of them on one clock."""
+
+import math
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.images import images_in, read_image
+
+DEFAULT_FPS = 30.0
+PRIMING_IMAGES = 40
+"""Images from which the empty room is learnt before a recording is followed."""
+SILENT_S = 2.0
+"""A live camera that delivers nothing for so long has stopped."""
+
+
+@runtime_checkable
+class VideoSource(Protocol):
+    """One camera's images in their order."""
+
+    name: str
+    image_size: tuple[int, int]
+    """Columns and rows."""
+    fps: float
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        """Up to `most` images spread over the recording; none of a live camera."""
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        """Seconds and the image (rows, cols, 3); None where a live camera has nothing new.
+
+        Recordings begin at 0; live cameras share a clock, which began some time before.
+        """
+
+    def trouble(self) -> str | None:
+        """What went wrong while it was read, for a person; None if nothing did."""
+
+
+def open_video(place: str, *, fps: float | None = None) -> VideoSource:
+    """A video file, a folder of images, or the number of a live camera.
+
+    Args:
+        place: A path, or a number such as 0.
+        fps: Frames per second of a recording, in place of what it says of itself.
+
+    Raises:
+        InputError: nothing there, nothing that OpenCV can read, or a rate that is not finite and positive.
+    """
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise InputError(f"fps must be finite and above 0; got {fps}.")
+    if place.isdecimal():
+        return LiveCamera(int(place))
+    path = Path(place)
+    if path.is_dir():
+        return ImageFolder(path, fps or DEFAULT_FPS)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; a live camera is given by its number, as in 0.")
+    return VideoFile(path, fps)
+
+
+class VideoFile:
+    """A video that OpenCV can decode."""
+
+    def __init__(self, path: Path, fps: float | None = None):
+        self.name, self._path, self._is_stamped = str(path), path, fps is None
+        capture = self._open()
+        self.image_size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        self.fps = fps or _rate(float(capture.get(cv2.CAP_PROP_FPS)))
+        self.frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        capture.release()
+        self._trouble: str | None = None
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened() or not capture.get(cv2.CAP_PROP_FRAME_WIDTH):
+            raise InputError(f"{self.name}: not a video that can be decoded (damaged, empty, or an unknown codec).")
+        return capture
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        """Every n-th image; decoded in order, since seeking is not exact in all containers."""
+        every = max(1, self.frames // most)
+        return [image for i, (_, image) in enumerate(self.images()) if i % every == 0 and image is not None][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        capture, done = self._open(), 0
+        stamps = _Stamps(1 / self.fps)
+        try:
+            while True:
+                there, image = capture.read()
+                if not there:
+                    break
+                said_s = stamps.next(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+                yield (said_s if self._is_stamped else done / self.fps), image
+                done += 1
+        finally:
+            capture.release()
+        if done == 0:
+            raise InputError(f"{self.name}: no frame can be decoded.")
+        if self.frames > 0 and done < self.frames:
+            self._trouble = f"{self.name}: ends after {done} of {self.frames} frames (cut off or damaged)"
+
+    def trouble(self) -> str | None:
+        return self._trouble
+
+
+def _rate(claimed: float) -> float:
+    """Frames per second as a file claims them, or the usual ones where it claims none or nonsense."""
+    return claimed if math.isfinite(claimed) and claimed > 0 else DEFAULT_FPS
+
+
+class _Stamps:
+    """Times of the frames of a video as its file says them, from the first one.
+
+    Where it says nothing of use, a frame is one period after the one before.
+    """
+
+    def __init__(self, period_s: float):
+        self._period_s, self._first_s, self._last_s = period_s, 0.0, -period_s
+
+    def next(self, said_s: float) -> float:
+        if self._last_s < 0:
+            self._first_s = said_s
+        said_s -= self._first_s
+        is_later = np.isfinite(said_s) and said_s > self._last_s
+        self._last_s = said_s if is_later else self._last_s + self._period_s
+        return self._last_s
+
+
+class ImageFolder:
+    """Images of one size in a folder, in the order of their names."""
+
+    def __init__(self, path: Path, fps: float):
+        self.name, self.fps = str(path), fps
+        self._files = images_in(path)
+        rows, cols = read_image(self._files[0]).shape[:2]
+        self.image_size, self.frames = (cols, rows), len(self._files)
+
+    def numbers(self) -> np.ndarray | None:
+        """The numbers with which the names end, counters or time stamps; None unless all have one and they grow."""
+        ends = [re.search(r"(\d+)$", file.stem) for file in self._files]
+        found = np.asarray([int(end[0]) for end in ends if end is not None], float)
+        return found if len(found) == len(ends) and (np.diff(found) > 0).all() else None
+
+    def sample(self, most: int) -> list[np.ndarray]:
+        return [read_image(file) for file in self._files[:: max(1, len(self._files) // most)]][:most]
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        for i, file in enumerate(self._files):
+            image = read_image(file)
+            if image.shape[1::-1] != self.image_size:
+                raise InputError(f"{file}: {image.shape[1]}x{image.shape[0]} pixels; the first has {self.image_size}.")
+            yield i / self.fps, image
+
+    def trouble(self) -> str | None:
+        return None
+
+
+class LiveCamera:
+    """A camera of this machine, read in a thread of its own: the newest image counts, what was missed is missed."""
+
+    def __init__(self, number: int):
+        self.name = f"camera {number}"
+        self._capture = cv2.VideoCapture(number)
+        there, image = self._capture.read()
+        if not there:
+            self._capture.release()
+            raise InputError(f"{self.name}: cannot be opened, or delivers no image.")
+        self.image_size = (image.shape[1], image.shape[0])
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self._newest: tuple[float, np.ndarray] | None = None
+        self._trouble: str | None = None
+        self._lock, self._arrived, self._over = threading.Lock(), threading.Event(), threading.Event()
+
+    def sample(self, most: int) -> list[np.ndarray]:  # noqa: ARG002
+        return []
+
+    def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        threading.Thread(target=self._follow, daemon=True).start()
+        began = heard = time.monotonic()
+        try:
+            while True:
+                self._arrived.wait(1 / self.fps)
+                with self._lock:
+                    newest, self._newest = self._newest, None
+                    self._arrived.clear()
+                now = time.monotonic()
+                heard = now if newest is not None else heard
+                if now - heard > SILENT_S and self._trouble is None:
+                    self._trouble = f"{self.name}: no image since {heard - began:.0f} s after the start"
+                yield (now, None) if newest is None else newest
+        finally:
+            self._over.set()
+
+    def _follow(self) -> None:
+        while not self._over.is_set():
+            there, image = self._capture.read()
+            if not there:
+                time.sleep(0.05)
+                continue
+            with self._lock:
+                self._newest = (time.monotonic(), image)
+            self._arrived.set()
+
+    def trouble(self) -> str | None:
+        return self._trouble
+
+
+class Moment(NamedTuple):
+    """What all sources have at one time."""
+
+    time_s: float
+    """From the first one."""
+    images: tuple[np.ndarray | None, ...]
+    """None where a source has nothing new."""
+
+
+def together(sources: list[VideoSource]) -> Iterator[Moment]:
+    """The images of several sources on the clock of the fastest; a slower one has nothing new in between.
+
+    Ends when the last recording ends; one that ends earlier has nothing new from then on.
+    """
+    streams = [source.images() for source in sources]
+    waiting = [next(stream, None) for stream in streams]
+    half = 0.5 / max(source.fps for source in sources)
+    began = min((item[0] for item in waiting if item is not None), default=0.0)
+    while any(item is not None for item in waiting):
+        now = min(item[0] for item in waiting if item is not None)
+        images: list[np.ndarray | None] = []
+        for i, item in enumerate(waiting):
+            due = item is not None and item[0] <= now + half
+            images.append(item[1] if due and item is not None else None)
+            if due:
+                waiting[i] = next(streams[i], None)
+        yield Moment(now - began, tuple(images))

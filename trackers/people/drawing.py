@@ -1,0 +1,96 @@
+"""Pictures of people on a floor: outlines over the images, and the floor plan with everybody's way."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
+from jaxfilters.trackers.io.errors import OutputError
+from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, People, PeopleScene
+
+_PLAN_PX = 900
+_MARGIN_PX = 50
+_PAPER, _INK, _FLOOR = (255, 255, 255), (70, 70, 70), (236, 240, 242)
+_UNSURE = (170, 170, 170)
+
+
+def color_of(identity: int) -> tuple[int, int, int]:
+    """Blue, green, red: neighbours in number are far apart in hue."""
+    hue = int(180 * (identity * 0.618034 % 1))
+    b, g, r = cv2.cvtColor(np.array([[[hue, 200, 235]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
+    return int(b), int(g), int(r)
+
+
+def drawn(image: np.ndarray, outlines: Outline, people: People) -> np.ndarray:
+    """A copy of an image with everybody's outline, foot and number; NumPy leaves."""
+    image = image.copy()
+    for slot in np.flatnonzero((people.mode != FREE) & (people.mode != DORMANT) & (outlines.code == VISIBLE)):
+        color = _UNSURE if people.mode[slot] == TENTATIVE else color_of(int(people.identity[slot]))
+        _draw_one(image, outlines.center[slot], outlines.shape[slot], color, int(people.identity[slot]))
+    return image
+
+
+def _draw_one(image, center, shape, color, identity):
+    values, vectors = np.linalg.eigh(shape)
+    axes = tuple(round(float(axis)) for axis in np.sqrt(np.maximum(values, 0.0)))
+    if max(axes) > 4 * max(image.shape[:2]):
+        return
+    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
+    place = (round(float(center[0])), round(float(center[1])))
+    cv2.ellipse(image, place, axes, angle, 0, 360, color, 2, cv2.LINE_AA)
+    if identity >= 0:
+        top = (place[0] - 8, max(12, place[1] - int(np.sqrt(shape[1, 1])) - 6))
+        cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
+        cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 2, cv2.LINE_AA)
+
+
+def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
+    """The floor from above, X to the right and Y up, with cameras and ways; a dot where somebody was last.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    floor = np.asarray(scene.floor, float)
+    centers = np.asarray(scene.centers())
+    everything = np.concatenate([floor, centers])
+    low, high = everything.min(axis=0) - 0.3, everything.max(axis=0) + 0.3
+    scale = (_PLAN_PX - 2 * _MARGIN_PX) / max(high - low)
+    size = np.ceil((high - low) * scale).astype(int) + 2 * _MARGIN_PX
+
+    def pixels(xy):
+        flipped = (np.atleast_2d(xy) - low) * scale
+        return np.round(np.stack([_MARGIN_PX + flipped[:, 0], size[1] - _MARGIN_PX - flipped[:, 1]], -1)).astype(int)
+
+    plan = np.full((size[1], size[0], 3), _PAPER, np.uint8)
+    cv2.fillPoly(plan, [pixels(floor)], _FLOOR, cv2.LINE_AA)
+    cv2.polylines(plan, [pixels(floor)], True, _INK, 1, cv2.LINE_AA)
+    _draw_grid(plan, low, high, pixels)
+    for number, center in enumerate(centers):
+        at = tuple(int(v) for v in pixels(center)[0])
+        cv2.drawMarker(plan, at, _INK, cv2.MARKER_TRIANGLE_UP, 16, 2, cv2.LINE_AA)
+        cv2.putText(
+            plan, f"camera {number}", (at[0] + 10, at[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
+        )
+    for identity, track in tracks.items():
+        way = pixels(np.stack([seen.mean[:2] for seen in sorted(track, key=lambda seen: seen.frame)]))
+        cv2.polylines(plan, [way], False, color_of(identity), 2, cv2.LINE_AA)
+        end = tuple(int(v) for v in way[-1])
+        cv2.circle(plan, end, 5, color_of(identity), -1, cv2.LINE_AA)
+        cv2.putText(plan, str(identity), (end[0] + 7, end[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
+    if not cv2.imwrite(str(path), plan):
+        raise OutputError(f"cannot write {path}.")
+
+
+def _draw_grid(plan, low, high, pixels):
+    step = 1.0 if max(high - low) < 12 else 5.0
+    for axis in (0, 1):
+        for value in np.arange(np.ceil(low[axis] / step) * step, high[axis], step):
+            ends = np.array([low, high])
+            ends[:, axis] = value
+            a, b = (tuple(int(v) for v in end) for end in pixels(ends))
+            cv2.line(plan, a, b, (222, 222, 222), 1, cv2.LINE_AA)
+            place = (a[0] - 8, len(plan) - 28) if axis == 0 else (8, a[1] + 4)
+            cv2.putText(plan, f"{value:g}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    cv2.putText(plan, "metres", (8, len(plan) - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)

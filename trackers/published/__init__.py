@@ -1,0 +1,1 @@
+"""Trackers as their papers published them, kept as references for the benchmarks."""

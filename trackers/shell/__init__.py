@@ -1,1 +1,0 @@
-"""What stands around a tracker: the command line, files in and out, video, plots, progress."""
