@@ -61,8 +61,12 @@ def perturbed_observations(key: AnyKey, forecast: Forecast) -> Float[Array, "n k
     noise = jnp.where(observed, noise - jnp.mean(noise, axis=1, keepdims=True), 0.0)
     innovations = jnp.where(observed, forecast.observation[:, None] + noise - predicted, 0.0)
     whitened = solve_triangular(forecast.root, solve_triangular(forecast.root, innovations), transpose=True)
-    x = forecast.mean[:, None] + forecast.deviations
-    return x + _in_cheaper_order(forecast, whitened) / (predicted.shape[1] - 1)
+    x, spread = forecast.deviations, forecast.spread
+    if forecast.localization is None:
+        shift = _in_cheaper_order(x, spread, whitened)
+    else:
+        shift = matmul(forecast.localization.state * matmul(x, spread.T), whitened)
+    return forecast.mean[:, None] + x + shift / (predicted.shape[1] - 1)
 
 
 def transform(key: AnyKey, forecast: Forecast) -> Float[Array, "n k"]:
@@ -164,17 +168,15 @@ def _inverse_root_jvp(primals, tangents):
     return matmul(vectors / r, vectors.T), matmul(vectors, matmul(inside, vectors.T))
 
 
-def _in_cheaper_order(forecast: Forecast, whitened: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """The product of deviations, transposed spread and `whitened` by the smaller one of two intermediate matrices.
+def _in_cheaper_order(
+    deviations: Float[Array, "n k"], spread: Float[Array, "m k"], whitened: Float[Array, "m k"]
+) -> Float[Array, "n k"]:
+    """The product `deviations @ spread.T @ whitened`, with the smaller one of the two possible intermediate matrices.
 
-    These are the cross-covariance (n, m), which localisation needs, and the matrix (k, k) of inner products between
-    samples. The first keeps large ensembles linear in k; the second is smaller where both the state and the observation
-    are longer than the ensemble.
+    These are the cross-covariance (n, m) and the matrix (k, k) of inner products between samples. The first keeps large
+    ensembles linear in k; the second is smaller where both the state and the observation are longer than the ensemble.
     """
-    deviations, spread = forecast.deviations, forecast.spread
     (n, k), m = deviations.shape, spread.shape[0]
-    if forecast.localization is not None:
-        return matmul(forecast.localization.state * matmul(deviations, spread.T), whitened)
     if n * m <= k * k:
         return matmul(matmul(deviations, spread.T), whitened)
     return matmul(deviations, matmul(spread.T, whitened))

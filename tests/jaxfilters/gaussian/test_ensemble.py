@@ -7,7 +7,8 @@ import pytest
 
 from jaxfilters.filter import init, log_evidence, run, update
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.ensemble import _in_cheaper_order, ensemble_kalman
+from jaxfilters.gaussian.ensemble import ensemble_kalman
+from jaxfilters.gaussian.ensemble_analysis import _in_cheaper_order
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.noise import StandardNormal
 from jaxfilters.priors import gaussian_prior
