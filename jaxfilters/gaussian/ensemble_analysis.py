@@ -60,13 +60,34 @@ def perturbed_observations(key: AnyKey, forecast: Forecast) -> Float[Array, "n k
     noise = matmul(cholesky(forecast.R), standard_normal(key, predicted.shape, predicted.dtype))
     noise = jnp.where(observed, noise - jnp.mean(noise, axis=1, keepdims=True), 0.0)
     innovations = jnp.where(observed, forecast.observation[:, None] + noise - predicted, 0.0)
-    whitened = solve_triangular(forecast.root, solve_triangular(forecast.root, innovations), transpose=True)
+    x = forecast.deviations
+    return forecast.mean[:, None] + x + _gained(forecast, innovations) / (predicted.shape[1] - 1)
+
+
+def _gained(forecast: Forecast, innovations: Float[Array, "m k"]) -> Float[Array, "n k"]:
+    """Each sample's innovation times the gain, N - 1 times, with the smallest of the possible intermediate matrices.
+
+    These are the cross-covariance (n, m), which localisation needs, and the matrix (k, k) of inner products between
+    samples. The first keeps large ensembles linear in k; the second is smaller where both the state and the observation
+    are longer than the ensemble.
+    """
     x, spread = forecast.deviations, forecast.spread
-    if forecast.localization is None:
-        shift = _in_cheaper_order(x, spread, whitened)
-    else:
-        shift = matmul(forecast.localization.state * matmul(x, spread.T), whitened)
-    return forecast.mean[:, None] + x + shift / (predicted.shape[1] - 1)
+    (n, k), m = x.shape, spread.shape[0]
+    if forecast.localization is None and n * m > k * k:
+        return matmul(x, matmul(spread.T, _solve(forecast.root, innovations)))
+    cross = matmul(x, spread.T)
+    if forecast.localization is not None:
+        cross = forecast.localization.state * cross
+    # The factorisation is applied to the shorter one of its neighbours.
+    return (
+        matmul(_solve(forecast.root, cross.T).T, innovations)
+        if n < k
+        else matmul(cross, _solve(forecast.root, innovations))
+    )
+
+
+def _solve(root: Float[Array, "m m"], rows: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    return solve_triangular(root, solve_triangular(root, rows), transpose=True)
 
 
 def transform(key: AnyKey, forecast: Forecast) -> Float[Array, "n k"]:
@@ -139,7 +160,7 @@ def _transformed(X: Float[Array, "n k"], S: Float[Array, "m k"], d: Float[Array,
         # (I + S^T S)^-1/2 = I - S^T (M + M^1/2)^-1 S with M = I + S S^T, and (I + S^T S)^-1 S^T = S^T M^-1.
         G = _inverse_root(jnp.eye(m, dtype=S.dtype) + matmul(S, S.T))
         outer = cholesky(jnp.eye(m, dtype=S.dtype) + G)
-        shrunk = solve_triangular(outer, solve_triangular(outer, matmul(G, matmul(G, S))), transpose=True)
+        shrunk = _solve(outer, matmul(G, matmul(G, S)))
         shift = matmul(G, matmul(G, d[:, None]))
         return X + matmul(matmul(X, S.T), shift - shrunk)
     T = _inverse_root(jnp.eye(count, dtype=S.dtype) + matmul(S.T, S))
@@ -166,17 +187,3 @@ def _inverse_root_jvp(primals, tangents):
     divided = -1 / (r[:, None] * r * (r[:, None] + r))
     inside = divided * matmul(vectors.T, matmul(tangents[0], vectors))
     return matmul(vectors / r, vectors.T), matmul(vectors, matmul(inside, vectors.T))
-
-
-def _in_cheaper_order(
-    deviations: Float[Array, "n k"], spread: Float[Array, "m k"], whitened: Float[Array, "m k"]
-) -> Float[Array, "n k"]:
-    """The product `deviations @ spread.T @ whitened`, with the smaller one of the two possible intermediate matrices.
-
-    These are the cross-covariance (n, m) and the matrix (k, k) of inner products between samples. The first keeps large
-    ensembles linear in k; the second is smaller where both the state and the observation are longer than the ensemble.
-    """
-    (n, k), m = deviations.shape, spread.shape[0]
-    if n * m <= k * k:
-        return matmul(matmul(deviations, spread.T), whitened)
-    return matmul(deviations, matmul(spread.T, whitened))
