@@ -1,3 +1,4 @@
+from . import diagnostics as diagnostics
 from . import ensemble as ensemble
 from . import fit as fit
 from . import hmm as hmm
@@ -5,6 +6,7 @@ from . import math as math
 from . import motion as motion
 from . import noise as noise
 from . import optimize as optimize
+from . import plot as plot
 from . import priors as priors
 from . import smoothing as smoothing
 from . import typing as typing
