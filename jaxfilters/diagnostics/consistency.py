@@ -143,7 +143,7 @@ def chi_square_quantile(probability: ArrayLike, dof: ArrayLike) -> Float[Array, 
     small = 2 * jnp.exp((jnp.log(p) + gammaln(0.5 * dof + 1)) / (0.5 * dof))
     low, high = jnp.log(0.2 * jnp.minimum(guess, small)), jnp.log(2 * jnp.maximum(guess, small) + 1)
 
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = 0.5 * (low + high)
         below = gammainc(0.5 * dof, 0.5 * jnp.exp(middle)) < p

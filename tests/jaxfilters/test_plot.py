@@ -86,7 +86,7 @@ def test_a_calibration_curve_lies_in_its_band_or_not(saved):
 
 def test_pictures_are_drawn_into_given_axes():
     figure, ax = pyplot.subplots()
-    assert jf.plot.calibration([0.1, 0.9], ax=ax) is ax
+    assert jf.plot.calibration(np.array([0.1, 0.9]), ax=ax) is ax
     pyplot.close(figure)
 
 

@@ -61,7 +61,7 @@ def test_transforms_and_their_uniformity(x64):
         u = rng.uniform(size=n) ** (1 + shift)
         found, expected = D.uniformity(jnp.asarray(u)), scipy.stats.kstest(u, "uniform", method="exact")
         np.testing.assert_allclose(found.statistic, expected.statistic)
-        np.testing.assert_allclose(found.p_value, expected.pvalue, atol=0.01)
+        np.testing.assert_allclose(found.p_value, expected.pvalue, atol=0.03)
     samples, log_weights = jnp.asarray(rng.normal(size=(50, 7))), jnp.asarray(rng.normal(size=7))
     w = np.exp(log_weights) / np.exp(log_weights).sum()
     below = [np.sum(w[np.asarray(row) < value]) for row, value in zip(samples, y, strict=True)]
