@@ -136,8 +136,8 @@ def backward(
         return log_beta, log_beta
 
     last = jnp.zeros_like(log_likelihoods[:1])
-    each = (log_likelihoods[1:], inside[1:], A if A.ndim == 3 else None)
-    _, earlier = jax.lax.scan(step, last[0], each, reverse=True)
+    own = A if A.ndim == 3 else None
+    _, earlier = jax.lax.scan(step, last[0], (log_likelihoods[1:], inside[1:], own), reverse=True)
     return jnp.concatenate([earlier, last])
 
 
@@ -305,7 +305,8 @@ def _expected_transitions(A: Array, scaled: Array, ratios: Array) -> Array:
     One matrix product, or one for each frame.
     """
     if A.ndim == 3:
-        earlier, later = (leaf[:-1].reshape(len(A), A.shape[1], -1) for leaf in (scaled, ratios))
+        shape = (len(A), A.shape[1], math.prod(scaled.shape[2:]))
+        earlier, later = (leaf[:-1].reshape(shape) for leaf in (scaled, ratios))
         sums = jnp.einsum("tin,tjn->tij", earlier, later, precision="highest")
         return jnp.where(A > 0, A * sums, 0.0)
     axes = (0, *range(2, scaled.ndim))
