@@ -88,7 +88,7 @@ def analysed(state: EnsembleState, info: EnsembleInfo) -> Array:
     return jnp.mean(state.particles, axis=1)
 
 
-def rmse(filter: Filter, problem: Problem, key: AnyKey, spin_up: int = SPIN_UP) -> float:
+def rmse(filter: Filter, key: AnyKey, problem: Problem, spin_up: int = SPIN_UP) -> float:
     """Root mean square error of the analysed mean after the first steps."""
     # The belief before the first step is about the first state of the course, and the first reading of the next one.
     _, means = jf.run(filter, key, problem.readings[1:], collect=analysed)
@@ -119,10 +119,10 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     problems = {every: simulate(key, QUICK_STEPS if quick else STEPS, every) for every in (1, 2)}
     found = {}
     for name, (every, options) in FILTERS.items():
-        error = rmse(build(problems[every], **options), problems[every], filter_key)
+        error = rmse(build(problems[every], **options), filter_key, problems[every])
         found[f"rmse_{name}"] = Metric(error, "", "lower")
     for count in (COUNT, MANY):
-        found |= timed(simulate_linear(key, TIMED_STEPS), count, filter_key, QUICK_ROUNDS if quick else ROUNDS)
+        found |= timed(filter_key, simulate_linear(key, TIMED_STEPS), count, QUICK_ROUNDS if quick else ROUNDS)
     return found
 
 
@@ -139,7 +139,7 @@ def simulate_linear(key: AnyKey, steps: int) -> Problem:
     return Problem(truth, truth + jax.random.normal(noise_key, truth.shape), 1)
 
 
-def timed(problem: Problem, count: int, key: AnyKey, rounds: int) -> dict[str, Metric]:
+def timed(key: AnyKey, problem: Problem, count: int, rounds: int) -> dict[str, Metric]:
     """Processor time of a step of so many samples, and its ratio to that of cuthbert, which keeps the same results.
 
     Raises:

@@ -33,6 +33,7 @@ def crps(y: Float[Array, "*shape"], mean: ArrayLike, std: ArrayLike) -> Float[Ar
         0.6623
     """
     positive("std", std)
+    std = jnp.asarray(std, dtype=float)
     z = (y - mean) / std
     density = jnp.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
     return std * (z * erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))

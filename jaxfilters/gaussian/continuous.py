@@ -185,8 +185,17 @@ def continuous_extended_kalman(
     if not callable(diffusion):
         checks.noise("diffusion", diffusion, n, is_root=True)
     none = jnp.zeros((n, n), prior.mean.dtype)
-    options = dict(arithmetic=arithmetic, residual=residual, iterations=iterations, iterate_to=iterate_to)
-    discrete = extended_kalman(prior, _stay, none, observe, observation_noise, **options)
+    discrete = extended_kalman(
+        prior,
+        _stay,
+        none,
+        observe,
+        observation_noise,
+        arithmetic=arithmetic,
+        residual=residual,
+        iterations=iterations,
+        iterate_to=iterate_to,
+    )
     params = ContinuousExtendedKalman(
         discrete,
         taking_inputs("drift", drift, "x"),

@@ -63,15 +63,15 @@ def discretize(A: ArrayLike, L: ArrayLike, dt: ArrayLike) -> Step:
         >>> [[round(q, 3) for q in row] for row in Q[1].tolist()]
         [[2.667, 2.0], [2.0, 2.0]]
     """
-    A, L = _matrix("A", A), _matrix("L", L)
-    n = A.shape[-1]
-    if A.shape[-2] != n:
-        raise ValueError(f"A must be square, (..., n, n); got {A.shape}.")
-    if L.shape[-2] != n:
-        raise ValueError(f"L must have a row for each of the {n} rows of A, (..., {n}, k); got {L.shape}.")
-    dtype = jnp.result_type(A, L)
+    drift, root = _matrix("A", A), _matrix("L", L)
+    n = drift.shape[-1]
+    if drift.shape[-2] != n:
+        raise ValueError(f"A must be square, (..., n, n); got {drift.shape}.")
+    if root.shape[-2] != n:
+        raise ValueError(f"L must have a row for each of the {n} rows of A, (..., {n}, k); got {root.shape}.")
+    dtype = jnp.result_type(drift, root)
     lengths = step_length(dt, dtype)
-    return Step(*_steps(A.astype(dtype), L.astype(dtype), lengths))
+    return Step(*_steps(drift.astype(dtype), root.astype(dtype), lengths))
 
 
 @pytree_dataclass
@@ -124,8 +124,8 @@ def step_length(dt: ArrayLike, dtype: jnp.dtype | None = None) -> Float[Array, "
     return jnp.where((dt >= 0) & (dt < jnp.inf), dt, jnp.nan)
 
 
-def _matrix(name, value):
-    value = jnp.asarray(value)
+def _matrix(name: str, matrix: ArrayLike) -> Array:
+    value = jnp.asarray(matrix)
     if value.ndim < 2:
         raise ValueError(f"{name} must be a matrix; got the shape {value.shape}.")
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)

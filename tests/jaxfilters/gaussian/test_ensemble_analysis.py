@@ -146,7 +146,7 @@ def test_correlations_fall_from_one_to_zero_and_are_possible():
 def test_lorenz_96_is_followed_with_the_published_error():
     """300 steps after 100: published 0.18 to 0.22 for long runs; short ones vary by about 0.02."""
     problem = lorenz.simulate(jax.random.key(1), 400)
-    error = lorenz.rmse(lorenz.build(problem, analysis=jf.ensemble.transform, inflation=1.02), problem, KEY, 100)
+    error = lorenz.rmse(lorenz.build(problem, analysis=jf.ensemble.transform, inflation=1.02), KEY, problem, 100)
     assert 0.12 < error < 0.25
     few = lorenz.build(problem, 10, lorenz.RADIUS, analysis=jf.ensemble.serial, inflation=1.03)
-    assert lorenz.rmse(few, problem, KEY, 100) < 0.35
+    assert lorenz.rmse(few, KEY, problem, 100) < 0.35
