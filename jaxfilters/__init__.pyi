@@ -1,9 +1,13 @@
+from . import diagnostics as diagnostics
+from . import ensemble as ensemble
 from . import fit as fit
 from . import hmm as hmm
 from . import math as math
 from . import mcmc as mcmc
+from . import motion as motion
 from . import noise as noise
 from . import optimize as optimize
+from . import plot as plot
 from . import priors as priors
 from . import smoothing as smoothing
 from . import typing as typing
@@ -29,6 +33,7 @@ from .gaussian.consider import schmidt_kalman as schmidt_kalman
 from .gaussian.constraints.constrained_filter import EPConstraints as EPConstraints
 from .gaussian.constraints.constrained_filter import TruncateEachStep as TruncateEachStep
 from .gaussian.constraints.constrained_filter import constrained as constrained
+from .gaussian.continuous import continuous_extended_kalman as continuous_extended_kalman
 from .gaussian.ensemble import ensemble_kalman as ensemble_kalman
 from .gaussian.extended import Observation as Observation
 from .gaussian.extended import extended_kalman as extended_kalman

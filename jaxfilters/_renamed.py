@@ -13,7 +13,6 @@ _CURRENT = {
     "assignment": "jf.math.assignment",
     "contaminated": "jf.robust (a function)",
     "diffusion": "jf.math.diffusion",
-    "ensemble": "jf.ensemble_kalman (a function)",
     "extended": "jf.extended_kalman (a function)",
     "fixed_lag": "jf.smoothing.fixed_lag",
     "layered": "jf.Partitions",

@@ -17,6 +17,7 @@ from jaxfilters.filter import Filter, run
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import Observation, extended_kalman
 from jaxfilters.gaussian.smoothing import rts
+from jaxfilters.motion.models import constant_velocity
 
 
 class PointNoise(NamedTuple):
@@ -78,8 +79,7 @@ class _Drive:
     drive: Float[Array, ""]
 
     def __call__(self, seconds: Float[Array, ""]) -> Float[Array, "2 2"]:
-        rows = jnp.stack([jnp.stack([seconds**3 / 3, seconds**2 / 2]), jnp.stack([seconds**2 / 2, seconds])])
-        return jnp.square(self.drive) * rows
+        return constant_velocity(jnp.square(self.drive)).process_noise(seconds)
 
 
 @pytree_dataclass

@@ -3,12 +3,15 @@ from . import bank as bank
 from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
+from . import continuous as continuous
 from . import ensemble as ensemble
+from . import ensemble_analysis as ensemble_analysis
 from . import extended as extended
 from . import gaussian_sum as gaussian_sum
 from . import imm as imm
 from . import linear as linear
 from . import linearize as linearize
+from . import localization as localization
 from . import manifold as manifold
 from . import mixture as mixture
 from . import mode_maps as mode_maps

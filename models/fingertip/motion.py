@@ -18,6 +18,7 @@ from jaxfilters.gaussian import arithmetic
 from jaxfilters.gaussian.arithmetic import KalmanInfo
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math import linalg
+from jaxfilters.motion.models import constant_velocity
 
 STATE = 4
 H = np.eye(2, STATE)
@@ -48,7 +49,7 @@ def acceleration_driven(dt: float | Float[Array, ""] = 1.0) -> Motion:
 
 
 def _constant_velocity(dt):
-    return jnp.eye(STATE) + jnp.asarray(dt, dtype=float) * jnp.asarray(np.eye(STATE, STATE, 2), dtype=float)
+    return constant_velocity(0.0, dims=2).discretize(dt).F
 
 
 def new_belief(

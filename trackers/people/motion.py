@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters.motion.models import constant_velocity
 from jaxfilters.trackers.people.state import HEIGHT, STATE, WIDTH, PeopleConfig
 
 HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
@@ -14,10 +15,7 @@ def motion(config: PeopleConfig, dt: Float[Array, ""]) -> tuple[Float[Array, "6 
 
     Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section 6.2.2.
     """
-    F = jnp.eye(STATE).at[0, 2].set(dt).at[1, 3].set(dt)
-    block = config.acceleration_sd**2 * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    Q = jnp.zeros((STATE, STATE))
-    for axis in (0, 1):
-        pair = jnp.array([axis, axis + 2])
-        Q = Q.at[jnp.ix_(pair, pair)].set(block)
+    walk = constant_velocity(config.acceleration_sd**2, dims=2).discretize(dt)
+    F = jnp.eye(STATE).at[:4, :4].set(walk.F)
+    Q = jnp.zeros((STATE, STATE)).at[:4, :4].set(walk.Q)
     return F, Q.at[HEIGHT, HEIGHT].set(HEIGHT_DRIFT**2 * dt).at[WIDTH, WIDTH].set(WIDTH_DRIFT**2 * dt)

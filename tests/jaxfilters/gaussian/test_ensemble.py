@@ -7,7 +7,8 @@ import pytest
 
 from jaxfilters.filter import init, log_evidence, run, update
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.ensemble import _in_cheaper_order, ensemble_kalman
+from jaxfilters.gaussian.ensemble import ensemble_kalman
+from jaxfilters.gaussian.ensemble_analysis import Forecast, perturbed_observations
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.noise import StandardNormal
 from jaxfilters.priors import gaussian_prior
@@ -99,10 +100,17 @@ def test_memory_grows_as_the_ensemble_not_as_its_square():
     assert compiled.memory_analysis().temp_size_in_bytes < 1000 * count
 
 
-@pytest.mark.parametrize(("n", "m", "count"), [(30, 20, 10), (3, 2, 50)])
-def test_both_orders_of_the_product_are_the_same(x64, n, m, count):
-    a, b, c = (np.random.default_rng(6).normal(size=(rows, count)) for rows in (n, m, m))
-    np.testing.assert_allclose(_in_cheaper_order(*map(jnp.asarray, (a, b, c))), a @ b.T @ c, rtol=1e-10, atol=1e-10)
+@pytest.mark.parametrize(("n", "m", "count"), [(30, 20, 10), (3, 2, 50), (7, 3, 6)])
+def test_products_in_any_order_move_samples_by_the_gain(x64, n, m, count):
+    """As each sample has noise of its own, only the mean is the textbook's: noise has the mean zero."""
+    x, predicted, y = (np.random.default_rng(6).normal(size=shape) for shape in ((n, count), (m, count), m))
+    x -= x.mean(1, keepdims=True)
+    spread = predicted - predicted.mean(1, keepdims=True)
+    S = spread @ spread.T / (count - 1) + np.eye(m)
+    arrays = [jnp.asarray(a) for a in (np.ones(n), x, predicted, y, np.isfinite(y), np.eye(m), np.linalg.cholesky(S))]
+    moved = perturbed_observations(KEY, Forecast(*arrays, None))
+    gain = x @ spread.T / (count - 1) @ np.linalg.inv(S)
+    np.testing.assert_allclose(moved.mean(1), 1 + gain @ (y - predicted.mean(1)), rtol=1e-10, atol=1e-10)
 
 
 def test_the_gradient_in_inflation_is_that_of_finite_differences(x64):

@@ -1,0 +1,17 @@
+from .discretization import LinearSDE as LinearSDE
+from .discretization import Step as Step
+from .discretization import discretize as discretize
+from .flow import adaptive as adaptive
+from .flow import rk4 as rk4
+from .models import Motion as Motion
+from .models import constant_acceleration as constant_acceleration
+from .models import constant_velocity as constant_velocity
+from .models import integrated_ornstein_uhlenbeck as integrated_ornstein_uhlenbeck
+from .models import integrated_wiener as integrated_wiener
+from .models import matern as matern
+from .models import ornstein_uhlenbeck as ornstein_uhlenbeck
+from .models import singer as singer
+from .turn import CoordinatedTurn as CoordinatedTurn
+from .turn import UnknownTurn as UnknownTurn
+from .turn import coordinated_turn as coordinated_turn
+from .turn import unknown_turn as unknown_turn
