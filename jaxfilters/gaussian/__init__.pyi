@@ -2,6 +2,8 @@ from . import arithmetic as arithmetic
 from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
+from . import emission_update as emission_update
+from . import emissions as emissions
 from . import ensemble as ensemble
 from . import extended as extended
 from . import gaussian_sum as gaussian_sum
@@ -9,7 +11,9 @@ from . import linear as linear
 from . import linearize as linearize
 from . import manifold as manifold
 from . import noise_models as noise_models
+from . import observation as observation
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust
 from . import sigma_point as sigma_point
 from . import smoothing as smoothing
+from . import student_t as student_t
