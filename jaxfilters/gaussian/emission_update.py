@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor
 from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.emissions import Emission
@@ -54,6 +55,8 @@ def emission_update(
     natural, family = emission.of_step(inputs), emission.family
     eta = lambda coordinates: natural(point(coordinates))
     y, possible = family.encoded(measured.y, eta(belief.mean))
+    if measured.mask is not None:
+        checks.boolean("Observation.mask", measured.mask, jnp.shape(measured.y), ", that of the observation y")
     mask = jnp.ones(y.shape, bool) if measured.mask is None else jnp.broadcast_to(measured.mask, y.shape)
     given = jnp.isfinite(y) & mask
     read = given & possible

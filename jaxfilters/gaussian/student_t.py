@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, DTypeLike, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
@@ -80,7 +80,7 @@ def student_t(
 
     The noises of `inner` are the scale matrices: the covariance of a t distribution is `dof / (dof - 2)` times as
     large. An observation is an outlier as a whole; components that fail one by one are observations of their own. The
-    info is a `StudentTInfo`. The state is the `Gaussian` of `inner`, or a `HeavyTailState` where there is a `process_dof`.
+    info is a `StudentTInfo`. The state is the `Gaussian` of `inner`, or a `HeavyTailState` with a `process_dof`.
 
     Args:
         inner: Filter made by `extended_kalman`, `unscented_kalman`, `cubature_kalman` or `kalman` with a `Gaussian`
@@ -138,17 +138,19 @@ def _checked(name: str, dof: Any, above: float) -> Array | None:
     return jnp.asarray(dof, dtype=float)
 
 
-def scales(dof: Array | None, size: int, count: int) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def scales(dof: Array | None, size: int, count: int, dtype: DTypeLike) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Values of lambda, and their log probabilities, which sum to 1; one value, 1, for Gaussian noise.
 
     Args:
         dof: Degrees of freedom; None for Gaussian noise.
         size: Dimension of the noise, which says how much one draw of it can tell about lambda.
         count: Number of values. Three quarters of them are below 1, where the tail is.
+        dtype: Type of the values.
     """
     if dof is None:
-        return jnp.ones(1), jnp.zeros(1)
-    steps = jnp.arange(count) - _at_one(dof, count)
+        return jnp.ones(1, dtype), jnp.zeros(1, dtype)
+    dof = dof.astype(dtype)
+    steps = (jnp.arange(count) - _at_one(dof, count)).astype(dtype)
     log_scale = _SPACING * jnp.sqrt(2 / (dof + size)) * steps
     log_density = 0.5 * dof * (log_scale - jnp.exp(log_scale))
     return jnp.exp(log_scale), jax.nn.log_softmax(log_density)
@@ -187,7 +189,7 @@ def _predict_parts(model: StudentT, key: AnyKey, state: HeavyTailState, inputs: 
     checks.state(belief, linear.prior)
     origin, step = linear.linear_transition(belief, inputs)
     Q = linear.process_noise_of(belief, inputs)
-    values, log_probabilities = scales(model.process_dof, dimension(belief), model.num_scales)
+    values, log_probabilities = scales(model.process_dof, dimension(belief), model.num_scales, belief.mean.dtype)
 
     def ahead(scale: Array) -> Gaussian:
         delta = linear.arithmetic.predict(increments(belief), step.F, Q / scale, step.value, step.residual_root)
@@ -210,8 +212,8 @@ def _updated(
     """One Gaussian for the updates of all parts with all scales of the observation noise."""
     linear, count = model.inner.params, model.num_scales
     observed = observation if isinstance(observation, Observation) else Observation(observation)
-    noises, log_noises = scales(model.observation_dof, jnp.size(observed.y), count)
-    moves, log_moves = scales(model.process_dof, parts.mean.shape[-1], count)
+    noises, log_noises = scales(model.observation_dof, jnp.size(observed.y), count, parts.mean.dtype)
+    moves, log_moves = scales(model.process_dof, dimension(linear.prior), count, parts.mean.dtype)
 
     def update(belief: Gaussian) -> tuple[Gaussian, KalmanInfo]:
         R = linear.observation_noise_of(belief, inputs) if observed.noise is None else observed.noise

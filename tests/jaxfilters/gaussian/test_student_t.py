@@ -10,11 +10,11 @@ import jaxfilters as jf
 
 KEY = jax.random.key(0)
 M, P, Q, R = 0.4, 0.5, 0.2, 0.3
-ONE = jnp.eye(1)
 
 
-def line(**options):
-    return jf.kalman(jf.Gaussian(jnp.array([M]), P * ONE), ONE, Q * ONE, ONE, R * ONE, **options)
+def line():
+    one = jnp.eye(1)
+    return jf.kalman(jf.Gaussian(jnp.array([M]), P * one), one, Q * one, one, R * one)
 
 
 def moments(x, log_density):
@@ -44,9 +44,9 @@ def one_step(filter, y):
 
 @pytest.mark.parametrize("dof", [1.0, 4.0, 30.0])
 def test_observations_with_heavy_tails_agree_with_quadrature(x64, dof):
-    """The trapezoidal rule has a relative error of 1e-3 in the density, from the centre to an outlier of 40 sigma."""
+    """The trapezoidal rule has a relative error of 1e-3 in the density, from the centre to an outlier of 27 sigma."""
     filter = jf.student_t(line(), dof)
-    for y in (0.7, 2.5, 20.0):
+    for y in (0.7, 2.5, 15.0):
         found, info = one_step(filter, y)
         exact = moments(GRID, AHEAD + stats.t.logpdf(y - GRID, dof, scale=np.sqrt(R)))
         np.testing.assert_allclose(found, exact, rtol=3e-3, atol=3e-3)
@@ -61,7 +61,7 @@ def test_a_process_with_heavy_tails_agrees_with_quadrature(x64, dof):
         exact = moments(GRID, log_prediction(dof) + stats.norm.logpdf(y - GRID, 0, np.sqrt(R)))
         np.testing.assert_allclose(found, exact, rtol=5e-3, atol=5e-3)
     assert info.process_weight < 0.1
-    assert info.observation_weight == 1
+    np.testing.assert_allclose(info.observation_weight, 1.0, rtol=1e-12)
 
 
 @pytest.mark.system
@@ -80,8 +80,9 @@ def test_both_tails_together_and_a_frame_without_an_observation(x64):
 def test_a_certain_state_leaves_the_density_of_the_t_distribution(x64):
     """In three dimensions, with correlated components and one that is missing."""
     V = np.array([[0.5, 0.2, 0.0], [0.2, 0.4, 0.1], [0.0, 0.1, 0.3]])
-    prior = jf.Gaussian(jnp.zeros(1), 0 * ONE)
-    inner = jf.kalman(prior, ONE, 0 * ONE, jnp.ones((3, 1)), jnp.asarray(V))
+    one = jnp.eye(1)
+    prior = jf.Gaussian(jnp.zeros(1), 0 * one)
+    inner = jf.kalman(prior, one, 0 * one, jnp.ones((3, 1)), jnp.asarray(V))
     for dof, y in ((3.0, [0.5, -0.4, 4.0]), (8.0, [5.0, 0.0, -6.0])):
         _, info = jf.step(jf.student_t(inner, dof), KEY, prior, jnp.array(y))
         np.testing.assert_allclose(info.log_evidence, stats.multivariate_t.logpdf(y, np.zeros(3), V, dof), atol=5e-3)
