@@ -1,30 +1,36 @@
-"""The interface between a tracker and the application that runs it."""
+"""The interface between a tracking system and the application that runs it, and a tracker run from Python."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 STATUS_NAMES = ("searching", "tracking", "lost")
-"""Words for the integers in `HandTrack.status`."""
+"""Words for the integers in `status` of a track."""
+CHUNK = 16
+"""Frames in one compiled call: enough to hide the call, few enough to report progress several times a second."""
+_PACE_S = 1 / 30
 
 
-class SequenceTracker(NamedTuple):
-    """A tracker in chunks of frames: one compiled call for many frames, a state that can be saved between calls."""
+class Tracker(NamedTuple):
+    """A system that follows something in frames: two functions on pytrees of arrays.
 
-    start: Callable[..., Any]
-    """`(key, frame (rows, cols)) -> state`, a pytree of arrays; the random key lives in it from here on."""
-    advance: Callable[..., tuple[Any, Any]]
-    """`(state, frames (b, rows, cols), times (b,)) -> (state, track)`: metres with NaN for no reading, seconds.
-
-    `track` is a named tuple of arrays with the frame axis first (`HandTrack` for a hand). Row `i` depends on
-    frames `0..i` only: the application fills up the last chunk by holding its last frame, and drops those rows.
+    `track_frames` runs one over frames in memory; `jaxfilters.trackers.app.run` runs one over a recording on disk.
     """
+
+    init: Callable[..., Any]
+    """`(key, frame) -> state` before the first frame, which shows where to begin. The state is a pytree of arrays,
+    with the random key in it: it is saved and restored as it is."""
+    step: Callable[..., tuple[Any, Any]]
+    """`(state, frames, times_s) -> (state, track)` for a chunk of frames: pytrees whose leaves have the frame axis
+    first. Row i of the track depends on frames 0 to i alone."""
 
 
 class HandTrack(NamedTuple):
-    """What is known of the hand in each of `b` frames, in the camera frame."""
+    """The estimated hand in each of `b` frames, in the camera frame."""
 
     pose: Float[Array | np.ndarray, "b 22"]
     """Wrist position (metres), unit quaternion (w, x, y, z), fifteen joint angles (radians)."""
@@ -32,9 +38,65 @@ class HandTrack(NamedTuple):
     """Standard deviations in the tangent space: position (metres), rotation vector (radians), angles (radians)."""
     joints: Float[Array | np.ndarray, "b 21 3"]
     """Metres: wrist, thumb 1-4, index, middle, ring, little, base to tip."""
-    ess: Float[Array | np.ndarray, " b"]
-    """Effective number of particles, from 1 to their number; 0 where the hand was not seen."""
+    effective_sample_size: Float[Array | np.ndarray, " b"]
+    """Effective number of particles, from 1 to their number; 0 where the hand was not observed."""
     log_evidence: Float[Array | np.ndarray, " b"]
     """log p(frame | earlier frames), up to the constant of the likelihood."""
     status: Int[Array | np.ndarray, " b"]
     """Index into `STATUS_NAMES`."""
+
+
+def step_chunk(tracker: Tracker, state: Any, frames: Sequence[Any], times_s: np.ndarray) -> tuple[Any, Any]:
+    """State and track after at most `CHUNK` frames, by the one program that serves every chunk.
+
+    A shorter chunk is filled up by its last frame. The filled rows are dropped; the state then includes them, and is of
+    use only where nothing follows.
+
+    Args:
+        tracker: The tracker.
+        state: Its state.
+        frames: 1 to `CHUNK` frames, each an array or a pytree of arrays.
+        times_s: (frames,) seconds since the first frame of the recording.
+
+    Returns:
+        The state, and the track on the host, a row for each of the frames.
+
+    Raises:
+        ValueError: `frames` and `times_s` differ in length, or there are none or too many.
+    """
+    if not 0 < len(frames) <= CHUNK or np.shape(times_s) != (len(frames),):
+        raise ValueError(f"frames: expected 1 to {CHUNK}, with a time each; got {len(frames)} and {np.shape(times_s)}.")
+    missing = CHUNK - len(frames)
+    later = times_s[-1] + np.arange(1, missing + 1) * _PACE_S
+    filled = jax.tree.map(lambda *leaves: np.stack(leaves), *frames, *[frames[-1]] * missing)
+    state, track = tracker.step(state, filled, np.concatenate([times_s, later]).astype(np.float32))
+    return state, jax.tree.map(lambda leaf: np.asarray(leaf)[: len(frames)], track)
+
+
+def track_frames(tracker: Tracker, key: Array, frames: Iterable[Any], times_s: np.ndarray) -> Any:
+    """The track of all frames, equal to that of the command line with the same seed.
+
+    Args:
+        tracker: The tracker.
+        key: Random key.
+        frames: One frame after another, in memory or read when asked for; at least one.
+        times_s: (frames,) seconds, strictly increasing.
+
+    Returns:
+        The track as NumPy arrays, the frame axis first.
+
+    Raises:
+        ValueError: There are no frames, or more or fewer than times.
+    """
+    source, since, parts, done = iter(frames), np.asarray(times_s, float), [], 0
+    state = None
+    while chunk := list(islice(source, CHUNK)):
+        if done + len(chunk) > len(since):
+            raise ValueError(f"times_s: expected one for each frame; got {len(since)}, and more frames.")
+        state = tracker.init(key, chunk[0]) if state is None else state
+        state, track = step_chunk(tracker, state, chunk, since[done : done + len(chunk)] - since[0])
+        parts.append(track)
+        done += len(chunk)
+    if not parts or done != len(since):
+        raise ValueError(f"times_s: expected one for each frame, at least one; got {len(since)} for {done} frames.")
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -25,8 +25,8 @@ from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
 from jaxfilters.benchmarks.scenarios._pets import Pets, images, load_pets, probability
 from jaxfilters.trackers.background.choice import background
-from jaxfilters.trackers.people.following import follow
-from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
+from jaxfilters.trackers.people.recorded import Sighting, smoothed
+from jaxfilters.trackers.people.session import PeopleTracks
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import start, step
 
@@ -83,7 +83,7 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
     """The whole pipeline over the first frames of the video; over all without a number."""
     subtraction = background("median")
     subtraction.prime(image for i, image in enumerate(images(pets)) if i % PRIME_EVERY == 0)
-    recorder, clocks = Recorder(), []
+    people, clocks = PeopleTracks(pets.scene), []
     confirmed: list[tuple[int, int, float, float]] = []
     tracking = []
 
@@ -97,7 +97,8 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
             before = time.perf_counter()
 
     jax.block_until_ready(step(pets.scene, start(pets.scene), (_nothing(pets),), np.float32(0)))
-    for now in follow(pets.scene, moments(), recorder):
+    for time_s, observed in moments():
+        now = people.step(observed, time_s)
         confirmed += [
             (now.frame, who, float(seen.mean[0]), float(seen.mean[1]))
             for who, seen in now.added
@@ -107,7 +108,7 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
         if now.frame % 100 == 99:
             sys.stderr.write(f"  {now.frame + 1} frames\n")
     inputs, subtracting = np.transpose(clocks)
-    return Followed(confirmed, recorder.tracks, np.array(tracking), subtracting, inputs)
+    return Followed(confirmed, people.recorder.tracks, np.array(tracking), subtracting, inputs)
 
 
 def read_truth(path: Path, pets: Pets) -> FloorTracks:

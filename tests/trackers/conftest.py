@@ -16,7 +16,7 @@ from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.recording import FeatureSequence, Start
 from jaxfilters.trackers.articulated.table import TimedArticulatedTrack
 from jaxfilters.trackers.hand_depth.recording import from_array
-from jaxfilters.trackers.tracker import HandTrack, SequenceTracker
+from jaxfilters.trackers.tracker import HandTrack, Tracker
 
 ROWS, COLS, FRAMES = 24, 32, 40
 
@@ -82,7 +82,7 @@ def fake_tracker():
 
 @pytest.fixture
 def fake_hand_depth(monkeypatch, recording):
-    """Puts a random walk in the place of the hand tracker, so that the application is tested without its cost."""
+    """Puts a random walk in the place of the hand tracker, so that the application is tested quickly."""
     from jaxfilters.trackers.hand_depth import tracker as hand_depth
 
     monkeypatch.setattr(hand_depth, "build", build_fake)
@@ -109,7 +109,7 @@ def build_fake(camera, config):
             pose=jnp.concatenate([wrist, jnp.asarray([1.0, 0.0, 0.0, 0.0], jnp.float32), angles]),
             pose_std=jnp.full(21, 0.01, jnp.float32),
             joints=wrist + _joints(1)[0] - _joints(1)[0, 0],
-            ess=jnp.asarray(32.0, jnp.float32),
+            effective_sample_size=jnp.asarray(32.0, jnp.float32),
             log_evidence=-jnp.abs(walk[0]),
             status=jnp.asarray(1, jnp.int32),
         )
@@ -118,8 +118,8 @@ def build_fake(camera, config):
         seen = jnp.isfinite(frame).any()
         return FakeState(key, state.frames + 1, wrist), jax.tree.map(partial(jnp.where, seen), row, nothing)
 
-    advance = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
-    return SequenceTracker(start, advance)
+    step_all = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
+    return Tracker(start, step_all)
 
 
 def _mean(frame):
@@ -179,7 +179,7 @@ def perfect_track(features):
 
 @pytest.fixture
 def fake_articulated(monkeypatch, features):
-    """Puts a random walk in the place of the articulated tracker, so that the application is tested without its cost."""
+    """Puts a random walk in the place of the articulated tracker, so that the application is tested quickly."""
     from jaxfilters.trackers.articulated import tracker as articulated_hand
 
     monkeypatch.setattr(articulated_hand, "build", build_fake_articulated)
@@ -230,8 +230,8 @@ def build_fake_articulated(sequence, config):
         row = jax.tree.map(partial(jnp.where, frame.mask.any()), row, nothing)
         return FakeState(key, state.frames + 1, mean), row
 
-    advance = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
-    return SequenceTracker(start, advance)
+    step_all = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
+    return Tracker(start, step_all)
 
 
 @pytest.fixture(scope="session")
@@ -275,18 +275,19 @@ def face_track(face_model):
         values = np.asarray(values, np.float32)
         return np.where(where.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
+    metres = np.array([1e-3, 1e-3, 1e-3, 1, 1, 1])
     track = TimedHeadTrack(
         times_s=np.arange(FRAMES) / 30,
-        pose=known(pose),
-        pose_std=known(np.tile(std, (FRAMES, 1))),
-        deformation=known(a),
-        shape=known(shapes),
+        pose=known(metres * pose),
+        pose_std=known(np.tile(metres * std, (FRAMES, 1))),
+        deformation=known(1e-3 * a),
+        shape=known(1e-3 * shapes),
         image_points=known(project(shapes, jnp.asarray(pose))[0]),
         score=known(0.85 - 0.1 * rng.random(FRAMES), status != 4),
         effective_sample_size=known(np.full(FRAMES, 300.0), status != 4),
         status=status,
     )
-    return track, HeadTruth(poses, np.asarray(project(shapes, jnp.asarray(poses, jnp.float32))[0]))
+    return track, HeadTruth(metres * poses, np.asarray(project(shapes, jnp.asarray(poses, jnp.float32))[0]))
 
 
 @pytest.fixture

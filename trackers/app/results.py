@@ -1,9 +1,10 @@
-"""What a run leaves in its folder: `track.csv`, `track.npz`, `report.json`, and a checkpoint to continue from."""
+"""What a run leaves in its folder: `track.csv`, `track.npz`, `report.json`, and `checkpoint/` to continue from."""
 
 import csv
 import errno
 import json
 import platform
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -12,37 +13,77 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from filelock import FileLock, Timeout
 
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.errors import CheckpointError, OutputError
 from jaxfilters.trackers.tracker import STATUS_NAMES
 
 
-class TrackTable(NamedTuple):
-    """How the track of one kind of tracker becomes rows of `track.csv`."""
+class Columns(NamedTuple):
+    """Neighbouring columns of `track.csv`."""
 
-    columns: tuple[str, ...]
-    """Names of the numbers of a row, between the time and the status."""
-    numbers: Callable[[Any, int], np.ndarray]
-    """`(track, i) -> (columns,)`."""
-    empty: Callable[[int], Any]
-    """`frames -> track`: a named tuple of arrays, frames first, that begins with `times_s` and ends with `status`,
-    zeros of the right shapes and types. Between these two are the fields of what the tracker returns, in order."""
+    names: tuple[str, ...]
+    """With their units: `x_m`, `yaw_std_rad`."""
+    values: Callable[[Any], np.ndarray]
+    """`track -> (frames,)` or `(frames, len(names))`."""
+
+
+class TrackTable(NamedTuple):
+    """How the track of one kind of tracker becomes rows of `track.csv` and arrays of `track.npz`."""
+
+    track: Callable[..., Any]
+    """A named tuple of arrays, frames first, that begins with `times_s` and ends with `status`. Between these two are
+    the fields of what the tracker returns, in order."""
+    parts: tuple[Columns, ...]
+    """Of the numbers of a row, between the time and the status."""
     status_names: tuple[str, ...] = STATUS_NAMES
     """Words for the integers in `status`."""
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the numbers of a row."""
+        return tuple(name for part in self.parts for name in part.names)
+
+
+class OutputFolder:
+    """A folder that one run writes into; no other run can until it is closed or its process ends."""
+
+    def __init__(self, path: Path):
+        """Make the folder if need be, and lock it.
+
+        Raises:
+            OutputError: it cannot be written, or another run writes into it.
+        """
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._lock = FileLock(path / ".lock", timeout=0, thread_local=False)
+            self._lock.acquire()
+        except Timeout:
+            raise OutputError(f"{path}: another run writes into it; choose another --out.") from None
+        except OSError as error:
+            raise OutputError(f"cannot write into {path}: {_cause(error)}.") from None
+
+    def close(self) -> None:
+        """Let other runs have it."""
+        self._lock.release()
+        (self.path / ".lock").unlink(missing_ok=True)
+
 
 class TrackWriter:
-    """Appends rows to `track.csv` as frames are done, and saves everything so far at checkpoints.
+    """Appends rows to `track.csv` as frames are done, and saves the state with them at checkpoints.
 
-    `begin` and `resume` make one.
+    The cost of a checkpoint does not depend on how many came before it: rows are saved once, in a file a checkpoint.
+    `begin` and `resume` make one; `close` lets go of its folder.
     """
 
-    def __init__(self, folder: Path, run: dict[str, Any], table: TrackTable, done: Any):
-        self._folder, self._run, self._table = folder, run, table
-        self._parts = [done]
-        self.frames_saved = len(done.times_s)
-        self._write_rows([("frame", "time_s", *table.columns, "status"), *self._rows(0, done)], "w")
+    def __init__(self, folder: OutputFolder, run: dict[str, Any], table: TrackTable, done: list[Any]):
+        self._folder, self._path, self._run, self._table = folder, folder.path, run, table
+        self._parts, self._saved = done, len(done)
+        self.frames_saved = self.frames
+        rows = [("frame", "time_s", *table.columns, "status")]
+        self._write_rows(rows + [row for part in self._with_first_frames() for row in self._rows(*part)], "w")
 
     @property
     def frames(self) -> int:
@@ -51,46 +92,67 @@ class TrackWriter:
 
     @property
     def results(self) -> Any:
-        """All frames so far."""
+        """All frames so far, at least one."""
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *self._parts)
 
     def append(self, times_s: np.ndarray, track: Any) -> None:
         """Add frames: one row each in `track.csv`, on disk when this returns."""
-        arrays = type(self._parts[0])(times_s, *track)
-        part = jax.tree.map(lambda array, like: np.asarray(array, like.dtype), arrays, self._parts[0])
+        part = jax.tree.map(np.asarray, self._table.track(np.asarray(times_s), *track))
         self._write_rows(self._rows(self.frames, part), "a")
         self._parts.append(part)
 
     def checkpoint(self, state: Any, *, complete: bool = False) -> None:
         """Save `state` with everything appended so far; `complete` marks the last one of a recording."""
         meta = {"run": self._run, "frames": self.frames, "complete": complete}
-        with self._explained(_checkpoint_path(self._folder)):
-            checkpoint.save(_checkpoint_path(self._folder), {"state": state, "done": self.results}, meta)
-        self.frames_saved = self.frames
+        with self._explained(folder := _checkpoint_folder(self._path)):
+            folder.mkdir(exist_ok=True)
+            for first, part in list(self._with_first_frames())[self._saved :]:
+                checkpoint.write_npz(_part_path(self._path, first), part._asdict())
+            # The state comes last: rows without it are written again.
+            checkpoint.save(_state_path(self._path), state, meta)
+        self.frames_saved, self._saved = self.frames, len(self._parts)
 
-    def finish(self, report: dict[str, Any], **learnt: np.ndarray) -> None:
-        """Write `track.npz`, with what was `learnt` beside the track, and `report.json`."""
-        with self._explained(self._folder / "track.npz"):
-            checkpoint.write_npz(self._folder / "track.npz", self.results._asdict() | learnt)
-        with self._explained(self._folder / "report.json"):
-            (self._folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+    def finish(self, report: dict[str, Any], **arrays: np.ndarray) -> None:
+        """Write `track.npz`, with other `arrays` beside the track, and `report.json`."""
+        results = self.results
+        with self._explained(self._path / "track.npz"):
+            checkpoint.write_npz(self._path / "track.npz", results._asdict() | arrays)
+        with self._explained(self._path / "report.json"):
+            (self._path / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+        if self.frames_saved and len(self._parts) > 1:
+            with self._explained(_checkpoint_folder(self._path)):
+                checkpoint.write_npz(_part_path(self._path, 0), results._asdict())
+                for first, _ in list(self._with_first_frames())[1:]:
+                    _part_path(self._path, first).unlink(missing_ok=True)
 
     def kept(self) -> str:
         """A sentence for people: what of this run is safe, and how to go on."""
         if self.frames_saved:
-            path = _checkpoint_path(self._folder)
+            path = _checkpoint_folder(self._path)
             return f"the first {self.frames_saved} frames are kept in {path}; continue with --resume"
         if self.frames:
-            return f"the first {self.frames} frames are in {self._folder / 'track.csv'}"
+            return f"the first {self.frames} frames are in {self._path / 'track.csv'}"
         return "nothing was kept"
 
+    def close(self) -> None:
+        """Let other runs write into the folder."""
+        self._folder.close()
+
+    def _with_first_frames(self) -> Iterator[tuple[int, Any]]:
+        first = 0
+        for part in self._parts:
+            yield first, part
+            first += len(part.times_s)
+
     def _rows(self, first: int, part: Any) -> Iterator[tuple[Any, ...]]:
+        frames = len(part.times_s)
+        numbers = np.concatenate([columns.values(part).reshape(frames, -1) for columns in self._table.parts], axis=1)
         for i, time_s in enumerate(part.times_s):
-            numbers = (f"{x:.9g}" for x in self._table.numbers(part, i))
-            yield (first + i, f"{time_s:.6f}", *numbers, self._table.status_names[int(part.status[i])])
+            texts = (f"{x:.9g}" for x in numbers[i])
+            yield (first + i, f"{time_s:.6f}", *texts, self._table.status_names[int(part.status[i])])
 
     def _write_rows(self, rows: Iterable[tuple[Any, ...]], mode: str) -> None:
-        with self._explained(path := self._folder / "track.csv"), path.open(mode, newline="") as file:
+        with self._explained(path := self._path / "track.csv"), path.open(mode, newline="") as file:
             csv.writer(file).writerows(rows)
 
     @contextmanager
@@ -112,36 +174,50 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
 
     Raises:
         CheckpointError: an unfinished run lies there, and `overwrite` is false.
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or another run writes into it.
     """
-    path = _checkpoint_path(folder)
-    if not overwrite and path.exists() and not (meta := checkpoint.load_meta(path))["complete"]:
-        raise CheckpointError(
-            f"{folder} holds an unfinished run of {meta['frames']} frames: continue it with --resume, "
-            f"choose another --out, or delete {path}."
-        )
+    output = OutputFolder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write into {folder}: {_cause(error)}.") from error
-    return TrackWriter(folder, run, table, table.empty(0))
+        path = _state_path(folder)
+        if not overwrite and path.exists() and not (meta := checkpoint.load_meta(path))["complete"]:
+            raise CheckpointError(
+                f"{folder} holds an unfinished run of {meta['frames']} frames: continue it with --resume, "
+                f"choose another --out, or delete {path.parent}."
+            )
+        shutil.rmtree(_checkpoint_folder(folder), ignore_errors=True)
+        return TrackWriter(output, run, table, [])
+    except BaseException:
+        output.close()
+        raise
 
 
-def resume(folder: Path, run: dict[str, Any], table: TrackTable, state: Any) -> tuple[TrackWriter, Any]:
-    """`(writer, state)` where the last checkpoint in `folder` left off; `state` is a template of the state.
+def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackWriter, Callable[[Any], Any]]:
+    """A writer where the last checkpoint in `folder` left off, and what restores the state of the tracker.
+
+    Args:
+        folder: where the results are.
+        run: must equal that of the run that is continued.
+        table: how rows are written.
+
+    Returns:
+        The writer, and `template -> state`: the saved state with the structure of `template`, a state of the tracker.
 
     Raises:
         CheckpointError: the checkpoint is damaged, or of another input, configuration or version.
+        OutputError: the folder cannot be written, or another run writes into it.
     """
-    path = _checkpoint_path(folder)
-    meta = checkpoint.load_meta(path)
-    was = meta["run"]
-    if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
-        changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
-        raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
-    saved, _ = checkpoint.load(path, {"state": state, "done": table.empty(meta["frames"])})
-    return TrackWriter(folder, run, table, saved["done"]), saved["state"]
+    output = OutputFolder(folder)
+    try:
+        meta = checkpoint.load_meta(_state_path(folder))
+        was = meta["run"]
+        if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
+            changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
+            raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
+        writer = TrackWriter(output, run, table, _saved_parts(folder, table, meta["frames"]))
+        return writer, lambda template: checkpoint.load(_state_path(folder), template)[0]
+    except BaseException:
+        output.close()
+        raise
 
 
 def versions() -> dict[str, str]:
@@ -156,11 +232,37 @@ def versions() -> dict[str, str]:
 
 def can_resume(folder: Path) -> bool:
     """Whether `folder` holds a checkpoint."""
-    return _checkpoint_path(folder).exists()
+    return _state_path(folder).exists()
 
 
-def _checkpoint_path(folder: Path) -> Path:
-    return folder / "checkpoint.npz"
+def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[Any]:
+    """The rows of the first `frames` frames; files of later ones were written without a state, and are ignored."""
+    parts: list[Any] = []
+    done = 0
+    while done < frames:
+        arrays = checkpoint.read_arrays(path := _part_path(folder, done))
+        try:
+            part = table.track(**arrays)
+        except TypeError:
+            raise CheckpointError(f"{path}: arrays of another tracker, {sorted(arrays)}.") from None
+        lengths = {len(array) for array in part}
+        if len(lengths) != 1 or not 0 < min(lengths) <= frames - done:
+            raise CheckpointError(f"{path}: expected at most {frames - done} frames in all arrays; got {lengths}.")
+        parts.append(part)
+        done += len(part.times_s)
+    return parts
+
+
+def _checkpoint_folder(folder: Path) -> Path:
+    return folder / "checkpoint"
+
+
+def _state_path(folder: Path) -> Path:
+    return _checkpoint_folder(folder) / "state.npz"
+
+
+def _part_path(folder: Path, first: int) -> Path:
+    return _checkpoint_folder(folder) / f"rows_{first:08d}.npz"
 
 
 def _cause(error: OSError) -> str:

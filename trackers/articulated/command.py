@@ -6,28 +6,40 @@ from functools import partial
 from pathlib import Path
 
 from jaxfilters.models.articulated.hand import ArticulatedHand
-from jaxfilters.trackers.app.track_command import Job, given, refusing
+from jaxfilters.trackers.app.options import config_from_args
+from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.articulated import tracker as articulated_hand
 from jaxfilters.trackers.articulated.drawing import scene, write_overlay
 from jaxfilters.trackers.articulated.recording import FeatureSequence
 from jaxfilters.trackers.articulated.summary import errors_of, write_summary
 from jaxfilters.trackers.articulated.table import TimedArticulatedTrack, articulated_table
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.features import open_features
 
 
-def articulated_job(options: argparse.Namespace) -> Job:
+def track(options: argparse.Namespace) -> str:
+    """Track as the command line says, leave the results in `options.out`, and report in a few lines.
+
+    Raises:
+        InputError: the recording or an option cannot be used.
+        OutputError: the results cannot be written.
+        CheckpointError: what lies in the folder does not fit.
+    """
+    return run(spec(options), options)
+
+
+def spec(options: argparse.Namespace) -> RunSpec:
     """A hand in a recording of features, as the command line says.
 
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = refusing(partial(given, articulated_hand.ArticulatedConfig, options))
+    config = as_input_error(partial(config_from_args, articulated_hand.ArticulatedConfig, options))
     sequence = _sequence(options, config)
-    hand = refusing(partial(articulated_hand.hand_model, sequence, config))
-    return Job(
+    hand = as_input_error(partial(articulated_hand.hand_model, sequence, config))
+    return RunSpec(
         sequence,
-        refusing(partial(articulated_hand.build, sequence, config)),
+        as_input_error(partial(articulated_hand.build, sequence, config)),
         config,
         articulated_table(hand.layout),
         partial(_errors, sequence, hand),

@@ -40,7 +40,7 @@ from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
 from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
-from jaxfilters.trackers.tracker import SequenceTracker
+from jaxfilters.trackers.tracker import Tracker
 
 SEARCHING, TRACKING, LOST = range(3)
 LOST_NIS = 25.0
@@ -142,7 +142,7 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
     return articulated_hand(Layout(sequence.num_fingers), features=sequence.features)
 
 
-def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> SequenceTracker:
+def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> Tracker:
     """A tracker of the hand in a recording of features; limits are table 1 for two fingers, anatomy for five.
 
     Raises:
@@ -157,12 +157,10 @@ def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) ->
     return tracker_of(hand, _limits(hand.layout), start, config)
 
 
-def tracker_of(
-    hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig
-) -> SequenceTracker:
+def tracker_of(hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig) -> Tracker:
     """A tracker of any hand; without a start, one of five fingers whose features are points finds its own."""
     setup = _Setup(hand, limits, start, config)
-    return SequenceTracker(partial(_start, setup), partial(_advance, setup))
+    return Tracker(partial(_start, setup), partial(_advance, setup))
 
 
 def _limits(layout: Layout) -> Inequalities:

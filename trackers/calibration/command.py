@@ -24,10 +24,9 @@ from jaxfilters.models.calibration_board import (
 )
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.tsai import calibration_of_tsai
-from jaxfilters.trackers.app.track_command import refusing
 from jaxfilters.trackers.calibration.stereo import calibrate_rig
 from jaxfilters.trackers.io.cameras import open_intrinsics, read_tsai, write_calibration, write_camera
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import read_image
 
 _COLUMNS = ("x_m", "y_m", "z_m", "u", "v")
@@ -114,7 +113,7 @@ def _numbers(row: dict, place: str) -> list[float]:
 
 
 def _from_boards(options: argparse.Namespace) -> str:
-    board = refusing(
+    board = as_input_error(
         lambda: charuco_board(options.squares, options.square_m, options.marker_m, dictionary=options.dictionary)
     )
     files = list(dict.fromkeys([*options.images, *([options.floor] if options.floor else [])]))
@@ -124,7 +123,7 @@ def _from_boards(options: argparse.Namespace) -> str:
     if other := [file for file in files if sizes[file] != size]:
         raise InputError(f"{other[0]}: {sizes[other[0]]} pixels; {files[0]} has {size}. All must be of one camera.")
     views = {file: detect_board(image, board) for file, image in images.items()}
-    K, distortion, rms_px = refusing(lambda: calibrate_intrinsics(list(views.values()), size))
+    K, distortion, rms_px = as_input_error(lambda: calibrate_intrinsics(list(views.values()), size))
     seen = sum(len(view.pixels) for view in views.values())
     told = [f"intrinsics from {seen} corners in {len(files)} pictures: reprojection error {rms_px:.3f} px"]
     if options.floor is None:
@@ -167,7 +166,7 @@ def _written(
 ) -> str:
     """Write the camera and describe it; it is checked as its reader will."""
     cols, rows = options.image_size
-    camera = refusing(lambda: FloorCamera.from_matrix(calibration.P, (rows, cols)))
+    camera = as_input_error(lambda: FloorCamera.from_matrix(calibration.P, (rows, cols)))
     write_calibration(options.out, calibration, (cols, rows), name=options.out.stem)
     x, y, z = np.asarray(camera.position(), float)
     told = [f"camera at ({x:.2f}, {y:.2f}) m, {z:.2f} m above the floor; from {how}"]

@@ -8,8 +8,7 @@ import numpy as np
 
 from jaxfilters.models.calibration_board import BoardView, calibrate_intrinsics, charuco_board, detect_board
 from jaxfilters.models.calibration_stereo import StereoPose, calibrate_stereo
-from jaxfilters.trackers.app.track_command import refusing
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import images_in, read_image
 from jaxfilters.trackers.io.rigs import RigCamera, write_rig
 
@@ -26,7 +25,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
         InputError: the pictures cannot be used, or contradict each other.
         OutputError: the rig cannot be written.
     """
-    board = refusing(
+    board = as_input_error(
         lambda: charuco_board(options.squares, options.square_m, options.marker_m, dictionary=options.dictionary)
     )
     folders = (options.left, options.right)
@@ -38,7 +37,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
         )
     views, image_size = _views(files, board)
     found = [_intrinsics(folder, seen, image_size) for folder, seen in zip(folders, views, strict=True)]
-    pose = refusing(lambda: calibrate_stereo(views[0], views[1], (found[0][:2], found[1][:2]), image_size))
+    pose = as_input_error(lambda: calibrate_stereo(views[0], views[1], (found[0][:2], found[1][:2]), image_size))
     total = _check_agreement(pose, files)
     poses = [(np.eye(3), np.zeros(3)), (pose.R, 1000 * pose.t)]
     cameras = [

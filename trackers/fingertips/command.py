@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxfilters.models.fingertip.thumb import ThumbAngles, calibrated, usual
 from jaxfilters.models.gesture import coded
-from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
@@ -22,12 +22,9 @@ from jaxfilters.trackers.fingertips.pictures import FingertipPictures
 from jaxfilters.trackers.fingertips.session import FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.head.common.outcome import finite
-from jaxfilters.trackers.head.common.run import warn
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
 from jaxfilters.trackers.people.files import write_report
-
-_UNKNOWN_LENGTH = 1_000_000
 
 
 class Followed(NamedTuple):
@@ -46,7 +43,7 @@ class Followed(NamedTuple):
     failure: InputError | None
 
 
-def track_fingertips(options: argparse.Namespace) -> str:
+def track(options: argparse.Namespace) -> str:
     """Follow hands, leave the results in `options.out`, and say in a few lines what came of it.
 
     Raises:
@@ -120,7 +117,7 @@ def _follow(
     pictures, video = FingertipPictures(), None
     names, counts, errors, ends = Counter[str](), list[int](), list[float](), list[float]()
     interrupted, failure, told = False, None, 0
-    total = getattr(source, "frames", 0) or _UNKNOWN_LENGTH
+    total = getattr(source, "frames", 0) or None
     try:
         with ProgressLine("tracking", total) as line:
             for time_s, image in _images(source, options.seconds):
@@ -136,7 +133,7 @@ def _follow(
                 counts.append(int(report.num_tips.sum()))
                 errors += _errors(source, report)
                 ends.append(time.perf_counter())
-                line.show(min(len(counts), total), f"{counts[-1]} fingertips")
+                line.show(len(counts) if total is None else min(len(counts), total), f"{counts[-1]} fingertips")
     except InputError as error:
         failure = error
     except KeyboardInterrupt:

@@ -8,6 +8,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from jaxfilters.trackers.app.results import OutputFolder
 from jaxfilters.trackers.fingertips.events import Event
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.io.errors import OutputError
@@ -27,16 +28,18 @@ class FingertipFiles:
         """Begin both files.
 
         Raises:
-            OutputError: the folder cannot be written, or holds another run's tips.
+            OutputError: the folder cannot be written, holds another run's tips, or another run writes into it.
         """
+        self._output = OutputFolder(folder)
         self.tips, self.events = folder / "tips.csv", folder / "events.jsonl"
         if self.tips.exists():
+            self._output.close()
             raise OutputError(f"{self.tips}: holds the tips of another run; choose another --out.")
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             self._tips: TextIO = self.tips.open("w", newline="")
             self._events: TextIO = self.events.open("w", encoding="utf-8")
         except OSError as error:
+            self._output.close()
             raise OutputError(f"cannot write into {folder}: {error.strerror}.") from None
         self._rows = csv.writer(self._tips)
         self._explained(self.tips, lambda: self._rows.writerow(COLUMNS))
@@ -58,6 +61,7 @@ class FingertipFiles:
         """Nothing more comes."""
         self._tips.close()
         self._events.close()
+        self._output.close()
 
     def _explained(self, path: Path, write: Callable[[], Any]) -> None:
         try:

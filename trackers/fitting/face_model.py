@@ -23,9 +23,8 @@ from jaxfilters.models.face.multilinear_fit import leave_one_out
 from jaxfilters.models.face.people_alignment import aligned_people
 from jaxfilters.models.synthetic.face_training import generator_shapes, ict_shapes, people_of
 from jaxfilters.models.synthetic.ict_face import read_ict
-from jaxfilters.trackers.app.track_command import refusing
 from jaxfilters.trackers.io.enrolled_people import People, write_people
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, save_face_model
 from jaxfilters.trackers.io.landmark_sets import NAMES_68, LandmarkSets, read_landmark_sets, ten_of
 
@@ -70,7 +69,7 @@ def fit(options: argparse.Namespace) -> str:
         raise InputError(f"--people must be 3 or more; got {options.people}.")
     with jax.enable_x64(True):
         examples = _examples(options)
-        model, tensor, quality = refusing(lambda: _learnt(examples.sets, options.identities, options.expressions))
+        model, tensor, quality = as_input_error(lambda: _learnt(examples.sets, options.identities, options.expressions))
         parameters = {
             **examples.parameters,
             "identities": options.identities,
@@ -111,7 +110,7 @@ def _examples(options: argparse.Namespace) -> Examples:
 
 def _ict_examples(options: argparse.Namespace, key: jax.Array, drawn: dict) -> Examples:
     # Read in single precision, the precision of its files; what is computed with it is double.
-    single = refusing(lambda: read_ict(options.data))
+    single = as_input_error(lambda: read_ict(options.data))
     widened = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
     model = jax.tree.map(widened, single)
     landmarks: tuple[int, ...]
@@ -120,7 +119,7 @@ def _ict_examples(options: argparse.Namespace, key: jax.Array, drawn: dict) -> E
     landmarks, names, pairs = FROM_68, NAMES, PAIRS
     if options.points == 68:
         landmarks, names, pairs = tuple(range(68)), NAMES_68, PAIRS_68
-    shapes = refusing(lambda: ict_shapes(key, model, options.people, landmarks=landmarks))
+    shapes = as_input_error(lambda: ict_shapes(key, model, options.people, landmarks=landmarks))
     return Examples(LandmarkSets(np.asarray(shapes), names, pairs, None), "ICT face model", drawn)
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilters.models.moving_points import learn, tracks_of
-from jaxfilters.trackers.app.track_command import refusing
-from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
 from jaxfilters.trackers.io.points import read_points
 
 _SYNTHETIC = (0.5, 40.0)
@@ -25,8 +24,8 @@ def fit_noise(options: argparse.Namespace) -> str:
     if not options.fps > 0:
         raise InputError(f"--fps must be positive; got {options.fps}.")
     points, times = _synthetic(options.seed) if options.tracks is None else read_points(options.tracks, options.fps)
-    tracks, _ = refusing(lambda: tracks_of(points, times))
-    found = refusing(lambda: learn(tracks))
+    tracks, _ = as_input_error(lambda: tracks_of(points, times))
+    found = as_input_error(lambda: learn(tracks))
     if not bool(found.converged):
         raise InputError(f"{options.tracks}: no noise parameters explain these tracks ({found.termination}).")
     if options.out is not None:

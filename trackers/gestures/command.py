@@ -12,10 +12,9 @@ from jaxfilters.models.gesture.learning import LeftOut, accuracy, learn_strokes,
 from jaxfilters.models.gesture.stroke import Drawn, to_judge
 from jaxfilters.models.gesture.symbols import Recognition, extended, recognise_all
 from jaxfilters.models.synthetic.strokes import drawn, tracked
-from jaxfilters.trackers.app.track_command import refusing
+from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
-from jaxfilters.trackers.head.common.run import warn
-from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
 from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
 
@@ -47,7 +46,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
             )
         states = before.symbols.models.log_initial.shape[-1] if before else options.states
         floor = before.min_variance if before else None
-        learnt = refusing(
+        learnt = as_input_error(
             lambda: learn_strokes(
                 examples.strokes,
                 examples.labels,
@@ -57,7 +56,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
             )
         )
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
-        symbols = refusing(lambda: extended(before.symbols, learnt)) if before else learnt
+        symbols = as_input_error(lambda: extended(before.symbols, learnt)) if before else learnt
         source = f"{before.source}; {source}" if before else source
         write_symbols(options.out, SymbolsFile(symbols, source, parameters))
         num_models, num_states = symbols.models.log_initial.shape
@@ -82,7 +81,7 @@ def recognise(options: argparse.Namespace) -> str:
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
     strokes = _read(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
-    found = refusing(lambda: _judged(file, strokes, options.margin))
+    found = as_input_error(lambda: _judged(file, strokes, options.margin))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
         _write(options.out, rows)
@@ -164,7 +163,7 @@ def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
 
 
 def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[str]:
-    found: list[LeftOut] = refusing(
+    found: list[LeftOut] = as_input_error(
         lambda: leave_one_out(
             examples.strokes,
             examples.labels,

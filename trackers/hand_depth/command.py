@@ -8,26 +8,39 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfilters.trackers.app.track_command import Job, given, refusing
+from jaxfilters.trackers.app.options import config_from_args
+from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.drawing import write_overlay
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.hand_depth.summary import mean_joint_error, write_summary
 from jaxfilters.trackers.hand_depth.table import HAND_TABLE, TimedHandTrack
 from jaxfilters.trackers.io.depth import open_depth
+from jaxfilters.trackers.io.errors import as_input_error
 
 
-def hand_job(options: argparse.Namespace) -> Job:
+def track(options: argparse.Namespace) -> str:
+    """Track as the command line says, leave the results in `options.out`, and report in a few lines.
+
+    Raises:
+        InputError: the recording or an option cannot be used.
+        OutputError: the results cannot be written.
+        CheckpointError: what lies in the folder does not fit.
+    """
+    return run(spec(options), options)
+
+
+def spec(options: argparse.Namespace) -> RunSpec:
     """A hand in a depth recording, as the command line says.
 
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = refusing(partial(given, hand_depth.HandDepthConfig, options))
+    config = as_input_error(partial(config_from_args, hand_depth.HandDepthConfig, options))
     sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
-    return Job(
+    return RunSpec(
         sequence,
-        refusing(partial(hand_depth.build, sequence.camera, config)),
+        as_input_error(partial(hand_depth.build, sequence.camera, config)),
         config,
         HAND_TABLE,
         partial(_errors, sequence),

@@ -99,7 +99,7 @@ def _captioned(sequence: DepthSequence, results: TimedHandTrack, frames_per_seco
     speed = f"{frames_per_second:.0f} frames/s" if np.isfinite(frames_per_second) else ""
     for i, time_s in enumerate(results.times_s - results.times_s[0]):
         image = draw_frame(sequence, results, i, limits)
-        status, ess = int(results.status[i]), results.ess[i]
+        status, ess = int(results.status[i]), results.effective_sample_size[i]
         count = f"ESS {ess:4.0f}" if np.isfinite(ess) else "        "
         caption(image, f"frame {i}   {time_s:6.2f} s   {count}   {speed}", 0)
         caption(image, STATUS_NAMES[status], 1, STATUS_COLORS[status])

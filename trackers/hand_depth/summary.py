@@ -91,7 +91,7 @@ def _crop(image: np.ndarray, sequence: DepthSequence, joints: np.ndarray, side: 
 def _charts(sequence: DepthSequence, results: TimedHandTrack) -> list[np.ndarray]:
     times_s = results.times_s - results.times_s[0]
     errors = joint_errors(sequence, results)
-    ess = Curve("", results.ess, _INK)
+    ess = Curve("", results.effective_sample_size, _INK)
     x_label = "time (s)"
     charts = [
         draw_chart(_CHART, "wrist from its median, mm, with 2 sigma", times_s, _wrist_curves(results)),

@@ -1,10 +1,11 @@
 """What `track.csv` and `track.npz` hold of a hand in depth images."""
 
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxfilters.trackers.app.results import TrackTable
+from jaxfilters.trackers.app.results import Columns, TrackTable
 
 _POSITION = tuple(f"wrist_{axis}" for axis in "xyz")
 _THUMB_ANGLES = ("thumb_cmc_x", "thumb_mcp_x", "thumb_mcp_z")
@@ -34,20 +35,17 @@ class TimedHandTrack(NamedTuple):
     pose: np.ndarray
     pose_std: np.ndarray
     joints: np.ndarray
-    ess: np.ndarray
+    effective_sample_size: np.ndarray
     log_evidence: np.ndarray
     status: np.ndarray
 
 
-def _numbers(track: TimedHandTrack, i: int) -> np.ndarray:
-    return np.concatenate([track.pose[i], track.pose_std[i], [track.ess[i], track.log_evidence[i]]])
-
-
-def _empty(frames: int) -> TimedHandTrack:
-    pose, pose_std, joints, ess, log_evidence = (
-        np.zeros((frames, *shape), np.float32) for shape in ((22,), (21,), (21, 3), (), ())
-    )
-    return TimedHandTrack(np.zeros(frames), pose, pose_std, joints, ess, log_evidence, np.zeros(frames, np.int32))
-
-
-HAND_TABLE = TrackTable((*POSE_COLUMNS, *STD_COLUMNS, "ess", "log_evidence"), _numbers, _empty)
+HAND_TABLE = TrackTable(
+    TimedHandTrack,
+    (
+        Columns(POSE_COLUMNS, attrgetter("pose")),
+        Columns(STD_COLUMNS, attrgetter("pose_std")),
+        Columns(("effective_sample_size",), attrgetter("effective_sample_size")),
+        Columns(("log_evidence",), attrgetter("log_evidence")),
+    ),
+)

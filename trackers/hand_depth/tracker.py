@@ -52,7 +52,7 @@ from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.hand_depth.detect import nearest_hand
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
-from jaxfilters.trackers.tracker import HandTrack, SequenceTracker
+from jaxfilters.trackers.tracker import HandTrack, Tracker
 
 SEARCHING, TRACKING, LOST = range(3)
 
@@ -152,7 +152,7 @@ class _Setup:
     stride: int = field(metadata={"static": True})
 
 
-def build(camera: Pinhole, config: HandDepthConfig | None = None) -> SequenceTracker:
+def build(camera: Pinhole, config: HandDepthConfig | None = None) -> Tracker:
     """A hand tracker for the frames of one depth camera."""
     config = config or HandDepthConfig()
     stride = config.stride or max(1, round(float(camera.focal[0]) * 2 * REACH / 0.6 / WINDOW[1]))
@@ -160,7 +160,7 @@ def build(camera: Pinhole, config: HandDepthConfig | None = None) -> SequenceTra
     surface = CapsuleHand(geometry) if config.surface == "capsules" else triangle_hand(geometry)
     likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
     setup = _Setup(camera, likelihood, config, stride)
-    return SequenceTracker(partial(_start, setup), partial(_advance, setup))
+    return Tracker(partial(_start, setup), partial(_advance, setup))
 
 
 def _start(setup: _Setup, key: Array, frame: np.ndarray) -> TrackState:
@@ -344,7 +344,7 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
         pose=pose,
         pose_std=jnp.sqrt(jnp.diagonal(covariance)),
         joints=forward_kinematics(pose, likelihood.geometry).joints,
-        ess=info.effective_sample_size,
+        effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
         status=jnp.where(seen, TRACKING, LOST).astype(jnp.int32),
     )

@@ -40,9 +40,31 @@ def load(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     return jax.tree.unflatten(treedef, [_restore(path, _name(p), arrays[_name(p)], leaf) for p, leaf in leaves]), meta
 
 
+def load_names(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays by their places in the tree, as `jax.tree_util.keystr` after "tree", and the `meta`.
+
+    Raises:
+        CheckpointError: damaged file, or other schema.
+    """
+    return _read(path)
+
+
 def load_meta(path: Path) -> dict[str, Any]:
     """The `meta` of a checkpoint, without its arrays being looked at."""
     return _read(path)[1]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file that `write_npz` wrote.
+
+    Raises:
+        CheckpointError: no such file, or a damaged one.
+    """
+    try:
+        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path}: not a complete checkpoint ({error}).") from None
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -59,12 +81,11 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = read_arrays(path)
     try:
-        with path.open("rb") as content, np.load(content, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
         schema, meta = header["schema"], header["meta"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path}: not a complete checkpoint ({error}).") from None
     if schema != SCHEMA:
         raise CheckpointError(f"{path}: schema {schema}, but this version reads {SCHEMA}.")

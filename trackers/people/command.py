@@ -1,40 +1,36 @@
 """`jaxfilters track people`."""
 
 import argparse
-import sys
+import itertools
+import json
 import time
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
-import jax
 import numpy as np
 
-from jaxfilters.models.person.ellipsoid import VISIBLE
-from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import versions
-from jaxfilters.trackers.app.track_command import refusing
 from jaxfilters.trackers.app.video import OverlayVideo, side_by_side
-from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.io.cameras import open_camera
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
 from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.io.video_input import PRIMING_IMAGES, LiveCamera, Moment, open_video, together
+from jaxfilters.trackers.io.video_input import PRIMING_IMAGES, LiveCamera, open_video, together
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.drawing import drawn, write_plan
-from jaxfilters.trackers.people.files import TrackTableWriter, replace_tracks, write_mot, write_report
-from jaxfilters.trackers.people.following import follow
-from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed
-from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleConfig, PeopleScene
-from jaxfilters.trackers.people.tracker import outlines, people_scene
-
-KEPT_BEYOND = 1.4
-"""The background is not learnt within a person's outline of this size."""
+from jaxfilters.trackers.people.files import TracksWriter, write_mot, write_report
+from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.session import PeopleEstimate, PeopleSession
+from jaxfilters.trackers.people.state import TRACKED, PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.tracker import people_scene
 
 
-class Place(NamedTuple):
+class Setup(NamedTuple):
     """What is watched, and by what."""
 
     scene: PeopleScene
@@ -44,51 +40,71 @@ class Place(NamedTuple):
     """The synthetic room, with its truth; None for real cameras."""
 
 
-class Followed(NamedTuple):
-    """What came of a run."""
+class RunResult(NamedTuple):
+    """What came of a run beside its tracks."""
 
-    recorder: Recorder
     frames: int
     frames_per_second: float
-    """Of everything but the first frame, which compiles; NaN until there are two."""
+    """Without the first frame, which compiles; NaN until there are two."""
     interrupted: bool
 
 
-def track_people(options: argparse.Namespace) -> None:
+def track(options: argparse.Namespace) -> str:
     """Follow everybody, and leave the results in `options.out`.
 
     Raises:
         InputError: a source, a file or an option cannot be used.
         OutputError: the results cannot be written.
     """
-    place = _place(options)
-    table = TrackTableWriter(options.out, place.scene, overwrite=False)
+    setup = _setup(options)
+    run = _identity(setup, options)
+    with closing(TracksWriter(options.out, setup.scene, run, resume=options.resume)) as writer:
+        return _tracked(setup, options, writer)
+
+
+def _tracked(setup: Setup, options: argparse.Namespace, writer: TracksWriter) -> str:
     began = time.perf_counter()
-    try:
-        followed = _follow(place, options, table)
-    finally:
-        table.close()
-    tracks = followed.recorder.tracks
-    live = any(isinstance(source, LiveCamera) for source in place.sources)
-    if not live:
-        tracks = smoothed(place.scene.config, tracks)
-        replace_tracks(table.path, place.scene, tracks)
+    session = as_input_error(lambda: PeopleSession(setup.scene, options.background))
+    session.prime(
+        [
+            [undistortion.apply(image) for image in source.sample(PRIMING_IMAGES)]
+            for source, undistortion in zip(setup.sources, setup.undistortions, strict=True)
+        ]
+    )
+    writer.restore(session)
+    result = _run(setup, options, session, writer)
+    is_live = any(isinstance(source, LiveCamera) for source in setup.sources)
+    tracks = session.tracks.recorder.tracks if is_live else session.tracks.smoothed()
+    if not is_live:
+        writer.replace(tracks)
     if options.mot:
-        write_mot(options.out / "tracks_mot.txt", place.scene, tracks)
-    write_plan(options.out / "plan.png", place.scene, tracks)
-    report = _report(place, options, followed, tracks, not live, time.perf_counter() - began)
+        write_mot(options.out / "tracks_mot.txt", setup.scene, tracks)
+    write_plan(options.out / "plan.png", setup.scene, tracks)
+    report = _report(setup, options, result, tracks, not is_live, time.perf_counter() - began)
     write_report(options.out / "report.json", report)
-    _tell(report, options)
+    return _summary(report, options)
 
 
-def _place(options: argparse.Namespace) -> Place:
-    config = refusing(lambda: PeopleConfig(**({"capacity": options.capacity} if options.capacity else {})))
+def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
+    """What two runs must share for one to continue the other."""
+    return {
+        "input": [source.name for source in setup.sources],
+        "image_sizes": [list(source.image_size) for source in setup.sources],
+        "seed": options.seed,
+        "background": options.background,
+        "version": version("jaxfilters"),
+        **{f"config.{name}": value for name, value in json.loads(json.dumps(asdict(setup.scene.config))).items()},
+    }
+
+
+def _setup(options: argparse.Namespace) -> Setup:
+    config = as_input_error(lambda: PeopleConfig(**({"capacity": options.capacity} if options.capacity else {})))
     if not options.sources:
         if options.camera or options.scene:
             raise InputError("--camera, --scene: of no use without a video; the synthetic room has its own.")
         room = demo_room(options.seed or 0)
         scene = people_scene(room.cameras, room.floor, furniture=room.furniture, config=config)
-        return Place(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room)
+        return Setup(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room)
     if not options.scene:
         raise InputError("--scene: missing; a scene.json with the floor on which people walk, in metres.")
     if len(options.camera) != len(options.sources):
@@ -103,8 +119,8 @@ def _place(options: argparse.Namespace) -> Place:
     described = open_scene(options.scene)
     cameras = [file.camera for file in files]
     furniture = furniture_of(described, cameras)
-    scene = refusing(lambda: people_scene(cameras, described.floor, furniture=furniture, config=config))
-    return Place(scene, [file.undistortion for file in files], sources, None)
+    scene = as_input_error(lambda: people_scene(cameras, described.floor, furniture=furniture, config=config))
+    return Setup(scene, [file.undistortion for file in files], sources, None)
 
 
 class _DemoSource:
@@ -132,35 +148,27 @@ def _demo_sources(room: DemoRoom) -> list[Any]:
     return [_DemoSource(room, camera) for camera in range(len(room.cameras))]
 
 
-def _follow(place: Place, options: argparse.Namespace, table: TrackTableWriter) -> Followed:
-    backgrounds = _backgrounds(place, options.background)
-    recorder = Recorder()
-    images = [np.zeros((*camera.shape, 3), np.uint8) for camera in place.scene.cameras]
-    keep: list[np.ndarray | None] = [None] * len(images)
-    total = max((getattr(source, "frames", 0) for source in place.sources), default=0)
-    video, ends = None, []
-    interrupted, index = False, -1
-
-    def moments() -> Iterator[tuple[float, tuple[CameraFrame, ...]]]:
-        for moment in together(place.sources):
-            _straighten(place, moment, images)
-            yield moment.time_s, _frames(moment, images, backgrounds, keep)
-
+def _run(setup: Setup, options: argparse.Namespace, session: PeopleSession, writer: TracksWriter) -> RunResult:
+    total = max((getattr(source, "frames", 0) for source in setup.sources), default=0) or None
+    first, ends = session.tracks.frames, list[float]()
+    video, interrupted = None, False
+    name = f"overlay_from_{first}.mp4" if first else "overlay.mp4"
     try:
-        with ProgressLine("tracking", total or 1_000_000) as line:
-            for now in follow(place.scene, moments(), recorder):
-                index = now.frame
-                shown = jax.tree.map(np.asarray, outlines(place.scene, now.people))
-                keep[:] = [
-                    _occupied(outline, now.people, image.shape[:2])
-                    for outline, image in zip(shown, images, strict=True)
+        with ProgressLine("tracking", total, done=first) as line:
+            for moment in itertools.islice(together(setup.sources), first, None):
+                images = [
+                    None if image is None else undistortion.apply(image)
+                    for image, undistortion in zip(moment.images, setup.undistortions, strict=True)
                 ]
-                table.append(now.added)
+                now = session.process(images, moment.time_s)
+                writer.append(now.added)
+                writer.checkpoint(session)
                 if options.video:
-                    video = _draw(video, options.out, place, images, shown, now.people, now.time_s)
+                    video = _draw(video, options.out / name, setup, session, now)
                 ends.append(time.perf_counter())
                 inside = int(np.sum(now.people.mode == TRACKED))
-                line.show(min(index + 1, total or index + 1), f"{inside} {'person' if inside == 1 else 'people'}")
+                done = now.frame + 1 if total is None else min(now.frame + 1, total)
+                line.show(done, f"{inside} {'person' if inside == 1 else 'people'}")
                 if options.seconds and now.time_s >= options.seconds:
                     break
     except KeyboardInterrupt:
@@ -169,77 +177,41 @@ def _follow(place: Place, options: argparse.Namespace, table: TrackTableWriter) 
         if video is not None:
             video.close()
     rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else float("nan")
-    return Followed(recorder, index + 1, rate, interrupted)
+    return RunResult(session.tracks.frames, rate, interrupted)
 
 
-def _backgrounds(place: Place, name: str) -> list[Background]:
-    made = []
-    for source, undistortion in zip(place.sources, place.undistortions, strict=True):
-        one = refusing(lambda: background(name))
-        if samples := source.sample(PRIMING_IMAGES):
-            one.prime([undistortion.apply(image) for image in samples])
-        made.append(one)
-    return made
-
-
-def _straighten(place: Place, moment: Moment, images: list[np.ndarray]) -> None:
-    """Put in the new images without lens distortion; the last ones stay where a camera has nothing new."""
-    for i, (image, undistortion) in enumerate(zip(moment.images, place.undistortions, strict=True)):
-        if image is not None:
-            images[i] = undistortion.apply(image)
-
-
-def _frames(moment, images, backgrounds, keep) -> tuple[CameraFrame, ...]:
-    frames = []
-    for i, (new, image, model) in enumerate(zip(moment.images, images, backgrounds, strict=True)):
-        if new is None:
-            frames.append(CameraFrame(np.zeros(image.shape[:2], np.uint8), image, np.bool_(False)))
-            continue
-        probability = model.apply(image, keep=keep[i])
-        frames.append(CameraFrame(cv2.convertScaleAbs(probability, alpha=255.0), image, np.bool_(True)))
-    return tuple(frames)
-
-
-def _occupied(seen: Any, people: People, shape: tuple[int, int]) -> np.ndarray:
-    """Non-zero where people stand."""
-    mask = np.zeros(shape, np.uint8)
-    for slot in np.flatnonzero(((people.mode == TRACKED) | (people.mode == TENTATIVE)) & (seen.code == VISIBLE)):
-        reach = KEPT_BEYOND * np.sqrt(np.diagonal(seen.shape[slot]))
-        low, high = seen.center[slot] - reach, seen.center[slot] + reach
-        u, v = np.clip(np.round([low[0], high[0]]), 0, shape[1]), np.clip(np.round([low[1], high[1]]), 0, shape[0])
-        mask[int(v[0]) : int(v[1]), int(u[0]) : int(u[1])] = 255
-    return mask
-
-
-def _draw(video, out: Path, place: Place, images, shown, people: People, time_s: float) -> OverlayVideo:
-    picture = side_by_side([drawn(image, seen, people) for image, seen in zip(images, shown, strict=True)], time_s)
+def _draw(
+    video: OverlayVideo | None, path: Path, setup: Setup, session: PeopleSession, now: PeopleEstimate
+) -> OverlayVideo:
+    views = zip(session.last_images, session.last_outlines, strict=True)
+    picture = side_by_side([drawn(image, outline, now.people) for image, outline in views], now.time_s)
     if video is None:
-        video = OverlayVideo(out / "overlay.mp4", max(source.fps for source in place.sources), picture.shape)
+        video = OverlayVideo(path, max(source.fps for source in setup.sources), picture.shape)
     video.write(picture)
     return video
 
 
 def _report(
-    place: Place,
+    setup: Setup,
     options: argparse.Namespace,
-    followed: Followed,
+    result: RunResult,
     tracks: dict[int, list[Sighting]],
     is_smoothed: bool,
     seconds: float,
 ) -> dict[str, Any]:
-    rate = followed.frames_per_second
+    rate = result.frames_per_second
     return {
-        "input": [source.name for source in place.sources],
-        "frames": followed.frames,
+        "input": [source.name for source in setup.sources],
+        "frames": result.frames,
         "frames_per_second": round(rate, 2) if rate == rate else None,
         "seconds": round(seconds, 2),
         "people": len(tracks),
         "smoothed": is_smoothed,
-        "interrupted": followed.interrupted,
-        "trouble": [trouble for source in place.sources if (trouble := source.trouble())],
-        "mean_error_m": None if place.demo is None else _demo_error(place.demo, tracks),
+        "interrupted": result.interrupted,
+        "trouble": [trouble for source in setup.sources if (trouble := source.trouble())],
+        "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
         "background": options.background,
-        "config": {name: getattr(place.scene.config, name) for name in place.scene.config.__dataclass_fields__},
+        "config": {name: getattr(setup.scene.config, name) for name in setup.scene.config.__dataclass_fields__},
         "versions": versions(),
     }
 
@@ -254,11 +226,11 @@ def _demo_error(room: DemoRoom, tracks: dict[int, list[Sighting]]) -> float | No
     return round(float(np.mean(errors)), 4) if errors else None
 
 
-def _tell(report: dict[str, Any], options: argparse.Namespace) -> None:
+def _summary(report: dict[str, Any], options: argparse.Namespace) -> str:
     for trouble in report["trouble"]:
-        print(f"jaxfilters: warning: {trouble}", file=sys.stderr)
+        warn(trouble)
     speed = report["frames_per_second"]
-    print(
+    return (
         f"{report['frames']} frames in {report['seconds']:.1f} s"
         + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
         + f", {report['people']} people"

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -9,69 +10,121 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
+from jaxfilters.trackers.app.results import OutputFolder
 from jaxfilters.trackers.io.errors import OutputError
+from jaxfilters.trackers.people.checkpoints import has_checkpoint, load, save
 from jaxfilters.trackers.people.recorded import Sighting, height_of, spreads
+from jaxfilters.trackers.people.session import PeopleSession
 from jaxfilters.trackers.people.silhouettes import body_of, place_of
 from jaxfilters.trackers.people.state import PeopleScene
 
 COLUMNS = ("frame", "id", "x_m", "y_m", "sd_radial_m", "sd_lateral_m", "height_m", "score", "mode")
 
 
-class TrackTableWriter:
-    """`tracks.csv`, one row a person and frame; every row is on disk when `append` returns."""
+CHECKPOINT_EVERY_S = 2.0
+"""Seconds between checkpoints; what was tracked since the last one is tracked again after a crash."""
 
-    def __init__(self, folder: Path, scene: PeopleScene, *, overwrite: bool):
-        """Begin a table.
+
+class TracksWriter:
+    """`tracks.csv`, one row a person and frame, and `checkpoint/` to continue from.
+
+    Every row is on disk when `append` returns. The cost of a checkpoint does not depend on how many came before it.
+    """
+
+    def __init__(self, folder: Path, scene: PeopleScene, run: dict[str, Any], *, resume: bool):
+        """Begin a table, or open that of an interrupted run.
+
+        Args:
+            folder: Where the results go.
+            scene: Whose cameras tell along the line of sight from across it.
+            run: What must be equal for a run to be continued, JSON-able.
+            resume: Whether an interrupted run is continued, where there is one.
 
         Raises:
-            OutputError: the folder cannot be written, or holds tracks already.
+            OutputError: The folder cannot be written, holds tracks already, or another run writes into it.
         """
-        self.path, self._centers = folder / "tracks.csv", np.asarray(scene.centers())
+        self._output, self.path = OutputFolder(folder), folder / "tracks.csv"
+        self._scene, self._run, self._centers = scene, run, np.asarray(scene.centers())
+        self._unsaved: list[tuple[int, Sighting]] = []
+        self._num_parts, self._saved_at = 0, time.monotonic()
+        self._resumes = resume and has_checkpoint(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if self.path.exists() and not overwrite:
-                raise OutputError(f"{self.path}: holds the tracks of another run; choose another --out.")
-            self._file: TextIO = self.path.open("w", newline="")
-        except OutputError:
-            raise
+            if self.path.exists() and not self._resumes:
+                raise OutputError(f"{self.path}: holds the tracks of another run; choose another --out, or --resume.")
+            self._file: TextIO = self.path.open("a" if self._resumes else "w", newline="")
+            if not self._resumes:
+                csv.writer(self._file).writerow(COLUMNS)
         except OSError as error:
+            self._output.close()
+            if isinstance(error, OutputError):
+                raise
             raise OutputError(f"cannot write {self.path}: {error.strerror}.") from None
-        self._rows = csv.writer(self._file)
-        self._rows.writerow(COLUMNS)
+
+    def restore(self, session: PeopleSession) -> None:
+        """Continue the interrupted run, if there is one, in a new session.
+
+        Raises:
+            CheckpointError: The interrupted run is another one, or its checkpoint is damaged.
+        """
+        if not self._resumes:
+            return
+        saved = load(self.path.parent, self._run, session)
+        session.restore(saved.state, saved.tracks)
+        self._num_parts = saved.num_parts
+        self._file.truncate(0)
+        csv.writer(self._file).writerow(COLUMNS)
+        self._write(saved.tracks)
 
     def append(self, sightings: list[tuple[int, Sighting]]) -> None:
         """Add rows.
 
         Raises:
-            OutputError: the disk is full or the folder gone; what was appended before is kept.
+            OutputError: The disk is full or the folder gone; what was appended before is kept.
         """
+        self._unsaved += sightings
+        self._write(sightings)
+
+    def checkpoint(self, session: PeopleSession) -> None:
+        """Save what the next images need, unless that was done a moment ago.
+
+        Raises:
+            OutputError: As for `append`.
+        """
+        if time.monotonic() - self._saved_at < CHECKPOINT_EVERY_S:
+            return
         try:
-            self._rows.writerows(_row(self._centers, identity, seen) for identity, seen in sightings)
+            save(self.path.parent, self._run, session.state(), self._unsaved, self._num_parts)
+        except OSError as error:
+            raise OutputError(f"cannot write a checkpoint: {error.strerror}; {self.path} is kept.") from None
+        self._unsaved, self._num_parts, self._saved_at = [], self._num_parts + 1, time.monotonic()
+
+    def replace(self, tracks: dict[int, list[Sighting]]) -> None:
+        """Put other tracks into the table of a finished run, ordered by frame, all or nothing.
+
+        Raises:
+            OutputError: It cannot be written; the old one is kept.
+        """
+        partial = self.path.with_name(self.path.name + ".partial")
+        try:
+            with partial.open("w", newline="") as file:
+                rows = csv.writer(file)
+                rows.writerow(COLUMNS)
+                rows.writerows(_row(self._centers, identity, seen) for identity, seen in by_frame(tracks))
+            partial.replace(self.path)
+        except OSError as error:
+            raise OutputError(f"cannot write {self.path}: {error.strerror}; the filtered tracks are kept.") from None
+
+    def close(self) -> None:
+        """Nothing more comes; other runs may write into the folder."""
+        self._file.close()
+        self._output.close()
+
+    def _write(self, sightings: list[tuple[int, Sighting]]) -> None:
+        try:
+            csv.writer(self._file).writerows(_row(self._centers, identity, seen) for identity, seen in sightings)
             self._file.flush()
         except OSError as error:
             raise OutputError(f"cannot write {self.path}: {error.strerror}; earlier rows are kept.") from None
-
-    def close(self) -> None:
-        """Nothing more comes."""
-        self._file.close()
-
-
-def replace_tracks(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
-    """Put other tracks into a finished `tracks.csv`, ordered by frame, all or nothing.
-
-    Raises:
-        OutputError: it cannot be written; the old one is kept.
-    """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("w", newline="") as file:
-            rows = csv.writer(file)
-            rows.writerow(COLUMNS)
-            centers = np.asarray(scene.centers())
-            rows.writerows(_row(centers, identity, seen) for identity, seen in by_frame(tracks))
-        partial.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; the tracks as they were found are kept.") from None
 
 
 def write_mot(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]], camera: int = 0) -> None:

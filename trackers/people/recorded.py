@@ -1,6 +1,7 @@
 """Tracks as they are kept: collected while the tracker runs, and smoothed when a recording has ended."""
 
 import itertools
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.state import HEIGHT, TENTATIVE, TRACKED, People, PeopleConfig, Report
+from jaxfilters.trackers.people.state import HEIGHT, STATE, TENTATIVE, TRACKED, People, PeopleConfig, Report
 
 
 class Sighting(NamedTuple):
@@ -31,31 +32,70 @@ class Sighting(NamedTuple):
     """`tentative`, `tracked`, `hidden` (nothing to be seen) or `no_depth` (not measurable along the line of sight)."""
 
 
+MODES = ("tentative", "tracked", "hidden", "no_depth")
+"""Words in `Sighting.mode`."""
+
+
 class Recorder:
     """Collects sightings by identity; those from before a confirmation follow once there is an identity."""
 
     def __init__(self) -> None:
         self.tracks: dict[int, list[Sighting]] = {}
-        self._unconfirmed: dict[int, list[Sighting]] = {}
+        self.unconfirmed: dict[int, list[Sighting]] = {}
+        """By slot."""
 
     def add(self, frame: int, time_s: float, people: People, report: Report) -> list[tuple[int, Sighting]]:
         """The sightings of a frame and, for the newly confirmed, of the frames before; NumPy leaves."""
         added: list[tuple[int, Sighting]] = []
         for slot, (mode, identity) in enumerate(zip(people.mode, people.identity, strict=True)):
             if mode not in (TENTATIVE, TRACKED):
-                self._unconfirmed.pop(slot, None)
+                self.unconfirmed.pop(slot, None)
                 continue
             seen = _sighting(frame, time_s, slot, people, report)
             if mode == TENTATIVE:
                 # A slot that was given up and taken again within one frame holds somebody else.
                 if people.log_odds[slot] == 0:
-                    self._unconfirmed.pop(slot, None)
-                self._unconfirmed.setdefault(slot, []).append(seen)
+                    self.unconfirmed.pop(slot, None)
+                self.unconfirmed.setdefault(slot, []).append(seen)
                 continue
-            added += [(int(identity), one) for one in [*self._unconfirmed.pop(slot, []), seen]]
+            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), seen]]
         for identity, seen in added:
             self.tracks.setdefault(identity, []).append(seen)
         return added
+
+
+def as_arrays(sightings: Sequence[tuple[int, Sighting]]) -> dict[str, np.ndarray]:
+    """Sightings with an integer each, as arrays to save."""
+    columns = list(zip(*[(key, *seen) for key, seen in sightings], strict=True)) or [()] * (1 + len(Sighting._fields))
+    arrays = dict(zip(("key", *Sighting._fields), columns, strict=True))
+    modes = [MODES.index(mode) for mode in arrays.pop("mode")]
+    n = len(modes)
+    return {
+        **{name: np.asarray(arrays[name], np.int64) for name in ("key", "frame", "slot")},
+        **{name: np.asarray(arrays[name], np.float64) for name in ("time_s", "score")},
+        "mean": np.reshape(np.asarray(arrays["mean"], np.float64), (n, STATE)),
+        "covariance": np.reshape(np.asarray(arrays["covariance"], np.float64), (n, STATE, STATE)),
+        "mode": np.asarray(modes, np.int64),
+    }
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Sighting]]:
+    """Sightings as `as_arrays` was given them."""
+    return [
+        (
+            int(arrays["key"][i]),
+            Sighting(
+                int(arrays["frame"][i]),
+                float(arrays["time_s"][i]),
+                arrays["mean"][i],
+                arrays["covariance"][i],
+                float(arrays["score"][i]),
+                int(arrays["slot"][i]),
+                MODES[int(arrays["mode"][i])],
+            ),
+        )
+        for i in range(len(arrays["key"]))
+    ]
 
 
 def _sighting(frame, time_s, slot, people, report) -> Sighting:

@@ -30,11 +30,11 @@ def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) 
     model = inner.params
     if not isinstance(model, ExtendedKalman | Kalman) or not model.manifold.flat:
         return
-    known = _on_host((constraints.normals, lasting))
+    known = known_values((constraints.normals, lasting))
     if known is None or not known[1].any():
         return
     normals, names = known[0][known[1]], np.asarray(constraints.names)[known[1]]
-    noise = None if callable(model.process_noise) else _on_host(model.process_noise)
+    noise = None if callable(model.process_noise) else known_values(model.process_noise)
     if noise is not None and noise.shape[:1] == normals.shape[1:]:
         _refuse_moving(names, *_noise_along(model.prior, normals, noise))
     _refuse_moving(names, *_transition_along(model, normals))
@@ -54,14 +54,14 @@ def _transition_along(model, normals):
     """Changes of the values by the transition, and what would be rounding."""
     message = "transition changes its value by {:g}"
     with jax.ensure_compile_time_eval():
-        belief = _on_host(model.prior)
+        belief = known_values(model.prior)
         if belief is None:
             return None, None, message
         mean = belief.mean
         variance = np.diagonal(belief.covariance) if isinstance(belief, Gaussian) else np.sum(belief.root**2, axis=1)
         points = [mean, mean + np.sqrt(np.maximum(variance, 0.0))]
         try:
-            moved = _on_host([model.transition(jax.numpy.asarray(x, mean.dtype), None) for x in points])
+            moved = known_values([model.transition(jax.numpy.asarray(x, mean.dtype), None) for x in points])
         except Exception:  # A transition that needs inputs, or another one that only the filter can call.
             return None, None, message
     if moved is None or any(np.shape(y) != mean.shape for y in moved):
@@ -80,8 +80,8 @@ def _refuse_moving(names, change, rounding, reason):
     )
 
 
-def _on_host(tree):
-    """The arrays as NumPy arrays, or None where one of them is traced."""
+def known_values(tree: Any) -> Any:
+    """The arrays of a pytree as NumPy arrays, or None where one of them is traced."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
         return None
     return jax.tree.map(np.asarray, tree)

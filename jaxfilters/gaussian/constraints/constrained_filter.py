@@ -19,6 +19,7 @@ from jaxfilters.gaussian.constraints import expectation_propagation
 from jaxfilters.gaussian.constraints.constant_rows import check_constant
 from jaxfilters.gaussian.constraints.info import TruncationInfo
 from jaxfilters.gaussian.constraints.linear import LinearConstraints, check_rows, check_width
+from jaxfilters.gaussian.constraints.resolution import check_resolution
 from jaxfilters.gaussian.constraints.sites import Sites, initial_sites
 from jaxfilters.typing import AnyKey
 
@@ -147,8 +148,9 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
     Raises:
         TypeError: `inner` or `constrain` is of the wrong kind, the state of `inner` is not Gaussian, or
             `constrain.lasting` is not Boolean.
-        ValueError: The rows do not fit the state, their numbers are not valid, or a row that is declared lasting
-            moves in time. Values are checked where they are known, that is, not under `jit` or `grad`.
+        ValueError: The rows do not fit the state, their numbers are not valid, a row that is declared lasting moves in
+            time, or one is too narrow for a covariance in float32. Values are checked where they are known, that is,
+            not under `jit` or `grad`.
 
     Example:
         A random walk that stays above 0:
@@ -193,6 +195,7 @@ def _checked(inner, constrain):
     if lasting.shape != (rows,):
         raise ValueError(f"lasting: expected shape ({rows},), one for each row; got {lasting.shape}.")
     check_constant(inner, constrain.constraints, lasting)
+    check_resolution(inner, constrain.constraints, lasting)
     return replace(constrain, lasting=lasting)
 
 

@@ -160,7 +160,7 @@ def test_a_disk_that_fills_at_the_end_keeps_the_run_for_a_second_try(npz, tmp_pa
     assert main(arguments) == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith(f"jaxfilters: error: cannot write {out / name}")
-    assert line.endswith(f"the first {FRAMES} frames are kept in {out / 'checkpoint.npz'}; continue with --resume.")
+    assert line.endswith(f"the first {FRAMES} frames are kept in {out / 'checkpoint'}; continue with --resume.")
     (out / name).unlink(missing_ok=True)
     assert main([*arguments, "--resume"]) == 0
     assert (out / name).stat().st_size > 0

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.app import session
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.app.devices import available_cores, use_all_cores
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.hand_depth import command as hand_command
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.tracker import HandDepthConfig
+from jaxfilters.trackers.tracker import CHUNK
 
-OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint.npz"}
+OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +114,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(png_folder, tmp_path, monk
     with monkeypatch.context() as patch:
         interrupt_at(patch, 20)
         assert run("track", "hand-depth", png_folder, "--out", parts) == 130
-    assert f"the first {session.CHUNK} frames are kept in {parts}/checkpoint.npz; continue with --resume" in (
+    assert f"the first {CHUNK} frames are kept in {parts}/checkpoint; continue with --resume" in (
         capsys.readouterr().err
     )
     assert run("track", "hand-depth", png_folder, "--out", parts) == 2
@@ -152,10 +152,15 @@ def test_a_truncated_image_says_what_is_kept_and_can_be_mended(png_folder, tmp_p
 
 
 @pytest.mark.usefixtures("fake_hand_depth")
-def test_a_mistake_of_ours_shows_its_traceback(tmp_path, monkeypatch):
+def test_an_unforeseen_error_is_one_line_and_its_traceback_lies_beside_the_results(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(hand_command, "write_summary", lambda *_: 1 / 0)
+    assert run("demo", "--out", tmp_path / "out", "--no-video") == 70
+    line = capsys.readouterr().err.splitlines()[-1]
+    expected = "jaxfilters: error: unforeseen ZeroDivisionError: division by zero; please report it with "
+    assert line == f"{expected}{tmp_path / 'out' / 'error.txt'}."
+    assert "write_summary" in (tmp_path / "out" / "error.txt").read_text()
     with pytest.raises(ZeroDivisionError):
-        run("demo", "--out", tmp_path / "out", "--no-video")
+        run("--debug", "demo", "--out", tmp_path / "out", "--no-video")
 
 
 @pytest.mark.parametrize(

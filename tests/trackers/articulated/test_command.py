@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.app import session
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.articulated import tracker as articulated_hand
 from jaxfilters.trackers.articulated.table import articulated_table
 from jaxfilters.trackers.articulated.tracker import ArticulatedConfig
+from jaxfilters.trackers.tracker import CHUNK
 
-OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint.npz"}
+OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}
 ERRORS = ("mean_angle_error_deg", "mean_length_error_px", "lengths_within_2_sigma_percent")
 
 
@@ -142,7 +142,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(npz, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(ProgressLine, "show", show_and_interrupt)
         assert run(file, "--out", parts) == 130
-    assert f"the first {session.CHUNK} frames are kept in {parts}/checkpoint.npz" in capsys.readouterr().err
+    assert f"the first {CHUNK} frames are kept in {parts}/checkpoint" in capsys.readouterr().err
     assert run(file, "--out", parts, "--resume", "--gate", 3) == 2
     assert "cannot be resumed: config.gate was 5.0 and is 3.0" in capsys.readouterr().err
     assert run(npz(start_mean=arrays_mean(file) + 1), "--out", parts, "--resume") == 2

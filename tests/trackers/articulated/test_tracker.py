@@ -16,9 +16,9 @@ from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING, A
 
 def follow(sequence, config=None):
     built = tracker.build(sequence, config or ArticulatedConfig())
-    state = built.start(jax.random.key(0), sequence[0])
+    state = built.init(jax.random.key(0), sequence[0])
     frames = jax.tree.map(lambda *leaves: np.stack(leaves), *[sequence[i] for i in range(len(sequence))])
-    return jax.tree.map(np.asarray, built.advance(state, frames, sequence.times_s.astype(np.float32))[1])
+    return jax.tree.map(np.asarray, built.step(state, frames, sequence.times_s.astype(np.float32))[1])
 
 
 @pytest.fixture(scope="module")

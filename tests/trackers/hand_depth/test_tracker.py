@@ -28,10 +28,10 @@ def tracker():
 
 
 def follow(tracker, depth, seed=0):
-    state, rows = tracker.start(jax.random.key(seed), depth[0]), []
+    state, rows = tracker.init(jax.random.key(seed), depth[0]), []
     for first in range(0, len(depth), CHUNK):
         times = np.arange(first, first + CHUNK, dtype=np.float32) / 30
-        state, track = tracker.advance(state, depth[first : first + CHUNK], times)
+        state, track = tracker.step(state, depth[first : first + CHUNK], times)
         rows.append(track)
     return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
@@ -51,7 +51,7 @@ def test_a_moving_hand_is_followed_from_an_automatic_start(track, sequence):
     assert np.all(track.status == TRACKING)
     assert errors.mean() < 12
     assert np.all(np.isfinite(track.log_evidence))
-    assert np.all((track.ess >= 1) & (track.ess <= NUM_PARTICLES))
+    assert np.all((track.effective_sample_size >= 1) & (track.effective_sample_size <= NUM_PARTICLES))
     assert np.all(track.pose_std > 0)
     np.testing.assert_allclose(np.linalg.norm(track.pose[:, 3:7], axis=1), 1, atol=1e-5)
 
@@ -96,10 +96,10 @@ def test_without_any_hand_the_tracker_searches(tracker, value):
 @pytest.mark.system
 def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequence):
     blank = np.full((424, 512), 3.0, np.float32)
-    state = tracker.start(jax.random.key(0), blank)
+    state = tracker.init(jax.random.key(0), blank)
     assert np.isnan(state.scale)
     depth = np.concatenate([np.stack([blank] * 2), sequence[0][: CHUNK - 2]])
-    state, track = tracker.advance(state, depth, np.arange(CHUNK, dtype=np.float32) / 30)
+    state, track = tracker.step(state, depth, np.arange(CHUNK, dtype=np.float32) / 30)
     assert np.all(track.status == [SEARCHING] * 2 + [TRACKING] * (CHUNK - 2))
     assert abs(float(state.scale) - 1) < 0.051
     assert joint_errors_mm(track, np.concatenate([sequence[1][:2], sequence[1]])[:CHUNK])[2:].mean() < 15
@@ -138,6 +138,6 @@ def test_a_real_hand_is_followed(data_dir):
     tracker = hand_depth.build(recording.camera, HandDepthConfig())
     depth = np.stack([recording[i] for i in range(len(recording))])
     times = (recording.times_s - recording.times_s[0]).astype(np.float32)
-    _, track = tracker.advance(tracker.start(jax.random.key(0), depth[0]), depth, times)
+    _, track = tracker.step(tracker.init(jax.random.key(0), depth[0]), depth, times)
     assert np.all(track.status == TRACKING)
     assert joint_errors_mm(track, recording.joints).mean() < 22

@@ -11,7 +11,7 @@ from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.video import caption, side_by_side
-from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, in_degrees
+from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, displayed
 
 HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (190, 190, 190))
 """Blue, green, red, in the order of `STATUS_WORDS`."""
@@ -20,6 +20,8 @@ AXIS_COLORS = ((84, 92, 255), (110, 220, 90), (255, 150, 70))
 OUTLINES = (EYES[:2], EYES[2:], MOUTH, (BROWS[0], *NOSTRILS, BROWS[1]))
 """Landmarks that lines join."""
 _AXES_MM = np.array([[0.0, 0, 0], [50, 0, 0], [0, 50, 0], [0, 0, -80]], np.float32)
+_MILLIMETRES = np.array([1e3, 1e3, 1e3, 1, 1, 1], np.float32)
+"""In which the rig projects; poses of rows are in metres and radians."""
 _LANDMARK, _LINE = (255, 255, 255), (220, 220, 120)
 _SUBPIXEL = 4
 """Fractional bits of the coordinates that OpenCV draws with."""
@@ -63,7 +65,7 @@ def can_be_drawn(points: np.ndarray) -> bool:
 
 def _axes(rig: CameraRig, pose: np.ndarray) -> np.ndarray:
     """(C, 4, 2) pixels of the head's origin and of the ends of its axes."""
-    return np.asarray(_placed_axes(rig, jnp.asarray(pose)))
+    return np.asarray(_placed_axes(rig, jnp.asarray(pose) * _MILLIMETRES))
 
 
 @jax.jit
@@ -88,7 +90,7 @@ def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
     scored = f"   score {score:.2f}" if np.isfinite(score) else ""
     caption(picture, f"{STATUS_WORDS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])
     if status in TRACKED:
-        x, y, z, roll, pitch, yaw = in_degrees(track.pose[i])
+        x, y, z, roll, pitch, yaw = displayed(track.pose[i])
         caption(picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm", 2)
         caption(picture, f"roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 3)
 

@@ -15,6 +15,7 @@ from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.synthetic.face_motion import FPS, MONOCULAR_PLACE_MM, motion, speech_schedule
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence, sequence
 from jaxfilters.trackers.head.common.report import HeadTruth
+from jaxfilters.trackers.head.common.table import pose_in_metres
 from jaxfilters.trackers.io.cameras import open_intrinsics
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.landmarks import read_landmarks
@@ -122,7 +123,7 @@ def _refuse_unused(given: dict[str, Any]) -> None:
 def _rendered(made: FaceSequence) -> Place:
     image = _remembered(made)
     sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
-    truth = HeadTruth(made.poses, made.uv)
+    truth = HeadTruth(pose_in_metres(made.poses), made.uv)
     undistortions = [Undistortion(made.rig.shape) for _ in sources]
     return Place(made.rig, undistortions, sources, np.asarray(made.uv[0, 0], float), truth, None)
 

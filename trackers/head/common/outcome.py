@@ -4,10 +4,12 @@ import argparse
 import math
 from typing import Any
 
+import numpy as np
+
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.head.common.report import errors, shares
 from jaxfilters.trackers.head.common.run import Followed, HeadRun
-from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED
+from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, displayed
 
 
 def run_report(run: HeadRun, followed: Followed) -> dict[str, Any]:
@@ -39,7 +41,9 @@ def told(report: dict[str, Any], options: argparse.Namespace) -> str:
         + (", interrupted" if report["interrupted"] else "")
     ]
     if report["errors"]:
-        rmse = ", ".join(f"{axis.replace('_', ' ')} {value:.2f}" for axis, value in report["errors"]["rmse"].items())
+        values = displayed(np.asarray(list(report["errors"]["rmse"].values())))
+        named = zip((axis.replace(",", " in") for axis in DISPLAYED), values, strict=True)
+        rmse = ", ".join(f"{axis} {value:.2f}" for axis, value in named)
         lines.append(f"errors, root mean square: {rmse}")
     if not any(report["status"][STATUS_WORDS[code]] for code in TRACKED):
         last = f"; last: {report['events'][-1]['what']}" if report["events"] else ""

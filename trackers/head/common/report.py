@@ -6,12 +6,10 @@ import numpy as np
 
 from jaxfilters.trackers.head.common.table import (
     AXES,
-    AXIS_ORDER,
     SKIPPED,
     STATUS_WORDS,
     TRACKED,
     HeadRows,
-    in_degrees,
     longest_stretch,
 )
 
@@ -23,7 +21,7 @@ class HeadTruth(NamedTuple):
     """Of a synthetic face, frames first."""
 
     poses: np.ndarray
-    """(frames, 6) millimetres and radians."""
+    """(frames, 6) metres and radians."""
     uv: np.ndarray
     """(frames, cameras, 10, 2) pixels of the landmarks."""
 
@@ -54,12 +52,10 @@ def errors(track: HeadRows, truth: HeadTruth | None) -> dict[str, Any]:
     offsets[:, 3:] = (offsets[:, 3:] + np.pi) % (2 * np.pi) - np.pi
     inside = np.abs(offsets) <= _SIGMAS * track.pose_std[tracked]
     pixels = track.image_points[tracked].astype(float) - truth.uv[tracked]
-    rmse = in_degrees(np.sqrt(np.mean(offsets**2, axis=0)))
+    rmse = np.sqrt(np.mean(offsets**2, axis=0))
     return {
-        "rmse": {axis: _rounded(value) for axis, value in zip(AXES, rmse, strict=True)},
-        "within_2_sigma": {
-            axis: _rounded(value) for axis, value in zip(AXES, inside.mean(axis=0)[AXIS_ORDER], strict=True)
-        },
+        "rmse": {axis: round(float(value), 6) for axis, value in zip(AXES, rmse, strict=True)},
+        "within_2_sigma": {axis: _rounded(value) for axis, value in zip(AXES, inside.mean(axis=0), strict=True)},
         "landmark_rms_px": _rounded(np.sqrt(np.nanmean(np.sum(pixels**2, axis=-1)))),
     }
 

@@ -2,15 +2,14 @@
 
 import argparse
 import math
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
-from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import TrackTable, begin
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.head.common.drawing import draw_frame
@@ -22,7 +21,6 @@ from jaxfilters.trackers.io.video_input import Moment
 
 MOST_WAITING = 32
 """Moments after which rows are written, however few of them are whole."""
-_UNKNOWN_LENGTH = 1_000_000
 
 
 @runtime_checkable
@@ -52,10 +50,20 @@ class Followed(NamedTuple):
     trouble: list[str]
 
 
+class RowsOf(NamedTuple):
+    """How what a session returns becomes rows of its table."""
+
+    table: TrackTable
+    in_metres: Callable[[Any], Any]
+    """Of a track in millimetres."""
+    nothing: Callable[[int], Any]
+    """`frames -> rows` of the right shapes and types."""
+
+
 class HeadRun:
     """The way of images from the cameras through the session into rows and pictures."""
 
-    def __init__(self, options: argparse.Namespace, place: Place, session: Session, table: TrackTable, *, chunk: int):
+    def __init__(self, options: argparse.Namespace, place: Place, session: Session, rows: RowsOf, *, chunk: int):
         """A run before its first image.
 
         Raises:
@@ -64,8 +72,8 @@ class HeadRun:
         if (path := options.out / "track.csv").exists():
             raise OutputError(f"{path}: holds the track of another run; choose another --out.")
         self.session, self.frame_of = session, list[int]()
-        self.place, self._options, self._table = place, options, table
-        self.writer = begin(options.out, {}, table, overwrite=True)
+        self.place, self._options, self._rows = place, options, rows
+        self.writer = begin(options.out, {}, rows.table, overwrite=True)
         self._video: OverlayVideo | None = None
         self._failure: InputError | None = None
         self._last = "no images of one moment"
@@ -97,6 +105,10 @@ class HeadRun:
         if followed.failure is not None:
             raise InputError(f"{str(followed.failure).removesuffix('.')}; {self.writer.kept()}.")
 
+    def close(self) -> None:
+        """Let other runs write into the folder."""
+        self.writer.close()
+
     def _followed(self) -> Followed:
         paired = PairedInput(self.place.sources)
         interrupted = False
@@ -115,7 +127,7 @@ class HeadRun:
         return Followed(rate, 1000 * cost, interrupted, self._failure, paired.trouble())
 
     def _take(self, paired: PairedInput) -> None:
-        total = min((getattr(source, "frames", 0) for source in self.place.sources), default=0) or _UNKNOWN_LENGTH
+        total = min((getattr(source, "frames", 0) for source in self.place.sources), default=0) or None
         waiting: list[Moment] = []
         with ProgressLine("tracking", total) as line:
             for moment in self._readable(paired):
@@ -123,13 +135,16 @@ class HeadRun:
                 is_last = bool(self._options.seconds) and moment.time_s >= self._options.seconds
                 if is_last or sum(map(_is_whole, waiting)) == self._chunk or len(waiting) == MOST_WAITING:
                     self._advance(waiting)
-                    line.show(min(self.writer.frames, total), self._last)
+                    line.show(self._done(total), self._last)
                     waiting = []
                 if is_last:
                     return
             if waiting:
                 self._advance(waiting)
-                line.show(min(self.writer.frames, total), self._last)
+                line.show(self._done(total), self._last)
+
+    def _done(self, total: int | None) -> int:
+        return self.writer.frames if total is None else min(self.writer.frames, total)
 
     def _readable(self, paired: PairedInput) -> Iterator[Moment]:
         """The straightened images up to the first that cannot be read."""
@@ -153,7 +168,8 @@ class HeadRun:
         track = self._track([moment for moment, is_whole in zip(moments, whole, strict=True) if is_whole])
         self.frame_of += [self.writer.frames + int(i) for i in np.flatnonzero(whole)]
         times_s = np.asarray([moment.time_s for moment in moments])
-        rows = with_gaps(track, times_s, whole, self._table)
+        track = None if track is None else self._rows.in_metres(track)
+        rows = with_gaps(track, times_s, whole, self._rows.nothing)
         self.writer.append(times_s, rows[1:])
         if self._options.video:
             self._draw(moments, rows)
@@ -183,8 +199,3 @@ class HeadRun:
 
 def _is_whole(moment: Moment) -> bool:
     return all(image is not None for image in moment.images)
-
-
-def warn(text: str) -> None:
-    """A line for a person, beside the results."""
-    sys.stderr.write(f"jaxfilters: warning: {text}\n")

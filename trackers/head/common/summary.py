@@ -10,7 +10,7 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.app.chart import Color, Curve, Shade, draw_chart
 from jaxfilters.trackers.head.common.drawing import HEAD_STATUS_COLORS, draw_points
 from jaxfilters.trackers.head.common.state import NUM_MODES
-from jaxfilters.trackers.head.common.table import AXES, STATUS_WORDS, HeadRows, in_degrees
+from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, HeadRows, displayed
 from jaxfilters.trackers.io.errors import OutputError
 
 DEVIATIONS = 2.0
@@ -32,6 +32,8 @@ class Labels(NamedTuple):
     """What the numbers of a face's changes are called."""
 
     coefficients: str = "deformation, mm"
+    scale: float = 1e3
+    """Of the coefficients in this picture."""
     curve: str = "a"
     mode: str = "a"
     modes: str = "deformation learnt"
@@ -45,24 +47,23 @@ def draw_summary(
 ) -> np.ndarray:
     """(rows, cols, 3) uint8: charts with 2-sigma bands over paper in the colours of the statuses, and the modes learnt.
 
-    `truth` are poses (frames, 6) in millimetres and radians, drawn in grey; None where they are not known.
+    `truth` are poses (frames, 6) in metres and radians, drawn in grey; None where they are not known.
     """
     times_s = track.times_s
     shades = status_shades(times_s, track.status)
-    pose, std = in_degrees(track.pose), in_degrees(track.pose_std)
-    known = None if truth is None else in_degrees(truth[: len(times_s)])
+    pose, std = displayed(track.pose), displayed(track.pose_std)
+    known = None if truth is None else displayed(truth[: len(times_s)])
 
     def chart(title: str, curves: list[Curve], x_label: str = "") -> np.ndarray:
         return draw_chart((_ROWS, _WIDTH // 2), title, times_s, curves, x_label, shades=shades)
 
     charts = []
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(DISPLAYED):
         curve = Curve("", pose[:, axis].astype(float), _COLORS[axis % 3], DEVIATIONS * std[:, axis].astype(float))
         under = [] if known is None else [Curve("truth", known[:, axis].astype(float), _TRUTH)]
-        word, unit = name.split("_")
-        charts.append(chart(f"{word}, {unit}, with 2 sigma", [*under, curve]))
+        charts.append(chart(f"{name}, with 2 sigma", [*under, curve]))
     modes = [
-        Curve(f"{labels.curve}{mode + 1}", track.deformation[:, mode].astype(float), _COLORS[mode])
+        Curve(f"{labels.curve}{mode + 1}", labels.scale * track.deformation[:, mode].astype(float), _COLORS[mode])
         for mode in range(min(NUM_MODES, 0 if model is None else track.deformation.shape[1]))
         if np.any(np.nan_to_num(track.deformation[:, mode]))
     ]

@@ -1,25 +1,29 @@
 """What `track.csv` and `track.npz` hold of a head."""
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
-from jaxfilters.trackers.app.results import TrackTable
-from jaxfilters.trackers.head.common.state import DEFORMABLE, HEAD_STATUS, NUM_MODES, RIGID
+from jaxfilters.trackers.app.results import Columns, TrackTable
+from jaxfilters.trackers.head.common.state import DEFORMABLE, HEAD_STATUS, NUM_MODES, RIGID, HeadTrack
 
 STATUS_WORDS = (*HEAD_STATUS, "skipped")
 """Words for the integers in `TimedHeadTrack.status`; skipped: without an image of each camera."""
 SKIPPED = len(HEAD_STATUS)
 TRACKED = (RIGID, DEFORMABLE)
 """Statuses in which there is a pose."""
-AXES = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
-"""Of a pose in the table and in reports; the tracker's own order has yaw before pitch."""
-AXIS_ORDER = [0, 1, 2, 3, 5, 4]
-"""Where they are in a pose of the tracker."""
-_COLUMNS = (*AXES, *(f"sd_{axis}" for axis in AXES), *(f"a{i}_mm" for i in range(1, NUM_MODES + 1)), "score")
+AXES = ("x_m", "y_m", "z_m", "roll_rad", "yaw_rad", "pitch_rad")
+"""Of a pose, in the table and in reports."""
+STD_AXES = tuple(f"{axis}_std_{unit}" for axis, unit in (name.split("_") for name in AXES))
+"""Of its standard deviations."""
+DISPLAYED = ("x, mm", "y, mm", "z, mm", "roll, degrees", "pitch, degrees", "yaw, degrees")
+"""What `displayed` gives, for pictures."""
+_DISPLAY_ORDER = [0, 1, 2, 3, 5, 4]
+_METRES = 1e-3
+"""The trackers compute in millimetres."""
 
 
 @runtime_checkable
@@ -48,13 +52,13 @@ class TimedHeadTrack(NamedTuple):
     times_s: np.ndarray
     """(frames,) float64 seconds from the first."""
     pose: np.ndarray
-    """(frames, 6) x, y, z in millimetres, roll, yaw, pitch in radians."""
+    """(frames, 6) x, y, z in metres, roll, yaw, pitch in radians."""
     pose_std: np.ndarray
     """(frames, 6) standard deviations."""
     deformation: np.ndarray
-    """(frames, 5) millimetres."""
+    """(frames, 5) metres."""
     shape: np.ndarray
-    """(frames, 10, 3) millimetres in the model frame."""
+    """(frames, 10, 3) metres in the model frame."""
     image_points: np.ndarray
     """(frames, cameras, 10, 2) pixels without lens distortion."""
     score: np.ndarray
@@ -65,24 +69,47 @@ class TimedHeadTrack(NamedTuple):
     """(frames,) int32: places in `STATUS_WORDS`."""
 
 
-def head_table(num_cameras: int) -> TrackTable:
-    """How the track of a head before `num_cameras` becomes rows."""
-    return TrackTable(_COLUMNS, _numbers, partial(_empty, num_cameras), STATUS_WORDS)
+HEAD_TABLE = TrackTable(
+    TimedHeadTrack,
+    (
+        Columns(AXES, attrgetter("pose")),
+        Columns(STD_AXES, attrgetter("pose_std")),
+        Columns(tuple(f"deformation_{i}_m" for i in range(1, NUM_MODES + 1)), attrgetter("deformation")),
+        Columns(("score",), attrgetter("score")),
+    ),
+    STATUS_WORDS,
+)
+"""How the track of a head before the cameras of a rig becomes rows."""
 
 
-def in_degrees(pose: np.ndarray) -> np.ndarray:
-    """(..., 6) in the units and the order of `AXES`, of poses or of their standard deviations."""
-    return np.concatenate([pose[..., :3], np.rad2deg(pose[..., 3:])], axis=-1)[..., AXIS_ORDER]
+def displayed(pose: np.ndarray) -> np.ndarray:
+    """(..., 6) in the units and the order of `DISPLAYED`, of poses in metres and radians or of their deviations."""
+    return np.concatenate([pose[..., :3] / _METRES, np.rad2deg(pose[..., 3:])], axis=-1)[..., _DISPLAY_ORDER]
 
 
-def with_gaps(track: Any, times_s: np.ndarray, whole: Sequence[bool], table: TrackTable) -> Any:
-    """The rows of all moments, in order: those of `track` where a moment is whole, else nothing and `SKIPPED`.
+def in_metres(track: HeadTrack) -> HeadTrack:
+    """A track of the stereo tracker with all lengths in metres."""
+    return track._replace(
+        pose=pose_in_metres(track.pose),
+        pose_std=pose_in_metres(track.pose_std),
+        deformation=_METRES * np.asarray(track.deformation),
+        shape=_METRES * np.asarray(track.shape),
+    )
 
-    `track` has the fields of the table's rows but for the times, or is None where no moment is whole.
 
-    Rows whose status says that nothing is tracked lose their numbers, so that none of them passes for a pose.
+def with_gaps(track: Any, times_s: np.ndarray, whole: Sequence[bool], nothing: Callable[[int], Any]) -> Any:
+    """The rows of all moments, in order: those of `track` where a moment is whole, else `nothing` and `SKIPPED`.
+
+    `track` is None where no moment is whole. Rows whose status says that nothing is tracked lose their numbers, so that
+    none of them passes for a pose.
+
+    Args:
+        track: Rows of the whole moments.
+        times_s: (frames,) of all moments.
+        whole: (frames,) which of them have an image of every camera.
+        nothing: `frames -> rows` with the times first, of the right shapes and types.
     """
-    none = table.empty(len(whole))
+    none = nothing(len(whole))
     rows = {name: np.full_like(field, np.nan) for name, field in none._asdict().items() if name != "status"}
     status = np.full(len(whole), SKIPPED, np.int32)
     places = np.flatnonzero(whole)
@@ -110,12 +137,6 @@ def longest_stretch(status: np.ndarray) -> slice:
     return slice(int(frames[best.start]), int(frames[best.stop - 1]) + 1) if best.stop else best
 
 
-def _numbers(track: TimedHeadTrack, i: int) -> np.ndarray:
-    return np.concatenate(
-        [in_degrees(track.pose[i]), in_degrees(track.pose_std[i]), track.deformation[i], track.score[i : i + 1]]
-    )
-
-
 def _as_wide(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """With as many columns as the table: zeros for modes that the face has not."""
     modes = rows.shape[1]
@@ -127,7 +148,8 @@ def _beside(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     return rows.reshape(-1, *[1] * (values.ndim - 1))
 
 
-def _empty(num_cameras: int, frames: int) -> TimedHeadTrack:
+def empty_rows(num_cameras: int, frames: int) -> TimedHeadTrack:
+    """Rows of the right shapes and types, before `num_cameras` cameras."""
     one = np.zeros(frames, np.float32)
     return TimedHeadTrack(
         times_s=np.zeros(frames),
@@ -140,3 +162,8 @@ def _empty(num_cameras: int, frames: int) -> TimedHeadTrack:
         effective_sample_size=one,
         status=np.zeros(frames, np.int32),
     )
+
+
+def pose_in_metres(pose: np.ndarray) -> np.ndarray:
+    """(..., 6) in metres and radians, of millimetres and radians."""
+    return np.asarray(pose) * np.repeat(np.asarray([_METRES, 1.0], np.asarray(pose).dtype), 3)

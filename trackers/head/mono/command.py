@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -10,19 +11,20 @@ import numpy as np
 from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.trackers.app.track_command import given, refusing
+from jaxfilters.trackers.app.options import config_from_args
+from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.head.common.input import place_of_one
 from jaxfilters.trackers.head.common.outcome import finite, run_report, told
-from jaxfilters.trackers.head.common.run import HeadRun, warn
+from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
 from jaxfilters.trackers.head.common.table import STATUS_WORDS
 from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoOptions
-from jaxfilters.trackers.head.mono.table import mono_table
+from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres, mono_table
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model
 from jaxfilters.trackers.io.landmark_sets import NAMES_68
 from jaxfilters.trackers.io.video_input import LiveCamera
@@ -30,11 +32,11 @@ from jaxfilters.trackers.io.video_input import LiveCamera
 PERSON_FILE = "person.npz"
 _GIVEN = ("model", "camera", "points", "known", "detector")
 """Options that the report repeats as they were given."""
-LABELS = Labels("expression, standard deviations", "a", "mode ", "how this face changes with expressions")
+LABELS = Labels("expression, standard deviations", 1.0, "a", "mode ", "how this face changes with expressions")
 """Of the summary: what is a parameter of the expression, and what moves the most."""
 
 
-def track_mono(options: argparse.Namespace) -> str:
+def track(options: argparse.Namespace) -> str:
     """Follow a head, leave the results in `options.out`, and say in a few lines what came of it.
 
     Raises:
@@ -42,7 +44,7 @@ def track_mono(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
-    settings = refusing(partial(given, MonoOptions, options))
+    settings = as_input_error(partial(config_from_args, MonoOptions, options))
     model = _model(options)
     place = place_of_one(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
@@ -51,10 +53,23 @@ def track_mono(options: argparse.Namespace) -> str:
     known = None if options.known is None else read_people(options.known, face)
     remembered = None if known is None else known.remembered
     detector = _detector(options)
-    session = refusing(
+    session = as_input_error(
         lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
     )
-    run = HeadRun(options, place, session, mono_table(face), chunk=settings.chunk)
+    rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
+    with closing(HeadRun(options, place, session, rows, chunk=settings.chunk)) as run:
+        return _tracked(options, settings, run, session, model, known)
+
+
+def _tracked(
+    options: argparse.Namespace,
+    settings: MonoOptions,
+    run: HeadRun,
+    session: MonoSession,
+    model: FaceModelFile,
+    known: People | None,
+) -> str:
+    place, face = run.place, tracked(model.model)
     if place.note:
         warn(f"{place.note}: distances are wrong in proportion")
     followed = run.follow()

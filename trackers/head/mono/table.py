@@ -1,14 +1,15 @@
 """What `track.csv` and `track.npz` hold of a head before one camera."""
 
-from functools import partial
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.trackers.app.results import TrackTable
-from jaxfilters.trackers.head.common.table import AXES, STATUS_WORDS, in_degrees
+from jaxfilters.trackers.app.results import Columns, TrackTable
+from jaxfilters.trackers.head.common.table import AXES, STATUS_WORDS, STD_AXES, pose_in_metres
+from jaxfilters.trackers.head.mono.state import MonoTrack
 
 
 class TimedMonoTrack(NamedTuple):
@@ -17,13 +18,13 @@ class TimedMonoTrack(NamedTuple):
     times_s: np.ndarray
     """(frames,) float64 seconds from the first."""
     pose: np.ndarray
-    """(frames, 6) x, y, z in millimetres, roll, yaw, pitch in radians."""
+    """(frames, 6) x, y, z in metres, roll, yaw, pitch in radians."""
     pose_std: np.ndarray
     """(frames, 6) standard deviations."""
     deformation: np.ndarray
     """(frames, A) expression in standard deviations of the training set's."""
     shape: np.ndarray
-    """(frames, 10, 3) millimetres in the model frame."""
+    """(frames, 10, 3) metres in the model frame."""
     image_points: np.ndarray
     """(frames, 1, 10, 2) pixels without lens distortion."""
     score: np.ndarray
@@ -33,9 +34,9 @@ class TimedMonoTrack(NamedTuple):
     identity: np.ndarray
     """(frames, S) in standard deviations of the training set's."""
     offset: np.ndarray
-    """(frames, 10, 3) what the model lacks of this face, millimetres."""
+    """(frames, 10, 3) what the model lacks of this face, metres."""
     who: np.ndarray
-    """(frames,) place among those who are known, -1 for a stranger."""
+    """(frames,) index of the recognised person, -1 for an unknown one."""
     is_adjusted: np.ndarray
     """(frames,) 1 where the face was adjusted."""
     status: np.ndarray
@@ -44,30 +45,41 @@ class TimedMonoTrack(NamedTuple):
 
 def mono_table(face: MultilinearFace) -> TrackTable:
     """How the track of a head with a model of faces becomes rows."""
-    expressions = (f"a{i}_sd" for i in range(1, face.num_expressions + 1))
-    identities = (f"s{i}_sd" for i in range(1, face.num_identities + 1))
-    columns = (*AXES, *(f"sd_{axis}" for axis in AXES), *expressions, *identities, "who", "is_adjusted", "score")
-    return TrackTable(columns, _numbers, partial(_empty, face.num_expressions, face.num_identities), STATUS_WORDS)
+    expressions = tuple(f"expression_{i}" for i in range(1, face.num_expressions + 1))
+    identities = tuple(f"identity_{i}" for i in range(1, face.num_identities + 1))
+    columns = (
+        Columns(AXES, attrgetter("pose")),
+        Columns(STD_AXES, attrgetter("pose_std")),
+        Columns(expressions, attrgetter("deformation")),
+        Columns(identities, attrgetter("identity")),
+        *(Columns((name,), attrgetter(name)) for name in ("who", "is_adjusted", "score")),
+    )
+    return TrackTable(TimedMonoTrack, columns, STATUS_WORDS)
 
 
-def _numbers(track: TimedMonoTrack, i: int) -> np.ndarray:
-    pose, std = in_degrees(track.pose[i]), in_degrees(track.pose_std[i])
-    last = [track.who[i], track.is_adjusted[i], track.score[i]]
-    return np.concatenate([pose, std, track.deformation[i], track.identity[i], last])
+def mono_in_metres(track: MonoTrack) -> MonoTrack:
+    """A track with all lengths in metres."""
+    return track._replace(
+        pose=pose_in_metres(track.pose),
+        pose_std=pose_in_metres(track.pose_std),
+        shape=1e-3 * np.asarray(track.shape),
+        offset=1e-3 * np.asarray(track.offset),
+    )
 
 
-def _empty(num_expressions: int, num_identities: int, frames: int) -> TimedMonoTrack:
+def empty_mono_rows(face: MultilinearFace, frames: int) -> TimedMonoTrack:
+    """Rows of the right shapes and types."""
     zeros = lambda *shape: np.zeros((frames, *shape), np.float32)
     return TimedMonoTrack(
         times_s=np.zeros(frames),
         pose=zeros(6),
         pose_std=zeros(6),
-        deformation=zeros(num_expressions),
+        deformation=zeros(face.num_expressions),
         shape=zeros(NUM_LANDMARKS, 3),
         image_points=zeros(1, NUM_LANDMARKS, 2),
         score=zeros(),
         effective_sample_size=zeros(),
-        identity=zeros(num_identities),
+        identity=zeros(face.num_identities),
         offset=zeros(NUM_LANDMARKS, 3),
         who=zeros() - 1,
         is_adjusted=zeros(),

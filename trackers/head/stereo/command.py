@@ -2,24 +2,26 @@
 
 import argparse
 import dataclasses
+from contextlib import closing
 from functools import partial
 
 import numpy as np
 
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
-from jaxfilters.trackers.app.track_command import given, refusing
+from jaxfilters.trackers.app.options import config_from_args
+from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.head.common.input import Place, place_of
 from jaxfilters.trackers.head.common.outcome import finite, run_report, told
-from jaxfilters.trackers.head.common.run import HeadRun, warn
+from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.state import HeadOptions
 from jaxfilters.trackers.head.common.summary import write_summary
-from jaxfilters.trackers.head.common.table import STATUS_WORDS, head_table
+from jaxfilters.trackers.head.common.table import HEAD_TABLE, STATUS_WORDS, empty_rows, in_metres
 from jaxfilters.trackers.head.stereo.session import HeadSession
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.video_input import LiveCamera
 
 
-def track_head(options: argparse.Namespace) -> str:
+def track(options: argparse.Namespace) -> str:
     """Follow a head, leave the results in `options.out`, and say in a few lines what came of it.
 
     Raises:
@@ -27,14 +29,19 @@ def track_head(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
-    settings = refusing(partial(given, HeadOptions, options))
+    settings = as_input_error(partial(config_from_args, HeadOptions, options))
     place = place_of(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
         settings = dataclasses.replace(settings, chunk=1, live=True)
-    session = refusing(lambda: _session(place, settings))
-    run = HeadRun(options, place, session, head_table(place.rig.num_cameras), chunk=settings.chunk)
-    if place.note:
-        warn(place.note)
+    session = as_input_error(lambda: _session(place, settings))
+    rows = RowsOf(HEAD_TABLE, in_metres, partial(empty_rows, place.rig.num_cameras))
+    with closing(HeadRun(options, place, session, rows, chunk=settings.chunk)) as run:
+        return _tracked(options, settings, run, session)
+
+
+def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, session: HeadSession) -> str:
+    if run.place.note:
+        warn(run.place.note)
     followed = run.follow()
     report = run_report(run, followed) | {
         "learnt_contribution": finite(float(session.contribution)),
@@ -45,7 +52,7 @@ def track_head(options: argparse.Namespace) -> str:
         },
     }
     run.writer.finish(report, **_learnt(session))
-    truth = None if place.truth is None else place.truth.poses
+    truth = None if run.place.truth is None else run.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
     run.conclude(followed)
     return told(report, options)

@@ -176,3 +176,28 @@ def test_repeated_truncation_changes_nothing_in_single_precision(width):
         np.testing.assert_allclose(info.log_mass, 0, atol=1e-3)
     np.testing.assert_allclose(belief.mean, first.mean, atol=0.01 * width)
     np.testing.assert_allclose(jnp.diagonal(belief.covariance), jnp.diagonal(first.covariance), rtol=1e-2)
+
+
+@pytest.mark.parametrize(("width", "accepted"), [(2e-3, False), (4e-3, True)])
+def test_what_a_covariance_in_single_precision_cannot_resolve_is_refused(x64, width, accepted):
+    """Where values are known; roots, axis-parallel rows, moving rows and double precision are not concerned."""
+    theta, normals = problem(2, width), jnp.asarray(NORMALS["2-D oblique"], jnp.float32)
+    rows = LinearConstraints(normals, theta["lower"], theta["upper"], ("a", "b"))
+    I = jnp.eye(2, dtype=jnp.float32)
+
+    def build(prior, rows=rows, lasting=True, **options):
+        arrays = (I, 0 * I, I, I) if prior.mean.dtype == jnp.float32 else double((I, 0 * I, I, I))
+        inner = jf.kalman(prior, *arrays, **options)
+        return jf.constrained(inner, jf.EPConstraints(rows, jnp.full(2, lasting)))
+
+    prior = jf.Gaussian(theta["mean"], jnp.eye(2, dtype=jnp.float32))
+    if accepted:
+        build(prior)
+    else:
+        # The standard deviation along the second normal, (-0.3, 1), is 1.04, and along the first 1.12.
+        with pytest.raises(ValueError, match=r"constraints: a is 0\.0018 prior standard deviations wide.*square_root"):
+            build(prior)
+    build(jf.GaussianRoot(prior.mean, I), arithmetic=jf.arithmetic.square_root)
+    build(prior, replace(rows, normals=I))
+    build(prior, lasting=False)
+    build(double(prior), double(rows))

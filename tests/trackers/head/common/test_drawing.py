@@ -28,7 +28,7 @@ def test_both_cameras_show_axes_and_landmarks_where_they_are(face_track):
         half = picture[:, 640 * camera : 640 * (camera + 1)]
         for u, v in track.image_points[10, camera]:
             assert half[round(v), round(u)].min() > 200
-        place = RIG.project(track.pose[10:11, :3] + np.float32([[25, 0, 0]]))[0]
+        place = RIG.project(1000 * track.pose[10:11, :3] + np.float32([[25, 0, 0]]))[0]
         for color in AXIS_COLORS:
             assert count(half, color) > 30
         # The face is turned by a few degrees: half of the first axis is where it points in the image, to 5 px.
@@ -56,7 +56,7 @@ def test_a_missing_image_is_said(face_track):
 def test_points_behind_a_camera_or_far_off_do_no_harm(face_track):
     track, _ = face_track
     pose = track.pose.copy()
-    pose[10, 2] = -500
+    pose[10, 2] = -0.5
     points = track.image_points.copy()
     points[10, 0, 3] = np.nan
     points[10, 0, 4] = 1e9

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from functools import partial
 
 import cv2
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from jaxfilters.trackers.head.common.table import with_gaps
 from jaxfilters.trackers.head.mono import command as mono_command
 from jaxfilters.trackers.head.mono.focal import FocalLength
 from jaxfilters.trackers.head.mono.state import MonoTrack
-from jaxfilters.trackers.head.mono.table import mono_table
+from jaxfilters.trackers.head.mono.table import empty_mono_rows
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.face_models import default_face_model, save_face_model
 
@@ -103,8 +104,8 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     with (out / "track.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["initialising"] * 2 + ["deformable"] * (FRAMES - 2)
-    assert float(rows[7]["x_mm"]) == pytest.approx(107, rel=1e-5)
-    assert float(rows[7]["pitch_deg"]) == pytest.approx(np.rad2deg(0.3), rel=1e-5)
+    assert float(rows[7]["x_m"]) == pytest.approx(0.107, rel=1e-5)
+    assert float(rows[7]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
     assert (float(rows[7]["a5_sd"]), float(rows[7]["s15_sd"])) == (0.25, 1.5)
     assert np.isnan(float(rows[0]["s1_sd"]))
     options = fake[0].options
@@ -212,7 +213,7 @@ def test_a_model_of_other_landmarks_is_refused(monkeypatch, tmp_path):
     other = file._replace(names=tuple(f"point {i}" for i in range(10)))
     monkeypatch.setattr(mono_command, "load_face_model", lambda path: other)
     with pytest.raises(InputError, match="which differ in right eye outer; the tracker follows the 10"):
-        mono_command.track_mono(mono_options(model=tmp_path / "m.npz", out=tmp_path))
+        mono_command.track(mono_options(model=tmp_path / "m.npz", out=tmp_path))
 
 
 def mono_options(**given):
@@ -234,7 +235,7 @@ def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
 def test_rows_of_lost_and_skipped_frames_are_empty():
     face = default_face_model().model
     track = made_track(np.full(2, 7.0), np.zeros(2), np.array([3, 2], np.int32), face)
-    rows = with_gaps(track, np.arange(3.0), [True, False, True], mono_table(face))
+    rows = with_gaps(track, np.arange(3.0), [True, False, True], partial(empty_mono_rows, face))
     assert np.isnan(rows.pose[:2]).all()
     assert np.isnan(rows.identity[:2]).all()
     assert rows.identity[2, 0] == 1.5

@@ -72,11 +72,13 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     words = ["initialising"] * 2 + ["rigid"] * 4 + ["deformable"] * 4 + ["lost"] * 2 + ["deformable"] * 8
     assert [row["status"] for row in rows] == words
     # Every image went to the session once, in its place: the stand-in says what it saw.
-    seen = [(float(row["x_mm"]), float(row["y_mm"]), float(row["z_mm"])) for row in rows if row["status"] in words[2:7]]
+    seen = [
+        tuple(1000 * float(row[name]) for name in ("x_m", "y_m", "z_m")) for row in rows if row["status"] in words[2:7]
+    ]
     expected = [(100 + i, 120 + 2 * i, 1000 * i / 30) for i in range(2, FRAMES) if i not in (10, 11)]
     np.testing.assert_allclose(seen, expected, rtol=1e-5)
-    assert all(np.isnan(float(rows[i]["x_mm"])) for i in (0, 1, 10, 11))
-    assert float(rows[5]["pitch_deg"]) == pytest.approx(np.rad2deg(0.3), rel=1e-5)
+    assert all(np.isnan(float(rows[i]["x_m"])) for i in (0, 1, 10, 11))
+    assert float(rows[5]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
     assert fake_head[0].sizes == [8, 8, 4]
     options = fake_head[0].options
     assert (options.seed, options.num_particles, options.mode) == (3, 50, "paper")
@@ -109,9 +111,9 @@ def test_a_dropped_frame_is_a_row_without_a_pose(stereo, fake_head, tmp_path, ca
     assert run(*stereo, "--out", out) == 0
     rows = rows_of(out)
     assert [row["status"] for row in rows[6:9]] == ["deformable", "skipped", "deformable"]
-    assert np.isnan([float(rows[7][name]) for name in ("x_mm", "yaw_deg", "a1_mm", "score")]).all()
+    assert np.isnan([float(rows[7][name]) for name in ("x_m", "yaw_rad", "deformation_1_m", "score")]).all()
     # The frames after it still come in pairs of one moment.
-    assert (float(rows[8]["x_mm"]), float(rows[8]["y_mm"])) == (108, 136)
+    assert (float(rows[8]["x_m"]), float(rows[8]["y_m"])) == pytest.approx((0.108, 0.136), rel=1e-6)
     assert "1 of 20 moments skipped" in capsys.readouterr().err
     report = json.loads((out / "report.json").read_text())
     assert "the first at 0.23 s" in report["trouble"][0]
@@ -218,9 +220,9 @@ def test_without_a_recording_the_synthetic_face_is_followed(fake_head, tmp_path,
     assert run("--out", out, "--seed", 2) == 0
     report = json.loads((out / "report.json").read_text())
     assert report["frames"] == 9
-    assert report["errors"]["rmse"]["x_mm"] > 0
+    assert report["errors"]["rmse"]["x_m"] > 0
     assert set(report["errors"]["within_2_sigma"]) == set(report["errors"]["rmse"])
-    assert "errors, root mean square: x mm" in capsys.readouterr().out
+    assert "errors, root mean square: x in mm" in capsys.readouterr().out
     session = fake_head[0]
     assert (session.options.seed, session.points.shape) == (2, (10, 2))
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_WIDTH) == 1280

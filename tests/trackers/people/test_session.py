@@ -1,11 +1,13 @@
-"""The loop over a recording: what the tracker is given, in which order, and what is kept of it."""
+"""What the tracker is given frame by frame, what is kept of it, and that it can be continued."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people import following
-from jaxfilters.trackers.people.recorded import Recorder
+from jaxfilters.trackers.people import session
+from jaxfilters.trackers.people.demo_room import demo_room
+from jaxfilters.trackers.people.recorded import as_arrays, from_arrays
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, PeopleConfig, Report
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -37,33 +39,45 @@ def given(monkeypatch):
         n = jnp.ones(len(people.mode))
         return people, Report(people.identity, people.mode, people.belief.mean[:, :2], n, n, n, n, n, n, n > 0, n)
 
-    monkeypatch.setattr(following, "step", step)
+    monkeypatch.setattr(session, "step", step)
     return steps
 
 
 @pytest.mark.system
 def test_frames_come_in_turn_with_the_seconds_between_them(scene, given):
     """Frame numbers are counted, steps are differences of times, and tracks go back to before the confirmation."""
-    recorder, times = Recorder(), [0.0, 0.1, 0.4, 0.5]
-    found = list(following.follow(scene, [(at, shown(i)) for i, at in enumerate(times)], recorder))
+    people, times = session.PeopleTracks(scene), [0.0, 0.1, 0.4, 0.5]
+    found = [people.step(shown(i), at) for i, at in enumerate(times)]
     assert [number for number, _ in given] == [0, 1, 2, 3]
     np.testing.assert_allclose([dt for _, dt in given], [0.0, 0.1, 0.3, 0.1], rtol=1e-6)
     assert [(now.frame, now.time_s) for now in found] == list(enumerate(times))
     assert [len(now.added) for now in found] == [0, 0, 3, 1]
-    assert [seen.frame for seen in recorder.tracks[4]] == [0, 1, 2, 3]
+    assert [seen.frame for seen in people.recorder.tracks[4]] == [0, 1, 2, 3]
     assert all(now.seconds > 0 and isinstance(now.people.mode, np.ndarray) for now in found)
 
 
-def test_the_next_moment_is_asked_for_when_the_last_has_been_dealt_with(scene, given):
-    """So that a background can be told where people stand before it sees the next image."""
-    events = []
-
-    def moments():
-        for at in (0.0, 0.1):
-            events.append("asked")
-            yield at, shown(0)
-
-    for _ in following.follow(scene, moments(), Recorder()):
-        events.append("dealt with")
-    assert events == ["asked", "dealt with"] * 2
-    assert len(given) == 2
+@pytest.mark.system
+def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
+    room = demo_room(0, frames=30)
+    scene = people_scene(room.cameras, room.floor, furniture=room.furniture, config=PeopleConfig(capacity=6))
+    images = [[room.image(0, i)] for i in range(30)]
+    primed = session.PeopleSession(scene)
+    primed.prime([[image for (image,) in images[::3]]])
+    before = primed.state()
+    for i in range(20):
+        primed.process(images[i], i / room.fps)
+    state = primed.state()
+    tracks = [(who, one) for who, track in primed.tracks.recorder.tracks.items() for one in track]
+    restored = session.PeopleSession(scene)
+    restored.restore(
+        state | {"unconfirmed": as_arrays(from_arrays(state["unconfirmed"]))}, from_arrays(as_arrays(tracks))
+    )
+    for i in range(20, 30):
+        expected, found = (one.process(images[i], i / room.fps) for one in (primed, restored))
+        for a, b in zip(jax.tree.leaves(expected[:-2]), jax.tree.leaves(found[:-2]), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert np.any(expected.people.mode == TRACKED)
+    assert before["clock"][0] == 0
+    assert {who: len(track) for who, track in restored.tracks.recorder.tracks.items()} == {
+        who: len(track) for who, track in primed.tracks.recorder.tracks.items()
+    }

@@ -3,62 +3,43 @@
 import argparse
 import dataclasses
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.chunks import Progress, track_recording
+from jaxfilters.trackers.app.progress import ProgressLine, note
 from jaxfilters.trackers.app.results import TrackTable, TrackWriter, begin, can_resume, resume, versions
-from jaxfilters.trackers.app.session import Progress, follow
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.recording import Recording
-from jaxfilters.trackers.tracker import STATUS_NAMES, SequenceTracker
+from jaxfilters.trackers.tracker import STATUS_NAMES, Tracker
 
-Made = TypeVar("Made")
+Errors = dict[str, float | None]
+"""Errors against the truth by name, with units in the names; None where no truth is known."""
 
 
-class Job(NamedTuple):
-    """What one command follows, with what, and how it is shown."""
+class RunSpec(NamedTuple):
+    """What one command tracks, with which tracker, and how the results are shown."""
 
-    sequence: Recording
-    tracker: SequenceTracker
+    recording: Recording
+    tracker: Tracker
     config: Any
     """A dataclass of Python values, with `seed`."""
     table: TrackTable
-    errors: Callable[[Any], dict[str, float | None]]
-    """`results -> errors` against the truth by name, with units in the names; None where no truth is known."""
+    errors: Callable[[Any], Errors]
     draw_summary: Callable[..., None]
     """`(path, results)`; raises `OutputError`."""
     draw_overlay: Callable[..., None]
     """`(path, results, frames_per_second, on_progress)`; raises `OutputError`."""
 
 
-def given(config: Callable[..., Made], options: argparse.Namespace) -> Made:
-    """A configuration with the options that were given; the others keep the defaults that stand there."""
-    names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
-    return config(**{name: value for name in names if (value := getattr(options, name, None)) is not None})
-
-
-def refusing(make: Callable[[], Made]) -> Made:
-    """What `make` returns; what it finds wrong is the input's fault.
-
-    Raises:
-        InputError: for a `ValueError`.
-    """
-    try:
-        return make()
-    except ValueError as error:
-        raise InputError(str(error)) from None
-
-
-def track(job: Job, options: argparse.Namespace) -> None:
-    """Do the job, and leave the results in `options.out`.
+def run(spec: RunSpec, options: argparse.Namespace) -> str:
+    """Track a recording, leave the results in `options.out`, and report in a few lines.
 
     Raises:
         InputError: the recording or an option cannot be used.
@@ -67,58 +48,61 @@ def track(job: Job, options: argparse.Namespace) -> None:
         KeyboardInterrupt: with what is kept as its text.
     """
     began = time.perf_counter()
-    state = job.tracker.start(jax.random.key(job.config.seed), job.sequence[0])
-    writer, state = _writer(options, job, state)
+    writer, saved = _writer(options, spec)
     try:
-        rate = _follow(job, state, writer)
-        errors = job.errors(writer.results)
-        report = _report(job, writer.results, errors, rate, time.perf_counter() - began)
+        state = spec.tracker.init(jax.random.key(spec.config.seed), spec.recording[0])
+        rate = _track(spec, state if saved is None else saved(state), writer)
+        errors = spec.errors(writer.results)
+        report = _report(spec, writer.results, errors, rate, time.perf_counter() - began)
         writer.finish(report)
-        _write_pictures(options, job, writer, rate)
+        _write_pictures(options, spec, writer, rate)
     except InputError as error:
         raise InputError(_with_what_is_kept(error, writer)) from None
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(writer.kept()) from None
-    _tell(report, errors, options)
+    except KeyboardInterrupt as interrupt:
+        raise type(interrupt)(writer.kept()) from None
+    finally:
+        writer.close()
+    return _summary(report, errors, options)
 
 
-def _identity(job: Job) -> dict[str, Any]:
+def _identity(spec: RunSpec) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
     return {
-        "input": job.sequence.fingerprint(),
+        "input": spec.recording.fingerprint(),
         "version": version("jaxfilters"),
-        **{f"config.{name}": value for name, value in dataclasses.asdict(job.config).items()},
+        **{f"config.{name}": value for name, value in dataclasses.asdict(spec.config).items()},
     }
 
 
-def _writer(options: argparse.Namespace, job: Job, state: Any) -> tuple[TrackWriter, Any]:
-    run = _identity(job)
+def _writer(options: argparse.Namespace, spec: RunSpec) -> tuple[TrackWriter, Callable[[Any], Any] | None]:
+    """The writer, before anything is compiled; and what restores the saved state, where there is one."""
+    identity = _identity(spec)
     if options.resume and can_resume(options.out):
-        writer, state = resume(options.out, run, job.table, state)
-        print(f"continuing after frame {writer.frames} of {options.out}", file=sys.stderr)
-        return writer, state
+        writer, saved = resume(options.out, identity, spec.table)
+        note(f"continuing after frame {writer.frames} of {options.out}")
+        return writer, saved
     if options.resume:
-        print(f"nothing to resume in {options.out}: starting with the first frame", file=sys.stderr)
-    return begin(options.out, run, job.table, overwrite=options.overwrite), state
+        note(f"nothing to resume in {options.out}: starting with the first frame")
+    return begin(options.out, identity, spec.table, overwrite=options.overwrite), None
 
 
-def _follow(job: Job, state: Any, writer: TrackWriter) -> float:
-    with ProgressLine("tracking", len(job.sequence)) as line:
+def _track(spec: RunSpec, state: Any, writer: TrackWriter) -> float:
+    with ProgressLine("tracking", len(spec.recording), done=writer.frames) as line:
 
         def show(progress: Progress) -> None:
             speed = "" if math.isnan(progress.frames_per_second) else f"{progress.frames_per_second:.0f} frames/s  "
             line.show(progress.done, speed + progress.status)
 
-        return follow(job.sequence, job.tracker, state, writer, show)
+        return track_recording(spec.recording, spec.tracker, state, writer, show)
 
 
-def _write_pictures(options: argparse.Namespace, job: Job, writer: TrackWriter, rate: float) -> None:
+def _write_pictures(options: argparse.Namespace, spec: RunSpec, writer: TrackWriter, rate: float) -> None:
     results = writer.results
     try:
         if options.video:
             with ProgressLine("drawing", len(results.times_s)) as line:
-                job.draw_overlay(options.out / "overlay.mp4", results, rate, line.show)
-        job.draw_summary(options.out / "summary.png", results)
+                spec.draw_overlay(options.out / "overlay.mp4", results, rate, line.show)
+        spec.draw_summary(options.out / "summary.png", results)
     except OutputError as error:
         raise OutputError(_with_what_is_kept(error, writer)) from None
 
@@ -127,25 +111,25 @@ def _with_what_is_kept(error: Exception, writer: TrackWriter) -> str:
     return f"{str(error).removesuffix('.')}; {writer.kept()}."
 
 
-def _report(job: Job, results: Any, errors: dict[str, float | None], rate: float, seconds: float) -> dict[str, Any]:
+def _report(spec: RunSpec, results: Any, errors: Errors, rate: float, seconds: float) -> dict[str, Any]:
     counts = Counter(STATUS_NAMES[int(status)] for status in results.status)
     evidence = float(np.nansum(results.log_evidence, dtype=float))
     return {
-        "input": job.sequence.name,
+        "input": spec.recording.name,
         "frames": len(results.times_s),
         "frames_per_second": None if math.isnan(rate) else round(rate, 2),
         "seconds": round(seconds, 2),
         "status": {name: counts[name] for name in STATUS_NAMES},
         "log_evidence": evidence if math.isfinite(evidence) else None,
         **errors,
-        "config": dataclasses.asdict(job.config),
+        "config": dataclasses.asdict(spec.config),
         "versions": versions(),
     }
 
 
-def _tell(report: dict[str, Any], errors: dict[str, float | None], options: argparse.Namespace) -> None:
+def _summary(report: dict[str, Any], errors: Errors, options: argparse.Namespace) -> str:
     speed = report["frames_per_second"]
-    print(
+    return (
         f"{report['frames']} frames in {report['seconds']:.1f} s"
         + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
         + "".join(f", {report['status'][name]} {name}" for name in ("lost", "searching"))

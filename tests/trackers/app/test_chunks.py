@@ -1,5 +1,6 @@
 import csv
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +9,11 @@ import numpy as np
 import pytest
 
 from jaxfilters.trackers.app import results
+from jaxfilters.trackers.app.chunks import track_recording
 from jaxfilters.trackers.app.results import begin, resume
-from jaxfilters.trackers.app.session import CHUNK, follow
 from jaxfilters.trackers.hand_depth.table import HAND_TABLE
 from jaxfilters.trackers.io.errors import CheckpointError, InputError, OutputError
-from jaxfilters.trackers.tracker import STATUS_NAMES
+from jaxfilters.trackers.tracker import CHUNK, STATUS_NAMES
 
 COLUMNS = ("frame", "time_s", *HAND_TABLE.columns, "status")
 RUN = {"input": "abc", "config.seed": 3}
@@ -20,25 +21,30 @@ RUN = {"input": "abc", "config.seed": 3}
 
 def track(recording, tracker, folder, *, resumed=False, stop_after=None, on_progress=lambda progress: None):
     """Follow the recording into `folder`; `stop_after` presses Ctrl-C when that many frames are done."""
-    state = tracker.start(jax.random.key(3), recording[0])
-    writer, state = resume(folder, RUN, HAND_TABLE, state) if resumed else (begin(folder, RUN, HAND_TABLE), state)
+    state = tracker.init(jax.random.key(3), recording[0])
+    if resumed:
+        writer, saved = resume(folder, RUN, HAND_TABLE)
+        state = saved(state)
+    else:
+        writer = begin(folder, RUN, HAND_TABLE)
 
     def report(progress):
         on_progress(progress)
         if stop_after is not None and progress.done >= stop_after:
             raise KeyboardInterrupt
 
-    follow(recording, tracker, state, writer, report)
-    writer.finish({"frames": writer.frames})
+    with closing(writer):
+        track_recording(recording, tracker, state, writer, report)
+        writer.finish({"frames": writer.frames})
     return writer
 
 
 @pytest.mark.system
 def test_rows_are_those_of_the_tracker_over_the_whole_recording(recording, fake_tracker, tmp_path):
     track(recording, fake_tracker, tmp_path)
-    state = fake_tracker.start(jax.random.key(3), recording[0])
+    state = fake_tracker.init(jax.random.key(3), recording[0])
     times_s = (recording.times_s - recording.times_s[0]).astype(np.float32)
-    _, expected = fake_tracker.advance(state, np.stack(list(recording)), times_s)
+    _, expected = fake_tracker.step(state, np.stack(list(recording)), times_s)
     with np.load(tmp_path / "track.npz") as saved:
         for name, array in expected._asdict().items():
             np.testing.assert_array_equal(saved[name], array)
@@ -78,25 +84,26 @@ def test_interrupted_and_resumed_equals_uninterrupted(recording, fake_tracker, t
 
 def test_resuming_a_finished_run_computes_nothing(recording, fake_tracker, tmp_path):
     track(recording, fake_tracker, tmp_path)
-    unused = fake_tracker._replace(advance=lambda *_: pytest.fail("nothing was left to do"))
+    unused = fake_tracker._replace(step=lambda *_: pytest.fail("nothing was left to do"))
     assert track(recording, unused, tmp_path, resumed=True).frames == len(recording)
 
 
 def test_a_finished_run_may_be_replaced(recording, fake_tracker, tmp_path):
     track(recording, fake_tracker, tmp_path)
-    assert begin(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE).frames == 0
+    with closing(begin(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE)) as writer:
+        assert writer.frames == 0
     assert (tmp_path / "track.csv").read_text().count("\n") == 1
 
 
 def test_another_run_cannot_be_resumed_or_overwritten(recording, fake_tracker, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         track(recording, fake_tracker, tmp_path, stop_after=CHUNK + 1)
-    state = fake_tracker.start(jax.random.key(3), recording[0])
     with pytest.raises(CheckpointError, match=r"cannot be resumed: config.seed was 3 and is 4\."):
-        resume(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE, state)
+        resume(tmp_path, RUN | {"config.seed": 4}, HAND_TABLE)
     with pytest.raises(CheckpointError, match=r"holds an unfinished run of 16 frames: continue it with --resume"):
         begin(tmp_path, RUN, HAND_TABLE)
-    assert begin(tmp_path, RUN, HAND_TABLE, overwrite=True).frames == 0
+    with closing(begin(tmp_path, RUN, HAND_TABLE, overwrite=True)) as writer:
+        assert writer.frames == 0
 
 
 def unreadable_at(recording, bad):
@@ -113,13 +120,14 @@ def unreadable_at(recording, bad):
 def test_frames_before_an_unreadable_one_are_kept(recording, fake_tracker, tmp_path, bad, saved):
     track(recording, fake_tracker, tmp_path / "whole")
     writer = begin(tmp_path / "parts", RUN, HAND_TABLE)
-    state = fake_tracker.start(jax.random.key(3), recording[0])
+    state = fake_tracker.init(jax.random.key(3), recording[0])
     with pytest.raises(InputError, match=rf"{bad}.png: truncated"):
-        follow(unreadable_at(recording, bad), fake_tracker, state, writer, lambda progress: None)
+        track_recording(unreadable_at(recording, bad), fake_tracker, state, writer, lambda progress: None)
     lines = (tmp_path / "parts" / "track.csv").read_text().splitlines()
     assert lines == (tmp_path / "whole" / "track.csv").read_text().splitlines()[: bad + 1]
     assert writer.frames_saved == saved
     assert str(saved or bad) in writer.kept()
+    writer.close()
     if saved:
         track(recording, fake_tracker, tmp_path / "parts", resumed=True)
         assert (tmp_path / "parts" / "track.csv").read_bytes() == (tmp_path / "whole" / "track.csv").read_bytes()
@@ -157,10 +165,10 @@ def test_progress_counts_up_and_measures_from_the_second_chunk(recording, fake_t
 def test_compiles_once_though_the_last_chunk_is_short(recording, fake_tracker, tmp_path):
     shapes = set()
 
-    def advance(state, frames, times):
+    def step(state, frames, times):
         shapes.add((frames.shape, frames.dtype, times.shape, times.dtype))
         assert (np.diff(times) > 0).all()
-        return fake_tracker.advance(state, frames, times)
+        return fake_tracker.step(state, frames, times)
 
-    track(recording, fake_tracker._replace(advance=advance), tmp_path)
+    track(recording, fake_tracker._replace(step=step), tmp_path)
     assert shapes == {((CHUNK, 24, 32), np.dtype(np.float32), (CHUNK,), np.dtype(np.float32))}

@@ -1,0 +1,45 @@
+"""Between the options of a command line and the configuration of a tracker."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from jaxfilters.trackers.app.argument_types import positive_number, seed
+
+Made = TypeVar("Made")
+
+
+def config_from_args(config: Callable[..., Made], options: argparse.Namespace) -> Made:
+    """A configuration with the options of the command line; those that are None keep the default of its field."""
+    names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
+    return config(**{name: value for name in names if (value := getattr(options, name, None)) is not None})
+
+
+def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
+    """A recording of frames on disk, whose run can be resumed."""
+    parser.add_argument(
+        "input", nargs="?", type=Path, metavar="INPUT", help=f"{what}; without it, a synthetic recording"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
+    parser.set_defaults(overwrite=False)
+
+
+def add_results_options(parser: argparse.ArgumentParser) -> None:
+    """Where a run writes, and whether it draws a video."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+
+
+def add_video_options(parser: argparse.ArgumentParser) -> None:
+    """The rate and the length of what video sources deliver."""
+    parser.add_argument(
+        "--fps", type=positive_number, metavar="FPS", help="of the recordings, in place of what they say"
+    )
+    parser.add_argument("--seconds", type=positive_number, metavar="S", help="stop after so long, as with live cameras")
+
+
+def add_seed(parser: argparse.ArgumentParser, default: int | None = None) -> None:
+    """The random seed; None unless given where the configuration has the default."""
+    parser.add_argument("--seed", type=seed, default=default, metavar="SEED", help="random seed")

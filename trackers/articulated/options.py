@@ -1,0 +1,45 @@
+"""The options of `jaxfilters track articulated`, apart from what carries them out so that `--help` answers at once."""
+
+import argparse
+
+from jaxfilters.trackers.app.argument_types import image_size, positive_number
+from jaxfilters.trackers.app.options import add_recording, add_results_options, add_seed
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to the parser of the command.
+
+    Options of the tracker are None unless given, so that the defaults stand in one place, `ArticulatedConfig`.
+    """
+    add_recording(
+        parser,
+        ".npz with features or keypoints, folder of OpenPose's *_keypoints.json, or .json or .csv of MediaPipe's "
+        "landmarks",
+    )
+    parser.add_argument(
+        "--mode",
+        choices=("recommended", "literal", "unconstrained"),
+        help="how estimates are kept within the limits of a hand (default: recommended; literal: as in the paper)",
+    )
+    parser.add_argument("--hypotheses", type=int, metavar="N", help="how many at most (default: 6)")
+    parser.add_argument(
+        "--gate", type=float, metavar="SIGMAS", help="leave out features that are farther off (default: 5; 0: never)"
+    )
+    parser.add_argument(
+        "--image-size", type=image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
+    )
+    parser.add_argument(
+        "--noise",
+        type=positive_number,
+        metavar="PIXELS",
+        help="standard deviation of a keypoint's coordinate (default: a share of the hand's diagonal)",
+    )
+    parser.add_argument(
+        "--fps",
+        type=positive_number,
+        metavar="FPS",
+        help="frames per second of a recording without times (default: 30)",
+    )
+    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
+    add_seed(parser)
+    add_results_options(parser)

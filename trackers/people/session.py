@@ -1,0 +1,171 @@
+"""Everybody on a floor from the images of fixed cameras: background subtraction, the tracker, and what is kept."""
+
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import numpy as np
+
+from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
+from jaxfilters.trackers.background.choice import background
+from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
+from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
+from jaxfilters.trackers.people.tracker import outlines, start, step
+
+KEPT_BEYOND = 1.4
+"""The background does not follow the image within a person's outline of this size."""
+
+
+class PeopleEstimate(NamedTuple):
+    """The estimate after one frame; NumPy leaves."""
+
+    frame: int
+    time_s: float
+    people: People
+    report: Report
+    added: list[tuple[int, Sighting]]
+    """By identity: of this frame and, for newly confirmed people, of the frames before."""
+    seconds: float
+    """From the foreground to the report."""
+
+
+class PeopleTracks:
+    """The tracker over foreground that is given, frame by frame, with everybody's track so far."""
+
+    def __init__(self, scene: PeopleScene):
+        """Nobody yet.
+
+        Args:
+            scene: Cameras, floor and furniture.
+        """
+        self.scene, self.recorder = scene, Recorder()
+        self.frames, self.people = 0, start(scene)
+        self._time_s = 0.0
+
+    def step(self, observed: tuple[CameraFrame, ...], time_s: float) -> PeopleEstimate:
+        """The estimate after the next frame.
+
+        Args:
+            observed: What every camera delivers, in the order of the scene.
+            time_s: Seconds since the first frame, growing.
+        """
+        began = time.perf_counter()
+        dt = np.float32(time_s - self._time_s)
+        self.people, report = jax.block_until_ready(step(self.scene, self.people, observed, dt))
+        seconds, self._time_s = time.perf_counter() - began, time_s
+        people, reported = jax.device_get((self.people, report))
+        added = self.recorder.add(self.frames, time_s, people, reported)
+        self.frames += 1
+        return PeopleEstimate(self.frames - 1, time_s, people, reported, added, seconds)
+
+    def smoothed(self) -> dict[int, list[Sighting]]:
+        """All tracks, smoothed backwards in time: for a recording that has ended."""
+        return smoothed(self.scene.config, self.recorder.tracks)
+
+    def state(self) -> dict[str, Any]:
+        """What the next frame needs, but for the tracks: arrays by name."""
+        unconfirmed = [(slot, one) for slot, some in self.recorder.unconfirmed.items() for one in some]
+        return {
+            "people": self.people,
+            "clock": np.array([self.frames, self._time_s]),
+            "unconfirmed": as_arrays(unconfirmed),
+        }
+
+    def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
+        """Continue from what `state` gave, with the tracks up to then."""
+        self.people, (frames, self._time_s) = state["people"], map(float, state["clock"])
+        self.frames, self.recorder = int(frames), Recorder()
+        for slot, one in from_arrays(state["unconfirmed"]):
+            self.recorder.unconfirmed.setdefault(slot, []).append(one)
+        for identity, one in tracks:
+            self.recorder.tracks.setdefault(identity, []).append(one)
+
+
+class PeopleSession:
+    """The tracker over images."""
+
+    def __init__(self, scene: PeopleScene, subtraction: str = "median"):
+        """Nobody yet, and backgrounds of which nothing is known: `prime` them with images of a recording.
+
+        Args:
+            scene: Cameras, floor and furniture.
+            subtraction: `median`, `mog2` or `knn`.
+
+        Raises:
+            ValueError: if there is no such method.
+        """
+        self.tracks = PeopleTracks(scene)
+        self._backgrounds = [background(subtraction) for _ in scene.cameras]
+        self._images = [np.zeros((*camera.shape, 3), np.uint8) for camera in scene.cameras]
+        self._outlines: list[Outline] | None = None
+        self._estimate: PeopleEstimate | None = None
+
+    def prime(self, samples: Sequence[Sequence[np.ndarray]]) -> None:
+        """Estimate each camera's background from images spread over its recording; none where it has no samples."""
+        for model, images in zip(self._backgrounds, samples, strict=True):
+            if images:
+                model.prime(images)
+
+    def process(self, images: Sequence[np.ndarray | None], time_s: float) -> PeopleEstimate:
+        """The estimate after the next images.
+
+        Args:
+            images: (rows, cols, 3) uint8 of every camera, without lens distortion; `None` where it has nothing new.
+            time_s: Seconds since the first images, growing.
+        """
+        observed = tuple(self._observed(i, image) for i, image in enumerate(images))
+        self._estimate = self.tracks.step(observed, time_s)
+        self._outlines = _on_host(outlines(self.tracks.scene, self._estimate.people))
+        return self._estimate
+
+    @property
+    def last_images(self) -> list[np.ndarray]:
+        """The newest image of every camera."""
+        return self._images
+
+    @property
+    def last_outlines(self) -> list[Outline]:
+        """Everybody's outline in every camera after the last images."""
+        assert self._outlines is not None, "No images were processed yet."
+        return self._outlines
+
+    def state(self) -> dict[str, Any]:
+        """What the next images need, but for the tracks: arrays by name."""
+        return self.tracks.state() | {"backgrounds": [model.state() for model in self._backgrounds]}
+
+    def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
+        """Continue from what `state` gave, with the tracks up to then."""
+        self.tracks.restore(state, tracks)
+        for model, saved in zip(self._backgrounds, state["backgrounds"], strict=True):
+            model.restore(saved)
+        people = jax.device_get(self.tracks.people)
+        self._outlines = _on_host(outlines(self.tracks.scene, people))
+
+    def _observed(self, camera: int, image: np.ndarray | None) -> CameraFrame:
+        if image is None:
+            last = self._images[camera]
+            return CameraFrame(np.zeros(last.shape[:2], np.uint8), last, np.bool_(False))
+        self._images[camera] = image
+        probability = self._backgrounds[camera].apply(image, keep=self._occupied(camera))
+        return CameraFrame(cv2.convertScaleAbs(probability, alpha=255.0), image, np.bool_(True))
+
+    def _occupied(self, camera: int) -> np.ndarray | None:
+        """Non-zero where people stood after the last images, where the background must not follow."""
+        if self._outlines is None:
+            return None
+        people, shape = jax.device_get(self.tracks.people), self._images[camera].shape[:2]
+        outline, mask = self._outlines[camera], np.zeros(shape, np.uint8)
+        inside = ((people.mode == TRACKED) | (people.mode == TENTATIVE)) & (outline.code == VISIBLE)
+        for slot in np.flatnonzero(inside):
+            reach = KEPT_BEYOND * np.sqrt(np.diagonal(outline.shape[slot]))
+            low, high = outline.center[slot] - reach, outline.center[slot] + reach
+            u = np.clip(np.round([low[0], high[0]]), 0, shape[1]).astype(int)
+            v = np.clip(np.round([low[1], high[1]]), 0, shape[0]).astype(int)
+            mask[v[0] : v[1], u[0] : u[1]] = 255
+        return mask
+
+
+def _on_host(found: tuple[Outline, ...]) -> list[Outline]:
+    return list(jax.device_get(found))
