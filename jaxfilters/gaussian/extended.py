@@ -63,9 +63,11 @@ class ExtendedKalman:
     """Parameters of a filter made by `extended_kalman`; its arguments describe them."""
 
     prior: Belief
-    transition: Callable
+    transition: Any
+    """`(x, inputs) -> x`, or a `NonAdditiveNoise`."""
     process_noise: Array | Callable | StateNoise
-    observe: Callable
+    observe: Any
+    """`(x, inputs) -> y`, a `NonAdditiveNoise` or an `Emission`."""
     observation_noise: Array | Callable | StateNoise | None
     manifold: Manifold
     residual: Callable

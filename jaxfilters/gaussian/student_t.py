@@ -26,7 +26,7 @@ from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import Observation
-from jaxfilters.gaussian.manifold import dimension, increments, retract_belief
+from jaxfilters.gaussian.manifold import Belief, dimension, increments, retract_belief
 from jaxfilters.gaussian.model import model_of
 from jaxfilters.gaussian.noise_models import NonAdditiveNoise
 from jaxfilters.typing import AnyKey
@@ -152,7 +152,8 @@ def scales(dof: Array | None, size: int, count: int, dtype: DTypeLike) -> tuple[
     dof = dof.astype(dtype)
     steps = (jnp.arange(count) - _at_one(dof, count)).astype(dtype)
     log_scale = _SPACING * jnp.sqrt(2 / (dof + size)) * steps
-    log_density = 0.5 * dof * (log_scale - jnp.exp(log_scale))
+    # Without the constant -1, which would cost the digits of a distribution that is narrow about 1.
+    log_density = -0.5 * dof * (jnp.expm1(log_scale) - log_scale)
     return jnp.exp(log_scale), jax.nn.log_softmax(log_density)
 
 
@@ -191,7 +192,7 @@ def _predict_parts(model: StudentT, key: AnyKey, state: HeavyTailState, inputs: 
     Q = linear.process_noise_of(belief, inputs)
     values, log_probabilities = scales(model.process_dof, dimension(belief), model.num_scales, belief.mean.dtype)
 
-    def ahead(scale: Array) -> Gaussian:
+    def ahead(scale: Array) -> Belief:
         delta = linear.arithmetic.predict(increments(belief), step.F, Q / scale, step.value, step.residual_root)
         return retract_belief(linear.manifold, origin, delta)
 
