@@ -196,7 +196,7 @@ def _predict_parts(model: StudentT, key: AnyKey, state: HeavyTailState, inputs: 
         delta = linear.arithmetic.predict(increments(belief), step.F, Q / scale, step.value, step.residual_root)
         return retract_belief(linear.manifold, origin, delta)
 
-    parts = jax.vmap(ahead)(values)
+    parts: Any = jax.vmap(ahead)(values)
     return HeavyTailState(_merged(linear, parts, jnp.exp(log_probabilities)), parts)
 
 
@@ -243,6 +243,7 @@ def _merged(model: Any, parts: Gaussian, weights: Float[Array, " k"]) -> Gaussia
     reference = parts.mean[jnp.argmax(weights)]
     apart = jax.vmap(model.manifold.local, (None, 0))(reference, parts.mean)
     mean = weights @ apart
-    scaled = jnp.sqrt(weights)[:, None] * (apart - mean)
-    covariance = jnp.tensordot(weights, parts.covariance, 1, precision="highest") + factor.inner(scaled, scaled)
+    # Not by the root of the weights, whose derivative is infinite where one underflows.
+    weighted, apart = weights[:, None] * (apart - mean), apart - mean
+    covariance = jnp.tensordot(weights, parts.covariance, 1, precision="highest") + factor.inner(weighted, apart)
     return Gaussian(model.manifold.retract(reference, mean), covariance)
