@@ -23,6 +23,7 @@ from .filter import step as step
 from .filter import update as update
 from .gaussian import arithmetic as arithmetic
 from .gaussian import constraints as constraints
+from .gaussian import emissions as emissions
 from .gaussian import linearize as linearize
 from .gaussian import manifold as manifold
 from .gaussian import mode_maps as mode_maps
@@ -49,6 +50,8 @@ from .gaussian.posterior_linearization import posterior_linearization as posteri
 from .gaussian.robust import robust as robust
 from .gaussian.sigma_point import cubature_kalman as cubature_kalman
 from .gaussian.sigma_point import unscented_kalman as unscented_kalman
+from .gaussian.student_t import HeavyTailState as HeavyTailState
+from .gaussian.student_t import student_t as student_t
 from .noise import StandardNormal as StandardNormal
 from .particle import differentiable_resampling as differentiable_resampling
 from .particle import proposals as proposals

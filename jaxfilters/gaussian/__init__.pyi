@@ -4,6 +4,8 @@ from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
 from . import continuous as continuous
+from . import emission_update as emission_update
+from . import emissions as emissions
 from . import ensemble as ensemble
 from . import ensemble_analysis as ensemble_analysis
 from . import extended as extended
@@ -16,7 +18,9 @@ from . import manifold as manifold
 from . import mixture as mixture
 from . import mode_maps as mode_maps
 from . import noise_models as noise_models
+from . import observation as observation
 from . import parallel_in_time as parallel_in_time
 from . import robust as robust
 from . import sigma_point as sigma_point
 from . import smoothing as smoothing
+from . import student_t as student_t

@@ -10,10 +10,11 @@ a merge of hypotheses) may change it between the steps.
 
 from collections.abc import Callable
 from dataclasses import field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.last_axis import batch_last
@@ -22,6 +23,8 @@ from jaxfilters.gaussian import arithmetic as arithmetics
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.gaussian.emission_update import emission_update
+from jaxfilters.gaussian.emissions import Emission
 from jaxfilters.gaussian.linearize import Linearization, Linearize, taylor
 from jaxfilters.gaussian.manifold import (
     Belief,
@@ -49,25 +52,10 @@ from jaxfilters.gaussian.noise_models import (
     no_noise,
     noise_of_step,
 )
+from jaxfilters.gaussian.observation import Observation as Observation
+from jaxfilters.gaussian.observation import as_observation as as_observation
 from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, as_pytree
-
-
-class Observation(NamedTuple):
-    """An observation with a mask and a noise of its own; Gaussian filters take a plain array `y` too.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> import jaxfilters as jf
-        >>> y = jf.Observation(jnp.array([1.0, 2.0]), mask=jnp.array([True, False]))
-    """
-
-    y: Float[Array, " m"]
-    """NaN where nothing was read: such components are left out, and counted in `info.num_invalid` unless masked."""
-    mask: Bool[Array, " m"] | None = None
-    """False for components that are to be left out, whatever `y` holds there; `None` leaves none out."""
-    noise: Array | None = None
-    """Covariance of the noise of this observation, (m, m), or a root of it, (m, k), in place of the filter's."""
 
 
 @pytree_dataclass
@@ -75,10 +63,12 @@ class ExtendedKalman:
     """Parameters of a filter made by `extended_kalman`; its arguments describe them."""
 
     prior: Belief
-    transition: Callable
+    transition: Any
+    """`(x, inputs) -> x`, or a `NonAdditiveNoise`."""
     process_noise: Array | Callable | StateNoise
-    observe: Callable
-    observation_noise: Array | Callable | StateNoise
+    observe: Any
+    """`(x, inputs) -> y`, a `NonAdditiveNoise` or an `Emission`."""
+    observation_noise: Array | Callable | StateNoise | None
     manifold: Manifold
     residual: Callable
     linearize: Linearize = field(metadata={"static": True})
@@ -132,8 +122,8 @@ def extended_kalman(
     prior: Gaussian | GaussianRoot,
     transition: Callable[..., Array] | NonAdditiveNoise,
     process_noise: Array | Callable[..., Array],
-    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
-    observation_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise | Emission,
+    observation_noise: Array | Callable[..., Array] | None = None,
     *,
     linearize: Linearize = taylor,
     arithmetic: Arithmetic = arithmetics.joseph,
@@ -157,9 +147,10 @@ def extended_kalman(
             `jf.arithmetic.square_root` a root of it, (d, any width)); or a function `inputs -> covariance`, e.g. for
             steps of unequal length; or a function `(x, inputs) -> covariance`, whose expected value counts (with
             `taylor`, that at the mean).
-        observe: `x -> y` without noise, (n,) to (m,), or `(x, inputs) -> y`; or `NonAdditiveNoise`.
+        observe: `x -> y` without noise, (n,) to (m,), or `(x, inputs) -> y`; or `NonAdditiveNoise`; or an emission of
+            `jf.emissions`, for counts and classes.
         observation_noise: Covariance of the observation noise, (m, m), or a root of it, (m, any width); or a function
-            like `process_noise`, of the predicted state.
+            like `process_noise`, of the predicted state. None for an emission, and only there.
         linearize: `jf.linearize.taylor` (the extended filter), `second_order`, `second_order_covariance_only`,
             `cubature` or `unscented(...)`.
         arithmetic: `jf.arithmetic.joseph`, `square_root` or `fast`.
@@ -201,7 +192,7 @@ def extended_kalman(
     checks.arithmetic_of(prior, arithmetic)
     checks.on_manifold("prior", prior, manifold)
     is_root = isinstance(prior, GaussianRoot)
-    R = bound_noise("observation_noise", observation_noise, None, is_root=is_root, function=observe)
+    R = _observation_noise(observe, observation_noise, is_root)
     Q = bound_noise("process_noise", process_noise, dimension(prior), is_root=is_root, function=transition)
     transition, observe = bound_function("transition", transition), bound_function("observe", observe)
     checks.function("residual", residual)
@@ -210,6 +201,10 @@ def extended_kalman(
         raise ValueError(f"iterations must be an integer of at least 1; got {iterations!r}.")
     if iterate_to not in ("mean", "mode"):
         raise ValueError(f'iterate_to must be "mean" or "mode"; got {iterate_to!r}.')
+    if isinstance(observe, Emission) and iterate_to == "mean" and iterations > 1:
+        raise ValueError(f'iterate_to must be "mode" for {iterations} iterations with an emission; got "mean".')
+    if isinstance(observe, Emission) and residual is not subtract:
+        raise ValueError(f"residual must be left out for an emission; got {residual!r}.")
     params = ExtendedKalman(
         prior,
         transition,
@@ -224,6 +219,18 @@ def extended_kalman(
         iterate_to,
     )
     return Filter(params, _init, _predict, _update)
+
+
+def _observation_noise(observe: Any, noise: Any, is_root: bool) -> Any:
+    if isinstance(observe, Emission):
+        if noise is not None:
+            raise ValueError("observation_noise must be None for an emission, which has its own distribution.")
+        return None
+    if noise is None:
+        raise ValueError(
+            "observation_noise must be a covariance or a function, unless observe is an emission; got None."
+        )
+    return bound_noise("observation_noise", noise, None, is_root=is_root, function=observe)
 
 
 def _init(model: ExtendedKalman, key: AnyKey) -> Belief:
@@ -254,17 +261,20 @@ def _update(
 ) -> tuple[Belief, KalmanInfo]:
     del key
     checks.state(belief, model.prior)
-    y = as_observation(observation).y
-    small = max(dimension(belief), y.size) <= factor.UNROLLED
-    conditioned = batch_last(_conditioned) if small else _conditioned
-    return conditioned(model, belief, observation, inputs)
+    is_emission = isinstance(model.observe, Emission)
+    y = observation if is_emission else as_observation(observation).y
+    small = max(dimension(belief), *map(jnp.size, jax.tree.leaves(y))) <= factor.UNROLLED
+    update = _conditioned_on_emission if is_emission else _conditioned
+    return (batch_last(update) if small else update)(model, belief, observation, inputs)
 
 
-def as_observation(observation: Any) -> Observation:
-    """An observation with what is known about it, given as such or as an array."""
-    measured = observation if isinstance(observation, Observation) else Observation(observation)
-    checks.observation(measured.y, measured.mask)
-    return measured
+def _conditioned_on_emission(
+    model: ExtendedKalman, belief: Belief, observation: PyTree, inputs: PyTree
+) -> tuple[Belief, KalmanInfo]:
+    posterior, report = emission_update(
+        model.observe, *model._about(belief), observation, inputs, model.linearize, model.arithmetic, model.iterations
+    )
+    return posterior if model.manifold.flat else retract_belief(model.manifold, belief.mean, posterior), report
 
 
 def _conditioned(

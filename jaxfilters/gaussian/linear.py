@@ -162,8 +162,8 @@ def kalman(
     """
     checks.arithmetic_of(prior, arithmetic)
     dtype = prior.mean.dtype
-    given = Matrices(F, Q, H, R, b, d)
-    found = Matrices(*(_matrix(name, value, dtype) for name, value in zip(Matrices._fields, given, strict=True)))
+    given = zip(Matrices._fields, (F, Q, H, R, b, d), strict=True)
+    found = Matrices(*(_matrix(name, value, dtype) for name, value in given))
     _check_shapes(found, prior)
     return Filter(Kalman(prior, *found, arithmetic), _init, _predict, _update)
 
@@ -174,8 +174,11 @@ def _check_shapes(matrices: Matrices, prior: Belief) -> None:
     n = prior.mean.shape[0]
     m = None if callable(H) else H.shape[0] if H.ndim else 0
     rows = f"H {m} rows" if m is not None else "H a number of rows that its function decides"
-    for name, value, shape in (("F", F, (n, n)), ("H", H, (m, n)), ("b", b, (n,)), ("d", d, (m,))):
-        if value is not None and not callable(value) and None not in shape:
+    shapes: list[tuple[str, Any, tuple[int, ...]]] = [("F", F, (n, n)), ("b", b, (n,))]
+    if m is not None:
+        shapes += [("H", H, (m, n)), ("d", d, (m,))]
+    for name, value, shape in shapes:
+        if value is not None and not callable(value):
             varies = value.ndim == len(shape) + 1
             hint = "; for one that changes with time, pass a function of the inputs" if varies else ""
             checks.shaped(name, value, shape, f", as the prior has {n} components and {rows}{hint}")

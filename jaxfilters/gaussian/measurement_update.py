@@ -10,6 +10,7 @@ American Statistical Association 81, 1986; `docs/derivations/iterated_update.md`
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -39,6 +40,10 @@ class Measurement(NamedTuple):
     residual: Callable[[Array, Array], Array]
     linearize: Linearize
     arithmetic: Arithmetic
+    noise_at: Callable[[Array], Array] | None = None
+    """`coordinates -> noise` where it is evaluated anew in each iteration."""
+    log_probability: Callable[[Array], Array] | None = None
+    """`coordinates -> log p(y | x)` where it is not that of Gaussian noise."""
 
 
 def subtract(y: Float[Array, " m"], y_hat: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -92,16 +97,21 @@ def iterated_update(
             covariance of the posterior.
     """
     prior_root = lower_root(measurement.belief)
+    given = measurement
     times_P = lambda v: factor.apply(prior_root, factor.apply(prior_root.T, v))
 
     def refine(index, offset, dual):
+        measurement = _noise_at(given, offset)
         posterior, report, linear = linear_update(measurement, offset)
-        end, end_dual = posterior.mean - measurement.start, _dual(report, linear.F, report.innovation)
+        end, end_dual = posterior.mean - measurement.start, dual_of(report, linear.F, report.innovation)
+        if measurement.log_probability is not None:
+            log_evidence = laplace_log_evidence(measurement, report, linear, offset, dual)
+            report = replace(report, log_evidence=log_evidence)
         if to_mean:
             # The first step is that of the plain update: its result is never better than where the iteration ends.
             u = jnp.where(index > 0, _log_determinant_slope(measurement, report, linear, prior_root, offset), 0.0)
             # C u = P u - P F^T S^-1 F P u.
-            shift_dual = _dual(report, linear.F, factor.apply(_counted(report, linear.F), times_P(u))) - u
+            shift_dual = dual_of(report, linear.F, factor.apply(_counted(report, linear.F), times_P(u))) - u
             end, end_dual = end + times_P(shift_dual), end_dual + shift_dual
         step, dual_step = end - offset, end_dual - dual
         likelihood_cost = _likelihood_cost(measurement, report, linear, prior_root if to_mean else None)
@@ -122,12 +132,46 @@ def iterated_update(
     if first is not None:
         # The prior's part of the cost is not known at a point that is no P g: the first step is a whole one.
         posterior, report, linear = linear_update(measurement, first)
-        offset, dual, done = posterior.mean - measurement.start, _dual(report, linear.F, report.innovation), 1
+        offset, dual, done = posterior.mean - measurement.start, dual_of(report, linear.F, report.innovation), 1
     results = jax.eval_shape(partial(refine, done), offset, dual)[2:]
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), results)
     found = jax.lax.fori_loop(done, iterations + 1, lambda i, at: refine(i, *at[:2]), (offset, dual, *empty))
     offset, _, posterior, report = found
     return with_mean(posterior, measurement.start + offset), report
+
+
+def laplace_log_evidence(
+    measurement: Measurement,
+    report: KalmanInfo,
+    linear: Linearization,
+    offset: Float[Array, " n"],
+    dual: Float[Array, " n"],
+) -> Float[Array, ""]:
+    r"""Log evidence of an observation whose noise is not Gaussian, from the Gaussian update that stands for it.
+
+    $\log p(y \mid \hat x) + \log N(\hat x; m, P) - \log N(\hat x; \hat x, \hat P)$ with
+    $|\hat P| / |P| = |R| / |S|$, and $\hat x - m = P g$.
+
+    Args:
+        measurement: The observation, with its `log_probability`.
+        report: Diagnostics of the update.
+        linear: The linear function of that update.
+        offset: The increment $\hat x - m$.
+        dual: The vector g.
+    """
+    counts = factor.diagonal(report.innovation_root) > 0
+    root = measurement.arithmetic.noise_root(measurement.noise, counts, linear.residual_root)
+    diagonals = (jnp.where(counts, jnp.abs(factor.diagonal(part)), 1.0) for part in (root, report.innovation_root))
+    log_noise, log_innovation = (jnp.sum(jnp.log(diagonal)) for diagonal in diagonals)
+    at_mean = measurement.log_probability(measurement.start + offset)
+    value = at_mean - 0.5 * jnp.sum(dual * offset) + log_noise - log_innovation
+    return jnp.where(report.log_evidence == -jnp.inf, -jnp.inf, value)
+
+
+def _noise_at(measurement, offset):
+    if measurement.noise_at is None:
+        return measurement
+    return measurement._replace(noise=measurement.noise_at(measurement.start + offset))
 
 
 def _linear_at(measurement, offset):
@@ -149,7 +193,7 @@ def _difference(measurement, y_hat):
     return read, jnp.where(read, measurement.residual(jnp.where(read, y, 0.0), y_hat), 0.0)
 
 
-def _dual(report, F, innovation):
+def dual_of(report: KalmanInfo, F: Float[Array, "m n"], innovation: Float[Array, " m"]) -> Float[Array, " n"]:
     """`F^T S^-1 innovation`, over the components that count."""
     whitened = linalg.solve_triangular(report.innovation_root, innovation)
     weights = linalg.solve_triangular(report.innovation_root, whitened, transpose=True)
@@ -158,6 +202,8 @@ def _dual(report, F, innovation):
 
 def _likelihood_cost(measurement, report, linear, prior_root):
     """Negative log likelihood at an increment, but for a constant; with log|S| / 2 where a root of P is given."""
+    if measurement.log_probability is not None:
+        return lambda offset: -measurement.log_probability(measurement.start + offset)
     counts = factor.diagonal(report.innovation_root) > 0
     noise_root = measurement.arithmetic.noise_root(measurement.noise, counts, linear.residual_root)
 

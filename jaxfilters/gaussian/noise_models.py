@@ -19,6 +19,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.gaussian.emissions import Emission
 from jaxfilters.gaussian.linearize import Linearization, Linearize, lower_root, taylor
 from jaxfilters.gaussian.manifold import Belief
 from jaxfilters.math import linalg
@@ -75,6 +76,8 @@ def bound_function(name: str, function: Any) -> Any:
     """
     if isinstance(function, NonAdditiveNoise):
         return NonAdditiveNoise(taking_inputs(f"the function of {name}", function.function, "x", "noise"))
+    if isinstance(function, Emission):
+        return function
     checks.function(name, function)
     return taking_inputs(name, function, "x")
 

@@ -83,6 +83,8 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
             "inner must be made by kalman or extended_kalman (or unscented_kalman, cubature_kalman) with a Gaussian "
             f"prior; its prior is a {type(model.prior).__name__}."
         )
+    if model.observation_noise is None:
+        raise ValueError("inner must have Gaussian observation noise; it has an emission.")
     checks.probability("outlier_probability", outlier_probability)
     if not callable(model.observation_noise):
         shape = jnp.shape(model.observation_noise)

@@ -8,6 +8,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian import arithmetic as arithmetics
 from jaxfilters.gaussian.arithmetic import Arithmetic
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.gaussian.emissions import Emission
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.gaussian.linearize import cubature, unscented
 from jaxfilters.gaussian.manifold import Manifold, euclidean
@@ -19,8 +20,8 @@ def unscented_kalman(
     prior: Gaussian | GaussianRoot,
     transition: Callable[..., Array] | NonAdditiveNoise,
     process_noise: Array | Callable[..., Array],
-    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
-    observation_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise | Emission,
+    observation_noise: Array | Callable[..., Array] | None = None,
     *,
     alpha: float = 1.0,
     beta: float = 2.0,
@@ -38,8 +39,10 @@ def unscented_kalman(
         transition: `x -> x` or `(x, inputs) -> x` without noise, (n,) to (n,); or `NonAdditiveNoise`.
         process_noise: Covariance of the process noise, (n, n), or a function `inputs -> covariance` or
             `(x, inputs) -> covariance`.
-        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`.
-        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`.
+        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`; or an emission
+            of `jf.emissions`.
+        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`; None for an
+            emission.
         alpha: Distance of the points from the mean, relative to sqrt(n + kappa) standard deviations; positive.
         beta: Weight of the centre point in the covariance, at least 0; 2 suits Gaussian states.
         kappa: Addition to the dimension n in the distance of the points, at least 0.
@@ -82,8 +85,8 @@ def cubature_kalman(
     prior: Gaussian | GaussianRoot,
     transition: Callable[..., Array] | NonAdditiveNoise,
     process_noise: Array | Callable[..., Array],
-    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise,
-    observation_noise: Array | Callable[..., Array],
+    observe: Callable[..., Float[Array, " m"]] | NonAdditiveNoise | Emission,
+    observation_noise: Array | Callable[..., Array] | None = None,
     *,
     arithmetic: Arithmetic = arithmetics.joseph,
     manifold: Manifold = euclidean,
@@ -98,8 +101,10 @@ def cubature_kalman(
         transition: `x -> x` or `(x, inputs) -> x` without noise, (n,) to (n,); or `NonAdditiveNoise`.
         process_noise: Covariance of the process noise, (n, n), or a function `inputs -> covariance` or
             `(x, inputs) -> covariance`.
-        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`.
-        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`.
+        observe: `x -> y` or `(x, inputs) -> y` without noise, (n,) to (m,); or `NonAdditiveNoise`; or an emission
+            of `jf.emissions`.
+        observation_noise: Covariance of the observation noise, (m, m), or a function like `process_noise`; None for an
+            emission.
         arithmetic: `jf.arithmetic.joseph`, `square_root` (all covariances are then roots) or `fast`.
         manifold: Space of the states, as for `extended_kalman`.
         residual: `(y, y_hat) -> y - y_hat`, for observations that wrap around.

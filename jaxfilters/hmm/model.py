@@ -24,7 +24,7 @@ class HiddenMarkovModel:
 
     log_initial: Float[Array, "..."]
     """(Q,): log p(s_1), for the state in the first frame."""
-    log_transition: Float[Array, "..."] | Callable
+    log_transition: Any
     """(Q, Q): log p(s_t+1 = j | s_t = i) at [i, j]; `-inf` for a transition that is ruled out, also in training.
     (T - 1, Q, Q) where it changes with time: element t leads from frame t to frame t + 1. A function of the inputs of a
     step for `jf.hmm.online`, and for `with_inputs`, which evaluates it for a whole sequence."""
@@ -58,8 +58,9 @@ class HiddenMarkovModel:
     def transition_of(self, inputs: PyTree) -> Float[Array, "q q"]:
         """Log transition probabilities (Q, Q) of one step."""
         if not callable(self.log_transition):
-            return self.log_transition
-        found = self.log_transition(inputs)
+            array: Array = self.log_transition
+            return array
+        found: Array = self.log_transition(inputs)
         if jnp.shape(found) != self.log_initial.shape * 2:
             raise ValueError(
                 f"the transition function must return {self.log_initial.shape * 2}, (Q, Q); got {jnp.shape(found)}."

@@ -170,7 +170,8 @@ def _log_evidence(log_initial, log_transition, log_likelihoods, lengths):
     def block(carry: tuple, first: Any, count: int = _BLOCK) -> tuple[tuple, None]:
         scaled, total = carry
         here = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, count)
-        frames, is_inside, own = usable(here(log_likelihoods)), *jax.tree.map(here, (inside, steps))
+        frames = usable(here(log_likelihoods))
+        is_inside, own = jax.tree.map(here, inside), jax.tree.map(here, steps)
         scaled, shifts = jax.lax.scan(step, scaled, (frames, jnp.arange(count) + first == 0, is_inside, own))
         return (scaled, _add_compensated(total, jnp.sum(shifts, axis=0))), None
 
@@ -222,7 +223,7 @@ def _forward(log_initial, log_transition, log_likelihoods, lengths) -> tuple[Arr
 
 def _step(log_initial, log_transition, log_likelihoods) -> Callable:
     """The function that advances scaled probabilities by one frame, from usable log-likelihoods."""
-    A_transposed = jnp.exp(log_transition).T if log_transition.ndim == 2 else None
+    A_transposed = jnp.exp(log_transition).T
     initial = jnp.exp(as_column(log_initial, log_likelihoods))
 
     def step(scaled: Array, inputs: tuple) -> tuple[Array, Array]:

@@ -94,6 +94,15 @@ EXACT = {
         extended(noise), jf.TruncateEachStep(SPACIOUS, jf.constraints.cut.sequential_intervals)
     ),
     "schmidt_kalman": lambda noise: jf.schmidt_kalman(extended(noise), observe, jnp.zeros(2, bool), 1e-3),
+    "kalman of inputs": lambda noise: jf.kalman(PRIOR, F, lambda _: Q, H, lambda _: covariance(noise)),
+    "noise as an argument": lambda noise: jf.unscented_kalman(
+        PRIOR,
+        jf.NonAdditiveNoise(lambda x, w: F @ x + jnp.sqrt(Q) @ w),
+        jnp.eye(2),
+        jf.NonAdditiveNoise(lambda x, w: observe(x) + noise * w),
+        jnp.eye(1),
+    ),
+    "student_t": lambda noise: jf.student_t(jf.kalman(PRIOR, F, Q, H, covariance(noise)), 1e6),
     "robust": lambda noise: jf.robust(extended(noise), 1e-7, jnp.array([[25.0]])),
     # Two modes of one model are that model.
     "imm": lambda noise: jf.imm([extended(noise)] * 2, [[0.9, 0.1], [0.4, 0.6]], [0.3, 0.7]),

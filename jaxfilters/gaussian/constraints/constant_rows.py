@@ -10,6 +10,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.constraints.linear import LinearConstraints
 from jaxfilters.gaussian.extended import ExtendedKalman
 from jaxfilters.gaussian.linear import Kalman
+from jaxfilters.gaussian.noise_models import NonAdditiveNoise
 
 
 def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) -> None:
@@ -34,7 +35,8 @@ def check_constant(inner: Filter, constraints: LinearConstraints, lasting: Any) 
     if known is None or not known[1].any():
         return
     normals, names = known[0][known[1]], np.asarray(constraints.names)[known[1]]
-    noise = None if callable(model.process_noise) else known_values(model.process_noise)
+    additive = not isinstance(model.transition, NonAdditiveNoise)
+    noise = known_values(model.process_noise) if additive and hasattr(model.process_noise, "shape") else None
     if noise is not None and noise.shape[:1] == normals.shape[1:]:
         _refuse_moving(names, *_noise_along(model.prior, normals, noise))
     _refuse_moving(names, *_transition_along(model, normals))

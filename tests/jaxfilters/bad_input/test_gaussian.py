@@ -348,10 +348,67 @@ LINEAR = [
     Case("kalman, long d", lambda: linear(d=np.zeros(3)), ("d", "(1,)", "(3,)")),
     Case("kalman, arithmetic", lambda: linear(arithmetic=jf.arithmetic.square_root), ("prior", "GaussianRoot")),
     Case("kalman, wide y", lambda: jf.run(linear(), KEY, jnp.zeros((5, 3))), ("observation", "(3,)", "(1,)")),
-    Case("kalman, a inputs", lambda: jf.run(linear(), KEY, jnp.zeros((5, 1)), jnp.zeros(5)), ("inputs", "None")),
+    Case("kalman, F for each frame", lambda: linear(F=np.ones((5, 2, 2))), ("F", "(5, 2, 2)", "the inputs")),
+    Case("kalman, F of two arguments", lambda: linear(F=lambda x, u: np.eye(2)), ("F must take (inputs)", "(x, u)")),
+    Case(
+        "kalman, F of inputs, narrow",
+        lambda: jf.run(linear(F=lambda u: jnp.ones((2, 1))), KEY, jnp.zeros((5, 1)), jnp.zeros(5)),
+        ("F", "(2, 2)", "(2, 1)"),
+    ),
+    Case("kalman, inputs", lambda: jf.run(linear(), KEY, jnp.zeros((5, 1)), jnp.zeros(5)), ("inputs", "None")),
 ]
 
-GAUSSIAN = [*LINEAR] + [Case(name, *case) for name, case in (EXTENDED | WRAPPERS | RUN).items()]
+STILL = lambda x: x
+
+
+def counted(emission, y=None, **options):
+    """An extended filter with an emission, run on one observation if there is one."""
+    filter = jf.extended_kalman(PRIOR, STILL, Q, emission, **options)
+    return filter if y is None else jf.update(filter, KEY, PRIOR, y)
+
+
+COUNTS = jf.emissions.poisson(lambda x: x)
+NOISES = [
+    Case("emission with a noise", lambda: counted(COUNTS, observation_noise=R), ("observation_noise", "None")),
+    Case("emission to the mean", lambda: counted(COUNTS, iterations=3), ("iterate_to", "mode")),
+    Case("emission with a residual", lambda: counted(COUNTS, residual=lambda y, z: y - z), ("residual",)),
+    Case("counts, wide", lambda: counted(COUNTS, jnp.zeros(3)), ("observation y", "(2,)", "(3,)")),
+    Case(
+        "counts, noise", lambda: counted(COUNTS, jf.Observation(jnp.zeros(2), None, R)), ("Observation.noise", "None")
+    ),
+    Case("counts, mask", lambda: counted(COUNTS, jf.Observation(jnp.zeros(2), jnp.ones(3, bool))), ("mask", "(2,)")),
+    Case("labels", lambda: counted(jf.emissions.categorical(STILL), jnp.zeros(2)), ("label", "()", "(2,)")),
+    Case("rate, scalar", lambda: counted(jf.emissions.poisson(lambda x: x[0]), jnp.zeros(1)), ("(m,)", "()")),
+    Case("rate, no function", lambda: jf.emissions.poisson(3.0), ("log_rate", "function", "float")),
+    Case("no trials", lambda: jf.emissions.binomial(STILL, 0), ("num_trials", "at least 1", "0")),
+    Case("half a trial", lambda: jf.emissions.binomial(STILL, 1.5), ("num_trials", "1.5")),
+    Case("no noise", lambda: jf.extended_kalman(PRIOR, STILL, Q, STILL), ("observation_noise", "None")),
+    Case("robust, emission", lambda: jf.robust(counted(COUNTS), 0.1, R), ("inner", "emission")),
+    Case("student_t, emission", lambda: jf.student_t(counted(COUNTS), 4.0), ("inner", "emission")),
+    Case("student_t, no dof", lambda: jf.student_t(linear(), None), ("observation_dof", "None")),
+    Case("student_t, zero dof", lambda: jf.student_t(linear(), 0.0), ("observation_dof", "above 0", "0.0")),
+    Case("student_t, infinite dof", lambda: jf.student_t(linear(), np.inf), ("observation_dof", "finite", "inf")),
+    Case("student_t, process", lambda: jf.student_t(linear(), None, process_dof=2.0), ("process_dof", "above 2")),
+    Case("student_t, scales", lambda: jf.student_t(linear(), 4.0, num_scales=2), ("num_scales", "at least 4", "2")),
+    Case("student_t, inner", lambda: jf.student_t(jf.robust(linear(), 0.1, np.eye(1)), 4.0), ("inner", "Robust")),
+    Case(
+        "noise of the state, not additive",
+        lambda: jf.extended_kalman(PRIOR, jf.NonAdditiveNoise(lambda x, w: x), lambda x, u: Q, STILL, Q),
+        ("process_noise", "NonAdditiveNoise"),
+    ),
+    Case(
+        "not additive, one argument",
+        lambda: jf.extended_kalman(PRIOR, jf.NonAdditiveNoise(STILL), Q, STILL, Q),
+        ("the function of transition must take (x, noise)", "(x)"),
+    ),
+    Case(
+        "noise of the state, shape",
+        lambda: jf.predict(jf.extended_kalman(PRIOR, STILL, lambda x, u: jnp.eye(1), STILL, Q), KEY, PRIOR),
+        ("the result of process_noise", "(2, 2)", "(1, 1)"),
+    ),
+]
+
+GAUSSIAN = [*LINEAR, *NOISES] + [Case(name, *case) for name, case in (EXTENDED | WRAPPERS | RUN).items()]
 
 
 @pytest.mark.parametrize("case", GAUSSIAN, ids=lambda case: case.name)
