@@ -128,7 +128,7 @@ def check_filters(filters: Any, *, one_size: str | None) -> list[Gaussian | Gaus
     if one_size is not None and len(set(sizes)) > 1:
         raise ValueError(f"filters must have states of one size{one_size}; got the sizes {', '.join(map(str, sizes))}.")
     spaces = [manifold_of(filter) for filter in filters]
-    structures = [None if space.flat else jax.tree.structure(space) for space in spaces]
+    structures = [jax.tree.structure(euclidean if space.flat else space) for space in spaces]
     if any(structure != structures[0] for structure in structures):
         raise ValueError("filters must all have states on one manifold; got different ones.")
     return states
