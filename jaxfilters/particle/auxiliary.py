@@ -344,11 +344,12 @@ def _select(
     model: Auxiliary, key: AnyKey, state: AuxiliaryState, y: PyTree, inputs: PyTree
 ) -> tuple[PyTree, Float[Array, " n"], Int32[Array, " n"]]:
     """Parents resampled by the first stage, their weights divided by it, and their indices."""
-    if model.log_first_stage is None:
+    log_first_stage = model.log_first_stage
+    if log_first_stage is None:
         return resample(key, state.parents, state.log_weights, model.scheme, model.ess_threshold)
 
     def evaluated(x: PyTree) -> Array:
-        return checks.scalar_log_density("log_first_stage", model.log_first_stage(x, y, inputs))
+        return checks.scalar_log_density("log_first_stage", log_first_stage(x, y, inputs))
 
     first = jax.vmap(evaluated, in_axes=-1)(state.parents)
     usable = jnp.isfinite(first)
