@@ -30,7 +30,7 @@ def crps(y: Float[Array, "*shape"], mean: ArrayLike, std: ArrayLike) -> Float[Ar
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> round(float(jf.diagnostics.crps(jnp.array(1.0), 0.0, 2.0)), 4)
-        0.6623
+        0.6628
     """
     positive("std", std)
     std = jnp.asarray(std, dtype=float)
