@@ -254,7 +254,7 @@ def optimal(key: Key, log_weights: Float[Array, " m"], num_survivors: int) -> Su
     relative = _relative(log_weights)
     kept, places, small_sum = _kept(relative, num_survivors)
     small = jnp.where(kept, 0.0, relative)
-    whole, fraction = prefix.positions(small, places)
+    whole, fraction = prefix.positions(small, places, num_survivors)
     drawn_below = jnp.minimum(
         whole + (fraction > jax.random.uniform(key, (), relative.dtype)), places.astype(jnp.int32)
     )

@@ -60,7 +60,7 @@ SEARCHING, TRACKING, LOST = range(3)
 
 @dataclass(frozen=True)
 class HandDepthConfig:
-    """What a user may set; Python values, read when the tracker is built."""
+    """Options of the tracker."""
 
     filter: str = "rbpf"
     """`rbpf` carries the velocity of each particle in a Kalman filter, `pf` has none."""
@@ -74,8 +74,7 @@ class HandDepthConfig:
     guide: bool = True
     """Draw particles around what registration finds; otherwise from the motion model alone."""
     missing: str = "auto"
-    """What pixels without a reading are: `background` (the recording had it removed), `unknown`, or `auto`: background
-    if they are more than half of the first frame."""
+    """Pixels without a reading: `background`, `unknown`, or `auto`, background if they are half of the first frame."""
     surface: str = "capsules"
     """What particles are rendered as: `capsules`, or the triangle `mesh`, three times slower."""
 
@@ -103,8 +102,7 @@ REGISTRATION_STRIDE = 4
 MAX_ERROR = 0.1
 """c_max of the paper, metres."""
 SIGMA = 3e-4
-"""Scale of the cost, metres. The cost is a mean over thousands of pixels, so it knows the pose far better than one
-pixel."""
+"""Scale of the cost, metres: of a mean over thousands of pixels, far below that of one pixel."""
 TEMPERED_SHARE = 0.02
 FEWEST_PIXELS = 50
 """Hand pixels in the window below which nothing is there."""
@@ -120,8 +118,7 @@ MOTION = HandMotion(
     per_coordinate(0.04, 0.2, math.radians(24)) ** 2 * 30,
     per_coordinate(0.0, 0.0, 1 / 0.3),
 )
-"""A real hand: a joint may move 35 mm from one frame to the next, so the pose may jump by four to six times what the
-specification's synthetic data does, which the guide can afford; joint velocities are damped over 0.3 s."""
+"""A real hand: a joint may move 35 mm from one frame to the next; joint velocities are damped over 0.3 s."""
 START_STD = per_coordinate(0.005, 0.04, math.radians(5))
 START_VELOCITY_STD = per_coordinate(0.08, 0.3, math.radians(25))
 """Per second."""
