@@ -88,7 +88,7 @@ def analysed(state: EnsembleState, info: EnsembleInfo) -> Array:
     return jnp.mean(state.particles, axis=1)
 
 
-def rmse(filter: Filter, key: AnyKey, problem: Problem, spin_up: int = SPIN_UP) -> float:
+def rmse(filter: Filter, key: AnyKey, problem: Problem, spin_up: int) -> float:
     """Root mean square error of the analysed mean after the first steps."""
     # The belief before the first step is about the first state of the course, and the first reading of the next one.
     _, means = jf.run(filter, key, problem.readings[1:], collect=analysed)
@@ -119,7 +119,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     problems = {every: simulate(key, QUICK_STEPS if quick else STEPS, every) for every in (1, 2)}
     found = {}
     for name, (every, options) in FILTERS.items():
-        error = rmse(build(problems[every], **options), filter_key, problems[every])
+        error = rmse(build(problems[every], **options), filter_key, problems[every], SPIN_UP)
         found[f"rmse_{name}"] = Metric(error, "", "lower")
     for count in (COUNT, MANY):
         found |= timed(filter_key, simulate_linear(key, TIMED_STEPS), count, QUICK_ROUNDS if quick else ROUNDS)
