@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.articulated.features import FULL
-from jaxfilters.models.articulated.layout import Layout
+from jaxfilters.models.articulated.layout import LINKS, Layout
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.recording import FeatureSequence, Start
@@ -175,6 +175,31 @@ def perfect_track(features):
         log_evidence=-ones,
         status=np.arange(FRAMES, dtype=np.int32) % 3,
     )
+
+
+@pytest.fixture(scope="session")
+def nothing_tracked():
+    """`(layout, frames) -> track` of an articulated hand, with zeros in every field."""
+
+    def made(layout, frames):
+        joints, one = (frames, layout.num_fingers, LINKS + 1), np.zeros(frames, np.float32)
+        return TimedArticulatedTrack(
+            times_s=np.zeros(frames),
+            mean=np.zeros((frames, layout.size), np.float32),
+            std=np.zeros((frames, layout.size), np.float32),
+            points=np.zeros((*joints, 3), np.float32),
+            image_points=np.zeros((*joints, 2), np.float32),
+            scale=one,
+            weight=one,
+            num_hypotheses=np.zeros(frames, np.int32),
+            is_new_view=np.zeros(frames, bool),
+            nis_per_row=one,
+            least_distance=one,
+            log_evidence=one,
+            status=np.zeros(frames, np.int32),
+        )
+
+    return made
 
 
 @pytest.fixture

@@ -45,6 +45,10 @@ class TrackTable(NamedTuple):
         """Names of the numbers of a row."""
         return tuple(name for part in self.parts for name in part.names)
 
+    def numbers(self, track: Any) -> np.ndarray:
+        """(frames, columns) of a track."""
+        return np.concatenate([part.values(track).reshape(len(track.times_s), -1) for part in self.parts], axis=1)
+
 
 class OutputFolder:
     """A folder that one run writes into; no other run can until it is closed or its process ends."""
@@ -145,8 +149,7 @@ class TrackWriter:
             first += len(part.times_s)
 
     def _rows(self, first: int, part: Any) -> Iterator[tuple[Any, ...]]:
-        frames = len(part.times_s)
-        numbers = np.concatenate([columns.values(part).reshape(frames, -1) for columns in self._table.parts], axis=1)
+        numbers = self._table.numbers(part)
         for i, time_s in enumerate(part.times_s):
             texts = (f"{x:.9g}" for x in numbers[i])
             yield (first + i, f"{time_s:.6f}", *texts, self._table.status_names[int(part.status[i])])

@@ -40,7 +40,7 @@ class FingertipPictures:
         modes = ", ".join(MODE_NAMES[int(mode)] for mode in report.mode)
         caption(picture, f"{time_s:.1f} s  {modes}", 0)
         self._events.extend((frame, in_words(event)) for event in events)
-        for line, (_, text) in enumerate([told for reported in self._events if frame - reported[0] < EVENT_FRAMES], 1):
+        for line, (_, text) in enumerate([event for event in self._events if frame - event[0] < EVENT_FRAMES], 1):
             caption(picture, text, line)
         return picture
 

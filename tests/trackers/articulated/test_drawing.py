@@ -12,7 +12,6 @@ from jaxfilters.models.synthetic.articulated import paper_hand
 from jaxfilters.trackers.articulated import drawing as articulated_draw
 from jaxfilters.trackers.articulated.drawing import Canvas, draw_frame, scene, write_overlay
 from jaxfilters.trackers.articulated.recording import from_keypoints
-from jaxfilters.trackers.articulated.table import articulated_table
 from jaxfilters.trackers.hand_depth.drawing import FINGER_COLORS
 from jaxfilters.trackers.io.errors import OutputError
 
@@ -132,7 +131,7 @@ def test_joints_that_are_nowhere_are_left_out(features, perfect_track, far):
     assert draw_frame(drawn, 0).any()
 
 
-def test_five_fingers_from_keypoints_have_five_colours(perfect_track):
+def test_five_fingers_from_keypoints_have_five_colours(perfect_track, nothing_tracked):
     hand = articulated_hand(five_fingers(), features=KEYPOINTS)
     x = np.zeros((2, hand.layout.size), np.float32)
     x[:, hand.layout.position], x[:, hand.layout.quaternion] = (200, 200), (0.5, -0.5, 0.5, -0.5)
@@ -140,11 +139,8 @@ def test_five_fingers_from_keypoints_have_five_colours(perfect_track):
     points = np.asarray(jax.jit(jax.vmap(hand.points))(x))
     keypoints = np.concatenate([x[:, None, :2], points[..., :2].reshape(2, 20, 2)], axis=1)
     sequence = from_keypoints(np.arange(2.0), keypoints, "a")
-    track = (
-        articulated_table(hand.layout)
-        .empty(2)
-        ._replace(times_s=sequence.times_s, mean=x, points=points, image_points=points[..., :2])
-    )
+    track = nothing_tracked(hand.layout, 2)
+    track = track._replace(times_s=sequence.times_s, mean=x, points=points, image_points=points[..., :2])
     drawn = scene(sequence, hand, track)
     image = draw_frame(drawn, 0)
     for finger, color in enumerate(FINGER_COLORS):
