@@ -2,9 +2,10 @@
 
 Everything public is one dot away and is imported when it is first used. Builders return a `Filter`: `kalman`,
 `extended_kalman`, `unscented_kalman`, `cubature_kalman`, `ensemble_kalman`, `gaussian_sum`, `robust`, `schmidt_kalman`,
-`constrained`, `bootstrap`, `guided`, `rao_blackwell`, `rao_blackwell_shared`, `adaptive_diffusion`. The functions
-`run`, `step`, `log_evidence` and the namespaces `smoothing`, `fit` and `sharding` take any of
-them.
+`constrained`, `student_t`, `posterior_linearization`, `continuous_extended_kalman`, `imm`, `bootstrap`, `guided`,
+`auxiliary`, `locally_optimal`, `rao_blackwell`, `rao_blackwell_shared`, `guided_rao_blackwell`, `switching`,
+`adaptive_diffusion`. The functions `run`, `step`, `log_evidence` and the namespaces `smoothing`, `fit`, `mcmc` and
+`sharding` take them.
 """
 
 from pathlib import Path as _Path
