@@ -17,7 +17,7 @@ SCHEMES = {
 # How far a count may lie from n w_i.
 SPREAD = {"systematic": (-1, 1), "stratified": (-2, 2), "multinomial": (-np.inf, np.inf), "residual": (-1, np.inf)}
 # 32 numbers a row, 1024 two levels of rows.
-SIZES = [1, 32, 33, 1025]
+SIZES = [1, 33, 1025]
 
 
 @pytest.fixture(params=SCHEMES, ids=str)
@@ -91,7 +91,7 @@ def test_even_dead_and_undefined_ensembles(scheme, n):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("most", [3, 5, 7, 11, 13])
+@pytest.mark.parametrize("most", [3, 13])
 def test_whole_expected_counts_are_met_exactly_by_certain_copies(most):
     expected = np.tile([most, 1] + [0] * (most - 1), 9)
     log_weights = jnp.log(jnp.asarray(expected / expected.sum(), jnp.float32))
