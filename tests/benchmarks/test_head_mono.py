@@ -6,7 +6,6 @@ import pytest
 from jaxfilters.benchmarks.scenarios import _mono_runs, head_mono
 from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
-from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
@@ -59,14 +58,6 @@ def test_users_are_who_the_training_faces_say():
     assert len(others) == head_mono.NUM_KNOWN - 1
     assert not any(np.allclose(made.identity.neutral, person.neutral) for person in others)
     assert 45 < eyes_apart_of(made.identity) < 80
-
-
-@pytest.mark.system
-def test_wider_turns_make_better_starts():
-    face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0).face
-    metrics = start_metrics(face, 0, 6)
-    assert metrics["start_free_spread_2_pitch"].value < metrics["start_free_spread_0.1_pitch"].value
-    assert metrics["start_spread_1_reprojection"].value < 1.0
 
 
 class Still(FaceSequence):
