@@ -1,4 +1,4 @@
-"""The scenario on heads before one camera: its arithmetic on made tracks, and a few rendered frames."""
+"""The scenario on heads before one camera: its arithmetic on made tracks."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,9 @@ import pytest
 from jaxfilters.benchmarks.scenarios import _mono_runs, head_mono
 from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
-from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
+from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.models.synthetic.face_sequence import FaceSequence
+from jaxfilters.trackers.head.common.state import DEFORMABLE
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
 from jaxfilters.trackers.io.face_models import default_face_model
 
@@ -58,20 +60,52 @@ def test_users_are_who_the_training_faces_say():
     assert 45 < eyes_apart_of(made.identity) < 80
 
 
-@pytest.mark.system
-def test_wider_turns_make_better_starts():
-    face = head_mono.learnt_from(head_mono.people_but(0)[:4], 6, 0).face
-    metrics = start_metrics(face, 0, 6)
-    assert metrics["start_free_spread_2_pitch"].value < metrics["start_free_spread_0.1_pitch"].value
-    assert metrics["start_spread_1_reprojection"].value < 1.0
+class Still(FaceSequence):
+    """The truth of a head that holds still for 60 frames, without images."""
+
+    def __init__(self):
+        poses = np.tile([0.0, 0, 650, 0, 0.1, 0], (60, 1))
+        shapes = np.tile(MEAN_SHAPE, (60, 1, 1))
+        uv = np.tile(np.array([300.0, 200.0]), (60, 1, 10, 1))
+        truth = {"poses": poses, "shapes": shapes, "uv": uv, "rig": _mono_runs.camera(), "times": np.arange(60) / 30}
+        for name, value in truth.items():
+            object.__setattr__(self, name, value)
+
+    def frames(self, start, stop):
+        return np.zeros((stop - start, 1, 480, 640), np.uint8)
 
 
-@pytest.mark.system
-def test_a_short_video_is_followed_by_several_trackers():
-    made = talking_head(3, 40)
-    face = default_face_model().model
-    runs = follow_all(made, {"usual": Contender(face, MonoOptions())}, 0)
-    assert runs["usual"].is_tracked.all()
-    assert len(runs["usual"].errors) == 40 - _mono_runs.START_FRAMES[-1] - 1
-    assert np.all(runs["usual"].means[3:] < 3.0)
-    assert runs["usual"].means[2] < 60.0
+def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypatch):
+    """A stand-in is 2 mm and a full turn of yaw off, and counts the frames that it was handed."""
+    made, sessions = Still(), []
+
+    class Session:
+        def __init__(self, rig, face, options, *, detections, remembered):
+            self.detections, self.done = detections, 0
+            sessions.append(self)
+
+        def process(self, images, times):
+            rows = np.arange(self.done, self.done + len(images))
+            self.done += len(images)
+            pose = made.poses[rows] + [2.0, 0, 0, 0, 2 * np.pi, 0]
+            track = {name: rows[:, None] for name in MonoTrack._fields}
+            # A shape that is elsewhere as a whole is none the worse.
+            shape = made.shapes[rows] + 5.0
+            return MonoTrack(**track | {"pose": pose, "shape": shape, "status": np.full(len(rows), DEFORMABLE)})
+
+    monkeypatch.setattr(_mono_runs, "MonoSession", Session)
+    contender = Contender(default_face_model().model, MonoOptions())
+    runs = follow_all(made, {"usual": contender, "other": contender}, 0)
+    first = _mono_runs.START_FRAMES[-1] + 1
+    for session in sessions:
+        found = session.detections
+        noise = found.points - made.uv[: len(_mono_runs.START_FRAMES), 0]
+        # Of a hundred draws the deviation is off by more than four of its own, 0.28, once in 16,000 times.
+        assert np.std(noise) == pytest.approx(_mono_runs.DETECTED_PX, rel=0.28)
+        assert found.time == pytest.approx((first - 1) / 30)
+    np.testing.assert_array_equal(sessions[0].detections.points, sessions[1].detections.points)
+    for run in runs.values():
+        np.testing.assert_array_equal(run.track.score[:, 0], range(first, 60))
+        np.testing.assert_allclose(run.means, [2.0, 0, 0, 0, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(run.landmark_mm, 0, atol=1e-4)
+        np.testing.assert_allclose(run.yaw_deg, np.degrees(0.1))

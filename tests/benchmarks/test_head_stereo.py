@@ -1,6 +1,5 @@
-"""The scenario of heads before two cameras: how runs are judged, and, slowly, all of it in small."""
+"""The scenario of heads before two cameras: how runs are judged, and what the tables are made of."""
 
-from functools import partial
 from types import SimpleNamespace
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _head_deformation as deformation
 from jaxfilters.benchmarks.scenarios import _head_runs as runs
 from jaxfilters.benchmarks.scenarios import _head_speed as speed
@@ -16,13 +16,10 @@ from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.rig import nominal
-from jaxfilters.models.synthetic import face_sequence
-from jaxfilters.models.synthetic.face_motion import gain_schedule, occlusion_schedule
+from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.common.state import RIGID, HeadOptions, HeadTrack
 
 K, ASTRAY = 10, 50.0
-NUM_FRAMES = 41
-"""Of every video of the tiny run: one block after the first frame."""
 
 
 def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
@@ -175,35 +172,110 @@ def test_the_picture_of_the_deformation_has_four_charts(tmp_path):
         assert np.any(np.all(np.abs(image.astype(int) - color) < 12, axis=-1))
 
 
+SIZES = {
+    "": 0.5,
+    "_learning": 0.25,
+    "_paper": 1.0,
+    "_paper_fixed5": 2.0,
+    "_paper_fixed1": 1.5,
+    "rigid": 1.0,
+    "deformable": 0.5,
+    "paper_rigid": 2.0,
+    "paper_deformable": 1.5,
+}
+"""Of the errors in millimetres and degrees, by the names of the trackers that stand-ins are for."""
+
+
+def stand_ins(num_frames, trackers):
+    """Runs whose errors change their sign with every frame."""
+    signs = np.where(np.arange(num_frames - 1) % 2, 1.0, -1.0)[:, None] * np.ones(6)
+    contributions = 0.1 * np.arange(1 + num_frames // deformation.BLOCK)
+    return {name: fake_run(SIZES[name] * signs, contributions=contributions) for name in trackers}
+
+
 @pytest.mark.system
-def test_a_tiny_run_has_every_metric(monkeypatch, tmp_path):
-    """Few particles and frames; all parts share two trackers, frame by frame: every other one takes long to compile."""
-    covered, dark = (10, 14), (26, 34)
-    usual = {mode: HeadOptions(mode=mode, num_particles=64, rigid_frames=0, chunk=1) for mode in ("modern", "paper")}
-    few = dict.fromkeys(("_paper", "_paper_fixed5"), usual["paper"])
-    monkeypatch.setattr(head_stereo, "PAPER", few)
-    monkeypatch.setattr(head_stereo, "ALWAYS", {"": usual["modern"]})
-    monkeypatch.setattr(head_stereo, "QUICK_NUM_SEEDS", 1)
-    for name in ("QUICK_NUM_FRAMES", "STILL_FRAMES", "QUICK_OCCLUSION_FRAMES"):
-        monkeypatch.setattr(head_stereo, name, NUM_FRAMES)
-    monkeypatch.setattr(head_stereo, "OCCLUSION_FRAMES", covered)
-    monkeypatch.setattr(head_stereo, "DIMMING_FRAMES", dark)
-    monkeypatch.setattr(head_stereo, "RECOVERY_FRAMES", 4)
-    monkeypatch.setattr(face_sequence, "occlusion_schedule", partial(occlusion_schedule, frames=covered))
-    monkeypatch.setattr(face_sequence, "gain_schedule", partial(gain_schedule, frames=dark))
-    monkeypatch.setattr(head_stereo, "QUICK_SCHEDULE", Schedule(10, 40, NUM_FRAMES))
-    monkeypatch.setattr(head_stereo, "QUICK_COUNTS", (64,))
-    monkeypatch.setattr(speed, "USUAL", 64)
-    monkeypatch.setattr(speed, "BATCH", 1)
-    both = dict.fromkeys(("rigid", "deformable"), usual["modern"])
-    monkeypatch.setattr(Schedule, "trackers", property(lambda self: both))
+def test_every_table_is_made_of_the_runs_of_its_trackers(monkeypatch, tmp_path):
+    """Videos are their numbers of frames, and stand-ins follow them."""
+    monkeypatch.setattr(head_stereo, "sequence", lambda key, kind, num_frames, seed, **more: num_frames)
+    for module in (head_stereo, deformation):
+        monkeypatch.setattr(module, "face_sequence", lambda key, poses, **more: len(poses))
+        monkeypatch.setattr(module, "follow", stand_ins)
+    speed_of = {"fps_1000_particles": Metric(50.0, "frames/s", "higher")}
+    monkeypatch.setattr(head_stereo, "speed_metrics", lambda first, counts, rounds: speed_of)
     metrics = head_stereo.run(quick=True, seed=0, out=tmp_path)
-    for kind in ("slow", "fast"):
-        for axis in AXES:
-            assert metrics[f"ratio_to_paper_adaptive_{kind}_{axis}"].value < 1
-            assert {f"worst_ratio_to_paper_adaptive_{kind}_{axis}", f"coverage_2sigma_{kind}_{axis}"} <= set(metrics)
-        assert metrics[f"lost_share_{kind}"].value == 0
-    names = {"recovery_frames", "occlusion_peak_pitch", "fps_64_particles", "fps_64_particles_paper"}
-    names |= {"still_std_x_paper_fixed5", "stage_share_particles", "deforming_ratio_to_rigid_rmse_pitch"}
-    assert names <= set(metrics)
+    value = {name: metric.value for name, metric in metrics.items()}
+    for kind, paper in head_stereo.PAPER_ADAPTIVE.items():
+        for axis, published in zip(AXES, paper, strict=True):
+            assert value[f"ratio_to_paper_adaptive_{kind}_{axis}"] == pytest.approx(0.5 / published)
+            assert value[f"worst_ratio_to_paper_adaptive_{kind}_{axis}_learning"] == pytest.approx(0.25 / published)
+            assert value[f"adaptive_to_fixed5_{kind}_{axis}_paper"] == pytest.approx(0.5)
+            assert value[f"coverage_2sigma_{kind}_{axis}"] == 1
+        assert value[f"lost_share_{kind}_paper_fixed1"] == 0
+    # Of 179 frames: one sign more than of the other.
+    assert value["still_std_x_paper_fixed5"] == pytest.approx(2.0 * np.sqrt(1 - 179.0**-2))
+    assert value["recovery_frames"] == 0
+    assert [value[f"{name}_learning"] for name in ("occlusion_peak_pitch", "dimming_peak_x")] == pytest.approx(
+        [0.25] * 2
+    )
+    assert value["after_occlusion_to_allowed"] == pytest.approx(0.5 / 1.5)
+    assert value["deforming_ratio_to_rigid_rmse_pitch"] == pytest.approx(0.5)
+    assert value["afterwards_ratio_to_rigid_rmse_x_paper"] == pytest.approx(0.75)
+    assert value["mild_deforming_rmse_yaw_rigid"] == pytest.approx(1.0)
+    # Frame 200 is the last of five blocks.
+    assert value["contribution_deformable"] == pytest.approx(0.4)
+    assert value["fps_1000_particles"] == 50
     assert (tmp_path / "deformation.png").stat().st_size > 10_000
+
+
+class Numbers(FaceSequence):
+    """A video whose images are the numbers of its frames."""
+
+    def __init__(self, num_frames):
+        for name, value in {"uv": np.zeros((num_frames, 2, K, 2)), "times": np.arange(num_frames) / 30}.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "rig", nominal())
+
+    def frames(self, start, stop):
+        return np.arange(start, stop)
+
+
+def test_a_run_begins_with_the_second_frame_and_has_every_other_one(monkeypatch):
+    handed = []
+
+    class Session:
+        def __init__(self, rig, options, points):
+            self.contribution = 0.0
+
+        def process(self, images, times):
+            handed.append(len(images))
+            self.contribution += len(images)
+            return HeadTrack(*(images[:, None] for _ in HeadTrack._fields))
+
+    monkeypatch.setattr(runs, "HeadSession", Session)
+    run = runs.follow(Numbers(91), {"usual": HeadOptions()})["usual"]
+    assert handed == [1, 40, 40, 10]
+    np.testing.assert_array_equal(run.track.score[:, 0], range(1, 91))
+    np.testing.assert_array_equal(run.contributions, [41, 81, 91])
+
+
+def test_a_frame_is_shared_out_among_its_stages(monkeypatch):
+    """Seconds of eight frames, and of one where they come alone."""
+    one = speed.Prepared(None, None, None, None, np.zeros((speed.BATCH, 1)), np.zeros(speed.BATCH))
+    seconds = {"_250_particles": 0.04, "_1000_particles": 0.08, "_1000_particles_paper": 0.16}
+    seconds |= {"_1000_particles_live": 0.012, "stage particles": 0.04, "stage learning": 0.016}
+    seconds |= {"stage particles_paper": 0.2}
+    monkeypatch.setattr(speed, "recording", lambda seed: None)
+    monkeypatch.setattr(speed, "prepared", lambda recorded, options: one)
+    monkeypatch.setattr(speed, "modern_stages", lambda one: dict.fromkeys(("particles", "learning")))
+    monkeypatch.setattr(speed, "paper_stages", lambda one: dict.fromkeys(("particles",)))
+    monkeypatch.setattr(speed, "interleaved", lambda calls, rounds: {name: seconds[name] for name in calls})
+    value = {name: metric.value for name, metric in speed.speed_metrics(0, (250, 1000), 3).items()}
+    assert value["frame_ms_250_particles"] == pytest.approx(5.0)
+    assert value["fps_1000_particles"] == pytest.approx(100.0)
+    assert value["frame_ms_1000_particles_live"] == pytest.approx(12.0)
+    assert [value[f"stage_share_{name}"] for name in ("particles", "learning", "rest")] == pytest.approx(
+        [0.5, 0.2, 0.3]
+    )
+    # Stages that take longer alone than together leave nothing.
+    assert value["stage_share_particles_paper"] == 1
+    assert value["stage_ms_rest_paper"] == 0

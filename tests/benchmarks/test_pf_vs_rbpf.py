@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.benchmarks.scenarios import _accuracy, _step_time, pf_vs_rbpf
 from jaxfilters.benchmarks.scenarios import _hand_filters as hand
-from jaxfilters.benchmarks.scenarios import _step_time, pf_vs_rbpf
 from jaxfilters.benchmarks.scenarios._accuracy import Run, append_csv, evaluate, p_value_better
 from jaxfilters.benchmarks.scenarios._step_time import StepTimes
 from jaxfilters.filter import init
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
-from jaxfilters.models.synthetic.hand import HandSequence
+from jaxfilters.models.synthetic.hand import HandSequence, kinect_v2
 
 
 def made_up(data, filter, seed, joint_mm):
@@ -30,6 +30,14 @@ def made_up_runs(errors):
         for seed, row in enumerate(errors)
         for name, error in zip(pair, row, strict=True)
     ]
+
+
+@pytest.fixture(scope="module")
+def still():
+    """The truth of a hand that holds still for 30 frames, without images."""
+    poses = jnp.tile(open_palm(jnp.array([0.0, 0.09, 0.7])), (30, 1))
+    joints = jax.jit(jax.vmap(lambda pose: forward_kinematics(pose, hand_geometry()).joints))(poses)
+    return HandSequence(poses, joints, jnp.zeros((30, 1, 1), jnp.uint16))
 
 
 def exact_signed_rank_p(difference):
@@ -82,13 +90,10 @@ def test_time_metrics_take_the_median_of_the_ratios():
 
 
 @pytest.mark.system
-def test_errors_are_those_of_a_known_shift():
-    poses = jnp.tile(open_palm(jnp.array([0.0, 0.09, 0.7])), (30, 1))
-    joints = jax.jit(jax.vmap(lambda pose: forward_kinematics(pose, hand_geometry()).joints))(poses)
-    truth = HandSequence(poses, joints, jnp.zeros((0, 1, 1), jnp.uint16))
+def test_errors_are_those_of_a_known_shift(still):
     shift = jnp.array([0.003, 0.0, 0.004]) * (jnp.arange(30) >= 10)[:, None]
-    found = hand.Estimate(poses.at[:, :3].add(shift), joints + shift[:, None], jnp.full(30, 7.0))
-    run = evaluate("A", "pf", 3, found, truth)
+    found = hand.Estimate(still.poses.at[:, :3].add(shift), still.joints + shift[:, None], jnp.full(30, 7.0))
+    run = evaluate("A", "pf", 3, found, still)
     # Positions near 0.7 m hold float32 to 3e-5 mm.
     assert run.joint_mm == pytest.approx(5, abs=1e-3)
     assert run.tip_mm == pytest.approx(5, abs=1e-3)
@@ -125,25 +130,58 @@ def test_the_wide_filter_spreads_like_the_rao_blackwellized_one():
     np.testing.assert_allclose(hand.spread_of_increments(setting)[0], dt * settled + q_n, rtol=1e-3)
 
 
+SHIFTS_MM = {"frozen": 50.0, "pf": 20.0, "rbpf": 10.0, "pf_paper_cost": 30.0, "rbpf_paper_cost": 45.0}
+
+
 @pytest.mark.system
-def test_a_tiny_comparison_has_every_metric_of_the_issue(tmp_path, monkeypatch):
-    """Times and errors from recordings of one length: the same compiled simulation."""
-    monkeypatch.setattr(_step_time._Tracker, "chunk", 4)
-    num_frames = 3 * _step_time._Tracker.chunk
-    monkeypatch.setattr(pf_vs_rbpf, "QUICK_COUNTS", (16,))
-    monkeypatch.setattr(pf_vs_rbpf, "QUICK_ROUNDS", 2)
-    monkeypatch.setattr(_step_time, "NUM_FRAMES", num_frames)
-    options = {"num_particles": 16, "num_seeds": 1, "num_frames": num_frames}
-    metrics = pf_vs_rbpf.run(quick=True, seed=0, out=tmp_path, **options)
-    names = {f"{name}_{data}" for name in ("joint_error_mm_pf", "joint_error_mm_rbpf") for data in "ab"}
-    names |= {"p_value_rbpf_better_b"}
-    names |= {f"{name}_paper_cost" for name in names} | {"joint_error_mm_frozen_a", "joint_error_mm_frozen_b"}
-    names |= {"frame_ms_pf_n16", "frame_ms_rbpf_n16", "time_ratio_rbpf_over_pf_n16"}
-    names |= {"frame_ms_rbpf_mesh_stride2_n16", "frame_ms_rbpf_guided_n16"}
-    assert names <= set(metrics)
-    assert all(np.isfinite(metric.value) for metric in metrics.values())
-    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 2 * 5
+def test_every_filter_is_judged_on_every_recording(still, tmp_path, monkeypatch):
+    """Stand-ins say of a hand that holds still that it is a known way aside."""
+
+    def stand_in(millimetres):
+        shift = jnp.array([1e-3 * millimetres, 0.0, 0.0])
+        found = hand.Estimate(still.poses.at[:, :3].add(shift), still.joints + shift, jnp.full(30, 7.0))
+        return lambda key, frames: found
+
+    chosen = {name: stand_in(millimetres) for name, millimetres in SHIFTS_MM.items()}
+    assert list(pf_vs_rbpf._filters(16, quick=True)["A"]) == list(chosen)
+    seconds = np.array([0.001, 0.002])
+    monkeypatch.setattr(pf_vs_rbpf, "_filters", lambda num_particles, quick: {"A": chosen, "B": chosen})
+    monkeypatch.setattr(pf_vs_rbpf, "measure", lambda *arguments: StepTimes(seconds, 2 * seconds, seconds))
+    variants = {"rbpf_mesh_stride2": 4 * seconds, "rbpf_guided": 8 * seconds}
+    monkeypatch.setattr(pf_vs_rbpf, "measure_variants", lambda *arguments: variants)
+    monkeypatch.setattr(_accuracy, "simulate_sequence", lambda key, data, num_frames: still)
+    metrics = pf_vs_rbpf.run(quick=True, seed=0, out=tmp_path, num_particles=16, num_seeds=2)
+    value = {name: metric.value for name, metric in metrics.items()}
+    for data, (name, millimetres) in itertools.product("ab", SHIFTS_MM.items()):
+        name, cost, _ = name.partition("_paper_cost")
+        assert value[f"joint_error_mm_{name}_{data}{cost}"] == pytest.approx(millimetres, abs=1e-3)
+    assert [value[f"lost_runs_rbpf_b{cost}"] for cost in ("", "_paper_cost")] == [0, 2]
+    # Two pairs that both fall the same way: one of four patterns of signs.
+    assert [value[f"p_value_rbpf_better_b{cost}"] for cost in ("", "_paper_cost")] == pytest.approx([0.25, 1.0])
+    assert value["time_ratio_rbpf_over_pf_n64"] == pytest.approx(2.0)
+    assert value["frame_ms_rbpf_mesh_stride2_n16"] == pytest.approx(6.0)
+    assert value["frame_ms_rbpf_guided_n16"] == pytest.approx(12.0)
+    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 2 * 2 * len(SHIFTS_MM)
     assert {path.name for path in tmp_path.glob("*.png")} == {
         "time_per_frame.png",
         *(f"data_{data}{cost}.png" for data in "ab" for cost in ("", "_paper_cost")),
     }
+
+
+def test_a_filter_that_is_timed_starts_anew_after_the_last_frame(monkeypatch):
+    monkeypatch.setattr(_step_time, "init", lambda filter, key: 0)
+    advance = lambda filter, key, view, state, frame: (state + 1, (state, int(frame[0, 0])))
+    monkeypatch.setattr(_step_time, "advance", advance)
+    setting = hand.improved()
+    view = hand.View(kinect_v2(), hand_geometry(), setting.segmented, setting.stride)
+    frames = jnp.zeros((3, 1, 1)) + jnp.arange(3)[:, None, None]
+    follower = _step_time._Follower(hand.particle_filter(setting, 16), jax.random.key(0), view, frames)
+    assert [follower() for _ in range(5)] == [(0, 0), (1, 1), (2, 2), (0, 0), (1, 1)]
+
+
+def test_rounds_that_are_timed_come_after_those_that_warm_up(monkeypatch):
+    monkeypatch.setattr(_step_time, "NUM_FRAMES", 2)
+    calls = []
+    seconds = _step_time.rounds_of({name: lambda name=name: calls.append(name) for name in "ab"}, 3)
+    assert "".join(calls) == "ab" + "ba" + "ab" + "ba" + "ab"
+    assert [len(times) for times in seconds.values()] == [3, 3]

@@ -118,6 +118,8 @@ SYSTEMS = [
 @pytest.mark.parametrize(("evidence", "theta"), SYSTEMS, ids=[system.__name__ for system, _ in SYSTEMS])
 def test_derivatives_are_finite_and_something(evidence, theta):
     theta = jax.tree.map(jnp.float32, theta)
-    value, slope = jax.value_and_grad(evidence)(theta)
+    value_and_slope = jax.value_and_grad(evidence)
+    # The limits of an articulated hand are checked outside of compiled functions.
+    value, slope = (value_and_slope if evidence is articulated else jax.jit(value_and_slope))(theta)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf) and leaf != 0 for leaf in jax.tree.leaves(slope)), slope

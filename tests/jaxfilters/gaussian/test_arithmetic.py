@@ -50,7 +50,7 @@ def textbook_update(mean, P, y, H, R):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("n", "m", "width"), [(3, 2, 3), (2, 4, 6), (10, 3, 12), (10, 9, 7)])
+@pytest.mark.parametrize(("n", "m", "width"), [(2, 4, 6), (10, 9, 7)])
 def test_prediction_and_update_agree_with_textbook(x64, rng, name, n, m, width):
     arithmetic = ARITHMETICS[name]
     mean, root = rng.normal(size=n), rng.normal(size=(n, width))
@@ -312,7 +312,7 @@ def test_more_noise_counts_as_noise(x64, rng, name):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("name", "size"), [("joseph", 3), ("joseph", 9), ("fast", 9), ("square_root", 9)])
+@pytest.mark.parametrize(("name", "size"), [("joseph", 3), ("fast", 9), ("square_root", 9)])
 def test_derivatives_agree_with_differences(x64, rng, name, size):
     arithmetic = ARITHMETICS[name]
     mean, root, root_R, y = (rng.normal(size=shape) for shape in (size, (size, size), (size, size), size))

@@ -74,15 +74,13 @@ def exact_log_evidence(ys):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(
-    ("guide", "scheme"), [(look, systematic), (look_past, systematic), (look_nowhere, systematic), (look, soft(0.6))]
-)
+@pytest.mark.parametrize(("guide", "scheme"), [(look_past, systematic), (look_nowhere, systematic), (look, soft(0.6))])
 def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
     # z-test at 4 sigma over 600 runs of the unbiased evidence: fails by chance once in 16000.
     ys = simulate()
     keys = jax.random.split(jax.random.key(1), 600)
     pf = guided_rao_blackwell(make_inner(scheme=scheme), guide)
-    estimates = jax.vmap(log_evidence, in_axes=(None, 0, None))(pf, keys, jnp.asarray(ys, dtype=float))
+    estimates = jax.jit(jax.vmap(log_evidence, in_axes=(None, 0, None)))(pf, keys, jnp.asarray(ys, dtype=float))
     ratio = np.exp(np.asarray(estimates, np.float64) - exact_log_evidence(ys))
     assert abs((ratio.mean() - 1) / (ratio.std(ddof=1) / np.sqrt(ratio.size))) < 4
 

@@ -311,7 +311,7 @@ def test_an_observed_linear_state_matches_the_joint_kalman_filter(builder):
     keys = jax.random.split(jax.random.key(3), 400)
     observations = jnp.asarray(ys, dtype=float)[:, None]
     ratio = np.exp(
-        np.asarray(jax.vmap(log_evidence, in_axes=(None, 0, None))(pf, keys, observations), np.float64) - total
+        np.asarray(jax.jit(jax.vmap(log_evidence, in_axes=(None, 0, None)))(pf, keys, observations), np.float64) - total
     )
     assert abs((ratio.mean() - 1) / (ratio.std(ddof=1) / np.sqrt(ratio.size))) < 4
 
@@ -324,10 +324,10 @@ def test_exactly_one_kind_of_observation():
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("proposal", [exact, plug_in, plug_in_corrected])
+@pytest.mark.parametrize("proposal", [exact, plug_in_corrected])
 def test_gradient_is_finite(proposal):
-    pf = make_filter(proposal, num_particles=50, ess_threshold=0.5)
-    gradient = jax.grad(lambda pf: log_evidence(pf, jax.random.key(0), jnp.asarray(simulate(20), dtype=float)))(pf)
+    pf, ys = make_filter(proposal, num_particles=50, ess_threshold=0.5), jnp.asarray(simulate(20), dtype=float)
+    gradient = jax.jit(jax.grad(lambda pf: log_evidence(pf, jax.random.key(0), ys)))(pf)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
     assert gradient.params.linear_prior.covariance[0, 0] != 0
 

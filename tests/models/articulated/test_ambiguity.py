@@ -24,6 +24,9 @@ from jaxfilters.models.camera import Pinhole
 
 pytestmark = pytest.mark.usefixtures("x64")
 FACING = (0.5, -0.5, 0.5, -0.5)
+points = jax.jit(lambda hand, x: hand.points(x))
+observed = jax.jit(lambda hand, x: hand.observe(x))
+mirror = jax.jit(depth_mirror)
 LINKS = [(finger, link) for finger in range(2) for link in range(3)]
 
 
@@ -37,19 +40,19 @@ def hand_state(angles_deg, q=FACING, position=(0.0, 0.0), layout=None):
 
 def link_vectors(hand, x):
     """Unit vectors of the links in the camera frame."""
-    links = np.diff(np.asarray(hand.points(x)), axis=1)
+    links = np.diff(np.asarray(points(hand, x)), axis=1)
     return links / np.linalg.norm(links, axis=2, keepdims=True)
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("pivot_at_wrist", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_mirror_flips_the_depth_keeps_the_length_and_moves_the_tip_as_stated(seed, pivot_at_wrist, random_state):
     hand = articulated_hand(Layout(2), **({"pivot": pivot_wrist} if pivot_at_wrist else {}))
     x = jnp.asarray(random_state(np.random.default_rng(seed), hand.layout))
     before = link_vectors(hand, x)
     for finger, link in LINKS:
-        mirrored = depth_mirror(x, hand, finger, link)
+        mirrored = mirror(x, hand, finger, link)
         u, v = before[finger, link], link_vectors(hand, mirrored.x)[finger, link]
         assert v[2] == pytest.approx(-u[2], abs=1e-12)
         assert np.hypot(*v[:2]) == pytest.approx(np.hypot(*u[:2]), abs=1e-12)
@@ -82,7 +85,7 @@ def test_palm_to_the_camera_without_abduction_has_the_same_image():
     mirrored = depth_mirror(x, hand, 0, 0)
     assert float(mirrored.amplitude) == pytest.approx(1, abs=1e-12)
     assert float(mirrored.x[7]) == pytest.approx(-np.deg2rad(30), abs=1e-12)
-    np.testing.assert_allclose(hand.observe(mirrored.x), hand.observe(x), atol=1e-10)
+    np.testing.assert_allclose(observed(hand, mirrored.x), observed(hand, x), atol=1e-10)
 
 
 @pytest.mark.system
@@ -95,7 +98,7 @@ def test_links_beyond_keep_their_direction_if_asked():
         expected = before.copy()
         expected[link, 2] *= -1
         np.testing.assert_allclose(link_vectors(hand, alone.x)[1], expected, atol=1e-12)
-        np.testing.assert_allclose(hand.observe(alone.x), hand.observe(x), atol=1e-10)
+        np.testing.assert_allclose(observed(hand, alone.x), observed(hand, x), atol=1e-10)
         np.testing.assert_array_equal(alone.change, along.change)
         angles = np.asarray(alone.x - along.x)
         changed = [hand.layout.names[i] for i in np.flatnonzero(angles)]
@@ -152,9 +155,9 @@ def test_linearisation_points_lie_on_both_sides_of_the_middle(theta, sigma_deg, 
     hand = articulated_hand(Layout(2))
     x = hand_state([0, theta, 0, 0, 0, 10, 10, 10])
     sigma = jnp.full(hand.layout.size, np.deg2rad(sigma_deg))
-    points = np.asarray(separated_points(x, sigma, hand, 0, 0))
-    np.testing.assert_allclose(np.rad2deg(points[:, 7]), [np.sign(theta) * half, -np.sign(theta) * half], atol=1e-10)
-    np.testing.assert_array_equal(np.delete(points, 7, axis=1), np.stack([np.delete(x, 7)] * 2))
+    found = np.asarray(separated_points(x, sigma, hand, 0, 0))
+    np.testing.assert_allclose(np.rad2deg(found[:, 7]), [np.sign(theta) * half, -np.sign(theta) * half], atol=1e-10)
+    np.testing.assert_array_equal(np.delete(found, 7, axis=1), np.stack([np.delete(x, 7)] * 2))
     alone = np.asarray(separated_points(x, sigma, hand, 0, 0, turn=turn_link_alone))
     np.testing.assert_allclose(alone[:, 7] + alone[:, 8], np.full(2, np.deg2rad(theta)), atol=1e-12)
 
@@ -162,23 +165,23 @@ def test_linearisation_points_lie_on_both_sides_of_the_middle(theta, sigma_deg, 
 def test_linearisation_points_are_apart_at_the_critical_angle_itself():
     hand = articulated_hand(Layout(2))
     x = hand_state([0, 0, 0, 0, 0, 10, 10, 10])
-    points = np.asarray(separated_points(x, jnp.full(hand.layout.size, 0.2), hand, 0, 0))
-    np.testing.assert_allclose(np.sort(points[:, 7]), [-0.2, 0.2], atol=1e-12)
+    found = np.asarray(separated_points(x, jnp.full(hand.layout.size, 0.2), hand, 0, 0))
+    np.testing.assert_allclose(np.sort(found[:, 7]), [-0.2, 0.2], atol=1e-12)
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("pivot_at_wrist", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_reversal_of_the_whole_hand_leaves_all_features_unchanged(seed, pivot_at_wrist, random_state):
     hand = articulated_hand(Layout(2), **({"pivot": pivot_wrist} if pivot_at_wrist else {}))
     x = jnp.asarray(random_state(np.random.default_rng(seed), hand.layout))
     reversed_x = reverse_depth(x, hand)
-    np.testing.assert_allclose(hand.observe(reversed_x), hand.observe(x), atol=1e-10)
+    np.testing.assert_allclose(observed(hand, reversed_x), observed(hand, x), atol=1e-10)
     # The points are mirrored in depth, and stay so as the hand moves on.
-    mirror = np.array([1, 1, -1])
-    np.testing.assert_allclose(hand.points(reversed_x), hand.points(x) * mirror, atol=1e-10)
+    flipped = np.array([1, 1, -1])
+    np.testing.assert_allclose(points(hand, reversed_x), points(hand, x) * flipped, atol=1e-10)
     np.testing.assert_allclose(
-        hand.points(hand.transition(reversed_x)), hand.points(hand.transition(x)) * mirror, atol=1e-10
+        points(hand, hand.transition(reversed_x)), points(hand, hand.transition(x)) * flipped, atol=1e-10
     )
     J, M = np.diag([1, 1, -1]), np.diag([1, -1, 1])
     R, reversed_R = (Rotation.from_quat(np.asarray(s)[2:6], scalar_first=True).as_matrix() for s in (x, reversed_x))
@@ -202,9 +205,11 @@ def test_reversal_in_perspective_is_exact_in_depth_along_the_line_of_sight():
     x = hand_state([-5, 30, 20, 10, 5, 25, 25, 20], position=(0.3, -0.2, 0.9), layout=layout)
     x = x.at[layout.static].multiply(1e-3)
     sight = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
-    offset = np.asarray(hand.points(x)) - [0.3, -0.2, 0.9]
+    offset = np.asarray(points(hand, x)) - [0.3, -0.2, 0.9]
     mirrored = offset - 2 * (offset @ sight)[..., None] * sight
-    np.testing.assert_allclose(np.asarray(hand.points(reverse_depth(x, hand))) - [0.3, -0.2, 0.9], mirrored, atol=1e-12)
+    np.testing.assert_allclose(
+        np.asarray(points(hand, reverse_depth(x, hand))) - [0.3, -0.2, 0.9], mirrored, atol=1e-12
+    )
 
 
 def test_mirror_in_perspective_flips_the_part_along_the_line_of_sight():
@@ -214,10 +219,10 @@ def test_mirror_in_perspective_flips_the_part_along_the_line_of_sight():
     x = hand_state([-5, 30, 20, 10, 5, 25, 25, 20], position=(0.3, -0.2, 0.9), layout=layout)
     x = x.at[layout.static].multiply(1e-3)
     for finger, link in LINKS:
-        start = np.asarray(hand.points(x))[finger, link]
+        start = np.asarray(points(hand, x))[finger, link]
         sight = start / np.linalg.norm(start)
         u = link_vectors(hand, x)[finger, link]
-        v = link_vectors(hand, depth_mirror(x, hand, finger, link).x)[finger, link]
+        v = link_vectors(hand, mirror(x, hand, finger, link).x)[finger, link]
         assert v @ sight == pytest.approx(-u @ sight, abs=1e-12)
 
 

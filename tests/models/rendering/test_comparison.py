@@ -137,8 +137,6 @@ def test_forward_and_batched_derivatives(x64, camera, random_capsules):
     mine = jax.tree.map(lambda leaf: leaf[..., 1], together)
     reverse = sum(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), mine, direction)))
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    alone = jax.jit(jax.grad(loss))(many[1])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), mine, alone)
 
 
 def test_an_image_is_no_variable(camera, random_capsules):
@@ -184,8 +182,10 @@ one = lambda c, y: compare_capsules(camera, c, y, 0.08)
 @jax.jit
 def sequence(capsules, images):
     def step(carry, image):
-        terms, gradient = (jax.vmap(f, in_axes=-1)(carry) for f in (
-            lambda c: one(c, image), jax.grad(lambda c: one(c, image).absolute_sum)))
+        def sum_beside_terms(c):
+            terms = one(c, image)
+            return terms.absolute_sum, terms
+        gradient, terms = jax.vmap(jax.grad(sum_beside_terms, has_aux=True), in_axes=-1)(carry)
         return jax.tree.map(lambda leaf: leaf + 1e-3, carry), (terms, gradient)
     return jax.lax.scan(step, capsules, images)[1]
 

@@ -209,13 +209,3 @@ def test_wrong_arguments_exit_with_two(arguments, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         run(*arguments.split())
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.system
-def test_the_real_tracker_finds_the_lengths_of_the_synthetic_hand(tmp_path):
-    assert run("--out", tmp_path / "out", "--no-video") == 0
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["status"]["tracking"] == report["frames"] == 55
-    # The paper's acceptance, for the third link of the first finger: 1.5 pixels from starts that are 10 off.
-    assert report["mean_length_error_px"] < 1.5
-    assert report["mean_angle_error_deg"] < 10

@@ -85,7 +85,6 @@ def exact_evidence(theta, y, normals, points=24):
 
 
 NORMALS = {
-    "1-D": np.eye(1),
     "3-D": np.eye(3),
     "2-D oblique": np.array([[1.0, 0.5], [-0.3, 1.0]]),
 }
@@ -126,10 +125,9 @@ def test_evidence_and_gradients_of_narrow_intervals_in_single_precision(x64, nam
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
-def test_wide_intervals_in_single_and_in_double_precision_agree(x64, root):
-    normals = jnp.eye(3)
-    filtered = jax.jit(jax.value_and_grad(partial(filtered_evidence, normals=normals, root=root)))
+def test_wide_intervals_in_single_and_in_double_precision_agree(x64):
+    normals = jnp.asarray(NORMALS["3-D"], jnp.float32)
+    filtered = jax.jit(jax.value_and_grad(partial(filtered_evidence, normals=normals, root=False)))
     for width in (3.0, 1.0, 0.3):
         theta, y = problem(3, width), single(READINGS)
         (value, gradients), (expected, expected_gradients) = filtered(theta, y), filtered(double(theta), double(y))

@@ -92,9 +92,9 @@ def prior_and_size(face, person):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("misplaced_mm", [0.0, 1.0])
-def test_what_is_kept_leads_to_the_same_person(face68, rig, misplaced_mm):
+def test_what_is_kept_leads_to_the_same_person(face68, rig):
     """The least of the energy of the prior and of what is kept, which is all that is left of the detections."""
+    misplaced_mm = 1.0
     points, _ = somebody(face68, rig, 3)
     _, (start, past) = begun(face68, rig, points, misplaced_mm)
     ten, person = tracked(face68), start.bundle.person
@@ -111,7 +111,7 @@ def test_what_is_kept_leads_to_the_same_person(face68, rig, misplaced_mm):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("misplaced_mm", [0.0, 1.5])
+@pytest.mark.parametrize("misplaced_mm", [1.5])
 def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(x64, face68, rig, misplaced_mm):
     """With a detector's part of the offset of every landmark as parameters of their own."""
     points, truth = somebody(face68, rig, 1)
