@@ -70,12 +70,12 @@ def rows(
 def used_rows(
     deviation: Float[Array, " m"],
     read: Bool[Array, " m"],
-    seen: Bool[Array, " m"],
+    usable: Bool[Array, " m"],
     mask: Bool[Array, " m"] | None,
 ) -> Rows:
-    """The rows of a measurement, of which `read` are finite and not masked, and `seen` can be used."""
-    invalid = ~seen if mask is None else mask & ~seen
-    return Rows(deviation, seen, jnp.sum(invalid, dtype=jnp.int32), jnp.any(read & ~seen))
+    """The rows of a measurement, of which `read` are finite and not masked, and `usable` can be used."""
+    invalid = ~usable if mask is None else mask & ~usable
+    return Rows(deviation, usable, jnp.sum(invalid, dtype=jnp.int32), jnp.any(read & ~usable))
 
 
 def observed(mask: Bool[Array, " m"] | None, rows: Float[Array, "m *k"] | None) -> Any:

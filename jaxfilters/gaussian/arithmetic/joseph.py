@@ -33,7 +33,7 @@ def update(
 def condition(
     P: Float[Array, "n n"], H: Float[Array, "m n"], R: Float[Array, "m m"], innovation: Float[Array, " m"]
 ) -> covariance.Update:
-    """The update with every component seen, of which the covariance depends on no reading: shared by an ensemble.
+    """The update with every component observed, of which the covariance depends on no reading: shared by an ensemble.
 
     NaN in the innovation becomes NaN in the shift and in the log density.
     """

@@ -107,18 +107,18 @@ def noise_root(
     return linalg.tria(info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root])))
 
 
-def _conditioned(seen, noise, state):
+def _conditioned(measured, noise, state):
     """Lower root of the innovation covariance, cross-covariance over it, root of the posterior.
 
-    `seen` and `state` are the measurement's and the state's share in the same random numbers. A row of the measurement
+    `measured` and `state` are the measurement's and the state's share in the same random numbers. A row of the measurement
     that depends on those before it gets zeros in the innovation's root.
     """
-    m, n = seen.shape[0], state.shape[0]
+    m, n = measured.shape[0], state.shape[0]
     if noise.shape[1] != m:
         noise = linalg.tria(noise)
     state = jnp.pad(state, ((0, 0), (0, max(0, n - state.shape[1]))))
-    seen = jnp.pad(seen, ((0, 0), (0, state.shape[1] - seen.shape[1])))
-    V, G = jnp.hstack([seen, noise]), jnp.pad(state, ((0, 0), (0, m)))
+    measured = jnp.pad(measured, ((0, 0), (0, state.shape[1] - measured.shape[1])))
+    V, G = jnp.hstack([measured, noise]), jnp.pad(state, ((0, 0), (0, m)))
 
     def sound(_V, _G, root, cross, posterior):
         return root, cross, posterior
