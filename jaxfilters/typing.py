@@ -59,17 +59,18 @@ class SamplePrior(Protocol):
 class SampleTransition(Protocol):
     r"""Draw $x_t \sim p(x_t \mid x_{t-1}, u_t)$ from `randomness`.
 
-    `randomness` is what the filter's `noise` argument draws for one particle: by default a random key.
+    Called as `(randomness, x)` or `(randomness, x, inputs)`; `randomness` is what the `noise` argument of the filter
+    draws for one particle: by default a random key.
     """
 
-    def __call__(self, randomness: Any, x: PyTree, inputs: PyTree, /) -> PyTree: ...
+    def __call__(self, *arguments: Any, **options: Any) -> PyTree: ...
 
 
 @runtime_checkable
 class LogLikelihood(Protocol):
-    r"""Evaluate $\log p(y_t \mid x_t, u_t)$; `-inf` means impossible."""
+    r"""Evaluate $\log p(y_t \mid x_t, u_t)$, called as `(x, y)` or `(x, y, inputs)`; `-inf` means impossible."""
 
-    def __call__(self, x: PyTree, y: PyTree, inputs: PyTree, /) -> Float[Array, ""]: ...
+    def __call__(self, *arguments: Any, **options: Any) -> Float[Array, ""]: ...
 
 
 @runtime_checkable

@@ -179,10 +179,10 @@ def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
         hand, limits = hand_of(chosen, detections)
         frames = _frames(detections)
         tracker = tracker_of(hand, limits, None, ArticulatedConfig(mode=mode, hypotheses=HYPOTHESES))
-        state = tracker.start(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
-        jax.block_until_ready(tracker.advance(state, frames, times))
+        state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
+        jax.block_until_ready(tracker.step(state, frames, times))
         start = time.perf_counter()
-        _, track = jax.block_until_ready(tracker.advance(state, frames, times))
+        _, track = jax.block_until_ready(tracker.step(state, frames, times))
         seconds = time.perf_counter() - start
         points = jax.lax.map(hand.marker_points, jnp.asarray(track.mean))
         return Lifted(1e3 * np.asarray(points), seconds, float(np.mean(np.asarray(track.status) == TRACKING)))

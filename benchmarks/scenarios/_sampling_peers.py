@@ -127,11 +127,11 @@ def tempered_of_blackjax(sizes: Sizes) -> Callable[[int], float]:
     )  # fmt: skip
 
     @jax.jit
-    def run(key: AnyKey) -> Array:
+    def run(key: AnyKey) -> Any:
         start_key, key = jax.random.split(key)
         start = sampler.init(jax.random.normal(start_key, (sizes.num_tempered, 3)))
 
-        def advance(carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        def advance(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
             number, state, total = carry
             state, info = sampler.step(jax.random.fold_in(key, number), state)
             return number + 1, state, total + info.log_likelihood_increment

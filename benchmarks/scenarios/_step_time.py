@@ -96,7 +96,7 @@ class _Tracker:
     def __init__(self, num_particles: int, key: Array, frames: np.ndarray):
         config = hand_depth.HandDepthConfig(num_particles=num_particles, scale=1.0)
         self._tracker = hand_depth.build(kinect_v2(), config)
-        self._start = self._state = self._tracker.start(key, frames[0])
+        self._start = self._state = self._tracker.init(key, frames[0])
         times = FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32)
         self._chunks = itertools.cycle(range(0, len(frames), self.chunk))
         self._frames, self._times = frames, times
@@ -105,7 +105,7 @@ class _Tracker:
         first = next(self._chunks)
         part = slice(first, first + self.chunk)
         state = self._state if first else self._start
-        self._state, track = self._tracker.advance(state, self._frames[part], self._times[part])
+        self._state, track = self._tracker.step(state, self._frames[part], self._times[part])
         return track
 
 

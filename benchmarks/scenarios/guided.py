@@ -97,14 +97,18 @@ def estimate(key: AnyKey, filter: Filter, ys: Float[Array, "t 1"]) -> Array:
 
 def filters(num_particles: int) -> dict[str, Filter]:
     """This library's filters by name; the proposal is a pair of functions, as that of the peers."""
-    model = (
+    model: Any = (
         jaxfilters.priors.from_noise(lambda noise: STATIONARY * noise, jaxfilters.StandardNormal(1)),
         lambda noise, x: RHO * x + STD_X * noise,
         log_likelihood,
     )
-    options = {"num_particles": num_particles, "noise": jaxfilters.StandardNormal(1), "ess_threshold": 1.0}
+    options: dict[str, Any] = {
+        "num_particles": num_particles,
+        "noise": jaxfilters.StandardNormal(1),
+        "ess_threshold": 1.0,
+    }
     proposal = (lambda noise, x, y: center(x, y) + SPREAD * noise, lambda new, x, y: log_proposal(new, x, y))
-    guide = {"log_transition": log_transition, "proposal": proposal}
+    guide: dict[str, Any] = {"log_transition": log_transition, "proposal": proposal}
     return {
         "bootstrap": jaxfilters.bootstrap(*model, **options),
         "guided": jaxfilters.guided(*model, **guide, **options),
@@ -190,8 +194,8 @@ def _smcx(num_particles: int, ys: Float[Array, "t 1"], *, guided: bool) -> OfKey
             return library.guided_filter(key, *arguments, **options).marginal_loglik
         move = lambda key, x: RHO * x + STD_X * jax.random.normal(key, x.shape)
         first_stage = lambda y, x: log_first_stage(x, y)
-        arguments = (start, move, likelihood, first_stage, ys, num_particles)
-        return library.auxiliary_filter(key, *arguments, **options).marginal_loglik
+        others = (start, move, likelihood, first_stage, ys, num_particles)
+        return library.auxiliary_filter(key, *others, **options).marginal_loglik
 
     return of
 

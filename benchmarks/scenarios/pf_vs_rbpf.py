@@ -125,9 +125,9 @@ def _guided(name: str, num_particles: int) -> Filtering:
     )
 
     def filtering(key: AnyKey, frames: jax.Array) -> hand.Estimate:
-        state = tracker.start(key, np.asarray(frames[0]))
-        _, found = tracker.advance(state, np.asarray(frames), FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32))
-        return hand.Estimate(*map(jax.numpy.asarray, (found.pose, found.joints, found.ess)))
+        state = tracker.init(key, np.asarray(frames[0]))
+        _, found = tracker.step(state, np.asarray(frames), FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32))
+        return hand.Estimate(*map(jax.numpy.asarray, (found.pose, found.joints, found.effective_sample_size)))
 
     return filtering
 

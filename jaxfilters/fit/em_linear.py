@@ -36,7 +36,8 @@ def maximized(filter: Filter, found: Moments, free: tuple[str, ...], is_partial:
         free: Names of `LINEAR`.
         is_partial: Whether some frames were read in part.
     """
-    model, change = filter.params, {}
+    model = filter.params
+    change: dict[str, Any] = {}
     if {"F", "Q", "b"} & set(free):
         pairs, b = _transitions(found), _vectors(model.b, found)
         F, b = regression(pairs, model.F, b, ("F" in free, "b" in free))
@@ -95,7 +96,7 @@ def _transitions(found: Moments) -> Pairs:
 def _observations(model: Kalman, found: Moments, is_partial: bool) -> Pairs:
     y, read, x, P = (_flat(each) for each in (found.y, found.read, found.mean[:, 1:], found.covariance[:, 1:]))
     weight = jnp.any(read, axis=1).astype(x.dtype)
-    covariance, (k, n) = jnp.tensordot(weight, P, axes=1), model.H.shape
+    covariance, (k, n) = jnp.tensordot(weight, P, axes=1), jnp.shape(_as_array(model.H))
     if not is_partial:
         return Pairs(weight, x, y, covariance, jnp.zeros((k, n), x.dtype), jnp.zeros((k, k), x.dtype))
     full = _imputed(model, found, y, read)
@@ -106,15 +107,21 @@ def _observations(model: Kalman, found: Moments, is_partial: bool) -> Pairs:
 
 
 def _imputed(model: Kalman, found: Moments, y: Array, read: Array) -> Imputed:
-    R, d = as_covariance(model.prior, model.R), _vectors(model.d, found)
+    R, d = as_covariance(model.prior, _as_array(model.R)), _vectors(model.d, found)
     d = jnp.broadcast_to(jnp.zeros((), y.dtype) if d is None else d, y.shape)
 
     def one(y: Array, read: Array, d: Array) -> Imputed:
         A, C = imputation(R, read)
         rest = jnp.eye(len(y), dtype=y.dtype) - A
-        return Imputed(factor.apply(A, y) + factor.apply(rest, d), linalg.matmul(rest, model.H), C)
+        return Imputed(factor.apply(A, y) + factor.apply(rest, d), linalg.matmul(rest, _as_array(model.H)), C)
 
     return jax.vmap(one)(y, read, d)
+
+
+def _as_array(matrix: Any) -> Array:
+    """A matrix of the model, which is not a function of the inputs here: `em` refuses those to be estimated."""
+    assert not callable(matrix)
+    return matrix
 
 
 def _flat(array: Array) -> Array:

@@ -42,8 +42,9 @@ def moments(
 
     mean, covariance, cross, log_evidence = jax.vmap(one, in_axes=-1)(y, inputs)
     read = jnp.isfinite(y)
-    first = lambda tree: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), tree)
-    return Moments(mean, covariance, cross, *first((jnp.where(read, y, 0.0), read, inputs, inside)), log_evidence.sum())
+    data = (jnp.where(read, y, 0.0), read, inputs, inside)
+    y, read, inputs, inside = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), data)
+    return Moments(mean, covariance, cross, y, read, inputs, inside, log_evidence.sum())
 
 
 class Imputed(NamedTuple):

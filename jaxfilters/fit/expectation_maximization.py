@@ -188,7 +188,9 @@ def _data(observations: Any, inputs: PyTree, lengths: Any, mask: Any) -> tuple[A
         observed = inside & mask
     y = jnp.where(observed[:, None] & jnp.isfinite(observations), observations, jnp.nan)
     known = checks.concrete(y)
-    some, every = (None, None) if known is None else (np.isfinite(known).any(1), np.isfinite(known).all(1))
-    if known is not None and not some.any():
+    if known is None:
+        return y, inside, True
+    some, every = np.isfinite(known).any(1), np.isfinite(known).all(1)
+    if not some.any():
         raise ValueError("observations must hold at least one number that is not masked; got none.")
-    return y, inside, known is None or bool((some != every).any())
+    return y, inside, bool((some != every).any())

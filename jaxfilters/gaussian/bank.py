@@ -82,7 +82,7 @@ Bank = Separate | Stacked
 
 def bank_of(filters: Sequence[Filter]) -> Bank:
     """The filters as one batch where they differ in numbers only."""
-    structures = [jax.tree.structure(filter) for filter in filters]
+    structures: list[Any] = [jax.tree.structure(filter) for filter in filters]
     leaves = [jax.tree.leaves(filter) for filter in filters]
     kinds = [[(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in of] for of in leaves]
     alike = all(structure == structures[0] for structure in structures) and all(kind == kinds[0] for kind in kinds)
@@ -128,7 +128,7 @@ def check_filters(filters: Any, *, one_size: str | None) -> list[Gaussian | Gaus
     if one_size is not None and len(set(sizes)) > 1:
         raise ValueError(f"filters must have states of one size{one_size}; got the sizes {', '.join(map(str, sizes))}.")
     spaces = [manifold_of(filter) for filter in filters]
-    structures = [jax.tree.structure(euclidean if space.flat else space) for space in spaces]
+    structures: list[Any] = [jax.tree.structure(euclidean if space.flat else space) for space in spaces]
     if any(structure != structures[0] for structure in structures):
         raise ValueError("filters must all have states on one manifold; got different ones.")
     return states

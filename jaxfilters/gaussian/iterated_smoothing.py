@@ -144,7 +144,8 @@ def _iterated(
 
     first = _with_first(model, start, inputs)
     final, (*course, log_evidence) = jax.lax.scan(improve, first, jnp.arange(iterations + 1))
-    info = IterationInfo(*(each[:-1] for each in course), log_evidence[-1])
+    cost, reached, step = (each[:-1] for each in course)
+    info = IterationInfo(cost, reached, step, log_evidence[-1])
     return jax.tree.map(lambda leaf: leaf[1:], final), info
 
 
@@ -154,6 +155,7 @@ def _with_first(model: ExtendedKalman, start: Belief, inputs: PyTree) -> Belief:
     prior = model.prior
     if isinstance(prior, GaussianRoot):
         prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
+        assert isinstance(start, GaussianRoot)
         start = GaussianRoot(start.mean, jax.vmap(linalg.tria)(start.root))
     origin, gain, rest = reverse_transition(model, prior, inputs)
     before = replace(prior, mean=prior.mean + rest.mean + factor.apply(gain, first.mean - origin))

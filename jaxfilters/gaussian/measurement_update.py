@@ -163,6 +163,7 @@ def laplace_log_evidence(
     root = measurement.arithmetic.noise_root(measurement.noise, counts, linear.residual_root)
     diagonals = (jnp.where(counts, jnp.abs(factor.diagonal(part)), 1.0) for part in (root, report.innovation_root))
     log_noise, log_innovation = (jnp.sum(jnp.log(diagonal)) for diagonal in diagonals)
+    assert measurement.log_probability is not None
     at_mean = measurement.log_probability(measurement.start + offset)
     value = at_mean - 0.5 * jnp.sum(dual * offset) + log_noise - log_innovation
     return jnp.where(report.log_evidence == -jnp.inf, -jnp.inf, value)

@@ -75,6 +75,7 @@ def _two_filter(model: Kalman | ExtendedKalman, beliefs: Belief, observations: P
     prior = model.prior
     if isinstance(prior, GaussianRoot):
         prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
+        assert isinstance(beliefs, GaussianRoot)
         beliefs = GaussianRoot(beliefs.mean, jax.vmap(linalg.tria)(beliefs.root))
     trajectory = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), prior, beliefs)
     affine = affine_model(model, trajectory, observations, inputs, mask)

@@ -71,7 +71,7 @@ class EnsembleProposal(Protocol):
 class FirstStage(Protocol):
     r"""Evaluate $\log \eta_t(x_{t-1}, y_t)$, an approximation of $\log p(y_t \mid x_{t-1})$ up to a constant."""
 
-    def __call__(self, x: PyTree, y: PyTree, inputs: PyTree, /) -> Float[Array, ""]: ...
+    def __call__(self, *arguments: Any, **options: Any) -> Float[Array, ""]: ...
 
 
 class Proposal(NamedTuple):

@@ -112,7 +112,9 @@ def paris(
         raise ValueError("inner must be made by bootstrap with a scheme of jf.resampling, which chooses ancestors.")
     increment = taking_inputs("increment", increment, "x", "x_next")
     density = taking_inputs("log_transition", log_transition, "x_next", "x")
-    params = Paris(inner, as_pytree(initial), increment, density, log_bound, num_draws, max_candidates)
+    params = Paris(
+        inner, as_pytree(initial), increment, density, jnp.asarray(log_bound, float), num_draws, max_candidates
+    )
     return Filter(params, _init, _predict, _update)
 
 

@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int32, PyTree
+from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
@@ -31,7 +31,7 @@ from jaxfilters.typing import AnyKey, LogLikelihood, ResamplingScheme, taking_in
 class EnsembleLogLikelihood(Protocol):
     r"""Evaluate $\log p(y_t \mid x_t)$ of all particles at once: `(d, n)` and an observation to `(n,)`."""
 
-    def __call__(self, particles: Float[Array, "d n"], y: PyTree, inputs: PyTree, /) -> Float[Array, " n"]: ...
+    def __call__(self, *arguments: Any, **options: Any) -> Float[Array, " n"]: ...
 
 
 def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood:

@@ -287,8 +287,8 @@ def _kept(
         rest = num - jnp.sum(kept, dtype=relative.dtype)
         return c, rest, jnp.sum(jnp.where(kept, 0.0, relative)), rest < places
 
-    start = jnp.where(few, jnp.inf, 0.0), jnp.where(few, 0.0, num), jnp.where(few, 0.0, jnp.sum(relative))
-    start = tuple(value.astype(relative.dtype) for value in start)
+    values = jnp.where(few, jnp.inf, 0.0), jnp.where(few, 0.0, num), jnp.where(few, 0.0, jnp.sum(relative))
+    start = tuple(value.astype(relative.dtype) for value in values)
     c, places, small_sum, _ = jax.lax.while_loop(unsolved, newton, (*start, ~few))
     return positive & (relative * c >= 1), jnp.where(small_sum > 0, places, 0.0), small_sum
 

@@ -33,7 +33,7 @@ class History(NamedTuple):
 class LogTransition(Protocol):
     r"""Evaluate $\log p(x_t \mid x_{t-1}, u_t)$ up to a constant; `-inf` means impossible."""
 
-    def __call__(self, x_next: PyTree, x: PyTree, inputs: PyTree, /) -> Float[Array, ""]: ...
+    def __call__(self, *arguments: Any, **options: Any) -> Float[Array, ""]: ...
 
 
 def keep_history(state: PyTree, info: PyTree) -> History:

@@ -202,11 +202,12 @@ def _chosen(model: Switching, key: AnyKey, log_weights: Float[Array, " n"]) -> t
     """Indices of the sequences that are continued, and their log weights."""
     num = model.num_particles
     if model.scheme is optimal:
-        return optimal(key, log_weights, num)
+        survivors = optimal(key, log_weights, num)
+        return survivors.indices, survivors.log_weights
     scheme_key, mode_key = jax.random.split(key)
     normalized, log_sum = weights.normalize(log_weights)
     table = jax.lax.stop_gradient(normalized).reshape(model.bank.count, num)
-    ancestors = model.scheme(scheme_key, jax.nn.logsumexp(table, axis=0))
+    ancestors: Array = model.scheme(scheme_key, jax.nn.logsumexp(table, axis=0))
     checks.check_ancestors(ancestors, num)
     mode = jax.random.categorical(mode_key, table[:, ancestors], axis=0)
     chosen = (mode * num + ancestors).astype(jnp.int32)

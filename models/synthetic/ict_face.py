@@ -90,9 +90,16 @@ def ict_model(points: dict[str, np.ndarray], surface: dict[str, np.ndarray]) -> 
             raise ValueError(f"{name} must name {shape} of {num_vertices} vertices by index; got {indices.shape}.")
     # The files wind their quads counter-clockwise from outside; turning y and z over keeps that.
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    scaled = (jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float) for name in ("neutral", *shapes))
+    neutral, identity, expression = (
+        jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float) for name in ("neutral", *shapes)
+    )
     return IctModel(
-        *scaled, jnp.asarray(landmarks, jnp.int32), jnp.asarray(faces, jnp.int32), tuple(str(name) for name in names)
+        neutral,
+        identity,
+        expression,
+        jnp.asarray(landmarks, jnp.int32),
+        jnp.asarray(faces, jnp.int32),
+        tuple(str(name) for name in names),
     )
 
 

@@ -171,7 +171,8 @@ def track(sequence: FeatureSequence, config: ArticulatedConfig | None = None) ->
         ValueError: as for `build`.
     """
     config = config or ArticulatedConfig()
-    return track_frames(build(sequence, config), jax.random.key(config.seed), sequence, sequence.times_s)
+    frames = (sequence[i] for i in range(len(sequence)))
+    return track_frames(build(sequence, config), jax.random.key(config.seed), frames, sequence.times_s)
 
 
 def tracker_of(hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig) -> Tracker:

@@ -110,8 +110,8 @@ def noise_root(
 def _conditioned(measured, noise, state):
     """Lower root of the innovation covariance, cross-covariance over it, root of the posterior.
 
-    `measured` and `state` are the measurement's and the state's share in the same random numbers. A row of the measurement
-    that depends on those before it gets zeros in the innovation's root.
+    `measured` and `state` are the measurement's and the state's share in the same random numbers. A row of the
+    measurement that depends on those before it gets zeros in the innovation's root.
     """
     m, n = measured.shape[0], state.shape[0]
     if noise.shape[1] != m:

@@ -5,6 +5,7 @@ from operator import attrgetter
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Array
 
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.trackers.app.results import Columns, TrackTable
@@ -164,6 +165,6 @@ def empty_rows(num_cameras: int, frames: int) -> TimedHeadTrack:
     )
 
 
-def pose_in_metres(pose: np.ndarray) -> np.ndarray:
+def pose_in_metres(pose: Array | np.ndarray) -> np.ndarray:
     """(..., 6) in metres and radians, of millimetres and radians."""
     return np.asarray(pose) * np.repeat(np.asarray([_METRES, 1.0], np.asarray(pose).dtype), 3)
