@@ -12,7 +12,6 @@ from jaxfilters.models.synthetic.articulated import paper_hand
 from jaxfilters.trackers.articulated import drawing as articulated_draw
 from jaxfilters.trackers.articulated.drawing import Canvas, draw_frame, scene, write_overlay
 from jaxfilters.trackers.articulated.recording import from_keypoints
-from jaxfilters.trackers.articulated.table import articulated_table
 from jaxfilters.trackers.hand_depth.drawing import FINGER_COLORS
 from jaxfilters.trackers.io.errors import OutputError
 
@@ -140,11 +139,8 @@ def test_five_fingers_from_keypoints_have_five_colours(perfect_track):
     points = np.asarray(jax.jit(jax.vmap(hand.points))(x))
     keypoints = np.concatenate([x[:, None, :2], points[..., :2].reshape(2, 20, 2)], axis=1)
     sequence = from_keypoints(np.arange(2.0), keypoints, "a")
-    track = (
-        articulated_table(hand.layout)
-        .empty(2)
-        ._replace(times_s=sequence.times_s, mean=x, points=points, image_points=points[..., :2])
-    )
+    first = type(perfect_track)(*(field[:2] for field in perfect_track))
+    track = first._replace(times_s=sequence.times_s, mean=x, points=points, image_points=points[..., :2])
     drawn = scene(sequence, hand, track)
     image = draw_frame(drawn, 0)
     for finger, color in enumerate(FINGER_COLORS):

@@ -12,7 +12,6 @@ from jaxfilters.trackers.articulated import summary as articulated_summary
 from jaxfilters.trackers.articulated.drawing import scene
 from jaxfilters.trackers.articulated.recording import from_keypoints
 from jaxfilters.trackers.articulated.summary import LAST_FRAMES, draw_summary, errors_of, write_summary
-from jaxfilters.trackers.articulated.table import articulated_table
 from jaxfilters.trackers.io.errors import OutputError
 
 HAND, LAYOUT = paper_hand(), Layout(2)
@@ -118,13 +117,15 @@ def test_without_truth_there_is_none_in_the_charts(features, perfect_track, curv
     assert [len(drawn) for _, drawn in curves] == [1, 1, 1, 1, 3, 3, 3]
 
 
-def test_five_fingers_have_six_charts_of_lengths():
+def test_five_fingers_have_six_charts_of_lengths(perfect_track):
     hand = articulated_hand(five_fingers(), features=KEYPOINTS)
     points = np.random.default_rng(0).uniform(0, 300, (3, 21, 2))
     sequence = from_keypoints(np.arange(3.0), points, "a")
-    track = articulated_table(hand.layout).empty(3)
-    mean = track.mean + np.float32(1)
-    track = track._replace(times_s=sequence.times_s, mean=mean)
+    first = type(perfect_track)(*(field[:3] for field in perfect_track))
+    mean = np.ones((3, hand.layout.size), np.float32)
+    joints = np.zeros((3, 5, 4, 3), np.float32)
+    of_five = {"mean": mean, "std": 0 * mean, "points": joints, "image_points": joints[..., :2]}
+    track = first._replace(times_s=sequence.times_s, **of_five)
     assert draw_summary(sequence, hand.layout, scene(sequence, hand, track), track).shape == (
         MONTAGE + 4 * CHART,
         960,
