@@ -325,7 +325,7 @@ def wander(scale, x, dt):
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("linearize", "arithmetic", "iterations"),
-    [(second_order_covariance_only, arithmetics.square_root, 3)],
+    [(cubature, arithmetics.square_root, 3)],
 )
 def test_the_gradient_of_nonlinear_filters_agrees_with_differences(x64, linearize, arithmetic, iterations):
     ys = jnp.asarray(RNG.normal(size=(4, 3)) + 3)

@@ -137,7 +137,7 @@ def scores(mesh, ys):
     keys = jax.random.split(jax.random.key(4), 200)
     score = jax.grad(lambda filter, key: jaxfilters.log_evidence(filter, key, ys))
     found = jax.jit(jax.vmap(score, (None, 0)))(sharded(plain(800), mesh), keys)
-    return found.params.island.params.log_likelihood.args[0].std.tolist()
+    return found.params.island.params.log_likelihood.callback.args[0].std.tolist()
 
 
 def sequences(mesh, num_devices, ys):

@@ -32,9 +32,8 @@ def displacements(poses):
 
 @pytest.mark.system
 @pytest.mark.parametrize("kind", MOTIONS)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_quaternions_are_unit_and_bounds_are_kept(kind, seed):
-    poses = np.asarray(MOTIONS[kind](jax.random.key(seed), 600))
+def test_quaternions_are_unit_and_bounds_are_kept(kind):
+    poses = np.asarray(MOTIONS[kind](jax.random.key(1), 600))
     assert poses.shape == (600, 22)
     np.testing.assert_allclose(np.linalg.norm(poses[:, 3:7], axis=1), 1, atol=1e-6)
     rounding = 1e-6
@@ -49,15 +48,6 @@ def test_a_key_decides_the_motion(kind):
     simulate = RANDOM_WALKS[kind]
     np.testing.assert_array_equal(simulate(jax.random.key(1), 20), simulate(jax.random.key(1), 20))
     assert not np.allclose(simulate(jax.random.key(1), 20), simulate(jax.random.key(2), 20))
-
-
-@pytest.mark.system
-def test_first_steps_of_data_a_have_the_stated_deviation():
-    keys = jax.random.split(jax.random.key(1), 4000)
-    first = jax.vmap(lambda key: local(open_palm(jnp.array(START)), simulate_poses_a(key, 1)[0]))(keys)
-    # The PIP angles start at a limit: reflection there changes the sign of a step, not its size.
-    mean_square = np.mean(np.asarray(first) ** 2, axis=0)
-    np.testing.assert_allclose(mean_square / POSE_STEP_STD**2, 1, atol=4 * np.sqrt(2 / 4000))
 
 
 def test_data_a_spreads_with_time_whatever_the_frame_interval():
@@ -87,22 +77,6 @@ def test_data_b_integrates_a_damped_random_walk_of_its_velocity():
     np.testing.assert_allclose(
         np.mean(velocity[:, 0] ** 2, axis=0) / INITIAL_VELOCITY_STD[:6] ** 2, 1, atol=4 * np.sqrt(2 / 40)
     )
-
-
-@pytest.mark.system
-def test_data_b_turns_back_at_the_limits_of_the_angles():
-    keys = jax.random.split(jax.random.key(5), 100)
-    poses = np.asarray(jax.vmap(lambda key: simulate_poses_b(key, 100))(keys))
-    # The PIP angles start at their lower limit 0. Cases: going on would lead below it by 3 deviations of what the
-    # velocity's noise does in a frame. Two frames later the finger must be leaving as fast as it came, but for damping.
-    pip = poses[:, :, [12, 15, 18, 21]]
-    step_std = 0.5 * VELOCITY_STEP_STD[-1] * FRAME_INTERVAL
-    step = np.diff(pip, axis=1)
-    bounces = pip[:, 1:-2] + VELOCITY_DECAY * step[:, :-2] < -3 * step_std
-    assert bounces.sum() > 50
-    surprise = (step[:, 2:] + VELOCITY_DECAY**2 * step[:, :-2])[bounces] / (step_std * np.hypot(1, VELOCITY_DECAY))
-    assert abs(surprise.mean()) < 4 / np.sqrt(surprise.size)
-    assert abs(np.mean(surprise**2) - 1) < 4 * np.sqrt(2 / surprise.size)
 
 
 def test_scripted_motion_is_the_circle_and_then_the_fist():

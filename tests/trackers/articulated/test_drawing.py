@@ -131,7 +131,7 @@ def test_joints_that_are_nowhere_are_left_out(features, perfect_track, far):
     assert draw_frame(drawn, 0).any()
 
 
-def test_five_fingers_from_keypoints_have_five_colours(perfect_track, nothing_tracked):
+def test_five_fingers_from_keypoints_have_five_colours(nothing_tracked):
     hand = articulated_hand(five_fingers(), features=KEYPOINTS)
     x = np.zeros((2, hand.layout.size), np.float32)
     x[:, hand.layout.position], x[:, hand.layout.quaternion] = (200, 200), (0.5, -0.5, 0.5, -0.5)
