@@ -97,23 +97,21 @@ def estimate(key: AnyKey, filter: Filter, ys: Float[Array, "t 1"]) -> Array:
 
 def filters(num_particles: int) -> dict[str, Filter]:
     """This library's filters by name; the proposal is a pair of functions, as that of the peers."""
-    model: Any = (
-        jaxfilters.priors.from_noise(lambda noise: STATIONARY * noise, jaxfilters.StandardNormal(1)),
-        lambda noise, x: RHO * x + STD_X * noise,
-        log_likelihood,
-    )
-    options: dict[str, Any] = {
+    model: dict[str, Any] = {
+        "sample_prior": jaxfilters.priors.from_noise(lambda noise: STATIONARY * noise, jaxfilters.StandardNormal(1)),
+        "sample_transition": lambda noise, x: RHO * x + STD_X * noise,
+        "log_likelihood": log_likelihood,
         "num_particles": num_particles,
         "noise": jaxfilters.StandardNormal(1),
         "ess_threshold": 1.0,
     }
     proposal = (lambda noise, x, y: center(x, y) + SPREAD * noise, lambda new, x, y: log_proposal(new, x, y))
-    guide: dict[str, Any] = {"log_transition": log_transition, "proposal": proposal}
+    guided = model | {"log_transition": log_transition, "proposal": proposal}
     return {
-        "bootstrap": jaxfilters.bootstrap(*model, **options),
-        "guided": jaxfilters.guided(*model, **guide, **options),
-        "auxiliary": jaxfilters.auxiliary(*model, log_first_stage=log_first_stage, **options),
-        "adapted": jaxfilters.auxiliary(*model, log_first_stage=log_first_stage, **guide, **options),
+        "bootstrap": jaxfilters.bootstrap(**model),
+        "guided": jaxfilters.guided(**guided),
+        "auxiliary": jaxfilters.auxiliary(**model, log_first_stage=log_first_stage),
+        "adapted": jaxfilters.auxiliary(**guided, log_first_stage=log_first_stage),
     }
 
 

@@ -13,7 +13,7 @@ A. F. Garcia-Fernandez, M. Raitoharju and L. Svensson, "Posterior linearisation 
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -149,7 +149,7 @@ def _iterated(
     return jax.tree.map(lambda leaf: leaf[1:], final), info
 
 
-def _with_first(model: ExtendedKalman, start: Belief, inputs: PyTree) -> Belief:
+def _with_first(model: Any, start: Belief, inputs: PyTree) -> Belief:
     """The beliefs with that of the state before the first observation."""
     first, inputs = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (start, inputs))
     prior = model.prior

@@ -10,7 +10,7 @@ tracking", European Conference on Computer Vision, 2000). It costs two evaluatio
 
 from collections.abc import Callable
 from dataclasses import field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp

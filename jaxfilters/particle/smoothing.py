@@ -6,7 +6,7 @@ trajectories that need not be ancestral, for which it evaluates the density of t
 """
 
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp

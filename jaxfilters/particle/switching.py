@@ -207,7 +207,7 @@ def _chosen(model: Switching, key: AnyKey, log_weights: Float[Array, " n"]) -> t
     scheme_key, mode_key = jax.random.split(key)
     normalized, log_sum = weights.normalize(log_weights)
     table = jax.lax.stop_gradient(normalized).reshape(model.bank.count, num)
-    ancestors: Array = model.scheme(scheme_key, jax.nn.logsumexp(table, axis=0))
+    ancestors = jnp.asarray(model.scheme(scheme_key, jax.nn.logsumexp(table, axis=0)))
     checks.check_ancestors(ancestors, num)
     mode = jax.random.categorical(mode_key, table[:, ancestors], axis=0)
     chosen = (mode * num + ancestors).astype(jnp.int32)

@@ -90,13 +90,13 @@ def ict_model(points: dict[str, np.ndarray], surface: dict[str, np.ndarray]) -> 
             raise ValueError(f"{name} must name {shape} of {num_vertices} vertices by index; got {indices.shape}.")
     # The files wind their quads counter-clockwise from outside; turning y and z over keeps that.
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    neutral, identity, expression = (
+    mean, by_identity, by_expression = (
         jnp.asarray(surface[name].astype(np.float64) * _TO_OURS, float) for name in ("neutral", *shapes)
     )
     return IctModel(
-        neutral,
-        identity,
-        expression,
+        mean,
+        by_identity,
+        by_expression,
         jnp.asarray(landmarks, jnp.int32),
         jnp.asarray(faces, jnp.int32),
         tuple(str(name) for name in names),
