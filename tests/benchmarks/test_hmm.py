@@ -38,6 +38,7 @@ def test_a_library_that_computes_something_else_is_not_timed(problem):
 
 
 @pytest.mark.system
+@pytest.mark.filterwarnings("ignore:jax.core:DeprecationWarning")  # dynamax imports names that JAX will remove
 @pytest.mark.parametrize("name", ["dynamax", "hmmlearn"])
 def test_a_peer_that_is_installed_agrees(problem, name):
     if name not in _hmm_peers.installed():
