@@ -84,7 +84,9 @@ def person(theta):
 
 def head(theta):
     """Landmarks of a face before two cameras: noises, and a size."""
-    rig, shape = nominal(), jnp.asarray(MEAN_SHAPE, jnp.float32)
+    shape = jnp.asarray(MEAN_SHAPE, jnp.float32)
+    with jax.ensure_compile_time_eval():
+        rig = nominal()  # read on the host, though the caller compiles this
 
     def seen(pose):
         return project_shape(rig, theta["size"] * shape, pose)[0].ravel()

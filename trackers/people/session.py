@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import cv2
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.background.choice import background
@@ -34,7 +35,7 @@ class PeopleEstimate(NamedTuple):
 
 
 def track(
-    images: Sequence[Sequence[np.ndarray | None]], times_s: np.ndarray, scene: PeopleScene, subtraction: str = "median"
+    images: Sequence[Sequence[np.ndarray | None]], times_s: ArrayLike, scene: PeopleScene, subtraction: str = "median"
 ) -> dict[int, list[Sighting]]:
     """Everybody's smoothed track in recorded images, by identity.
 
@@ -51,13 +52,14 @@ def track(
     Raises:
         ValueError: There are no images, or more or fewer than times; or no such method.
     """
-    if not len(images) or len(images) != len(times_s):
-        raise ValueError(f"times_s: expected one for each of at least one image; got {len(times_s)} and {len(images)}.")
+    seconds = np.asarray(times_s, float)
+    if not len(images) or seconds.shape != (len(images),):
+        raise ValueError(f"times_s: expected one for each of at least one image; got {seconds.shape}, {len(images)}.")
     session = PeopleSession(scene, subtraction)
     every = max(1, len(images) // PRIMING_IMAGES)
     session.prime([[one for one in views[::every] if one is not None] for views in zip(*images, strict=True)])
-    for views, time_s in zip(images, times_s, strict=True):
-        session.process(views, float(time_s) - float(times_s[0]))
+    for views, time_s in zip(images, seconds - seconds[0], strict=True):
+        session.process(views, float(time_s))
     return session.tracks.smoothed()
 
 
