@@ -34,8 +34,8 @@ MANUALS = {
 }
 """Where the manual of each command is."""
 
-NEEDED_BY_PAGES = {"blackjax", "numpyro"}
-"""Libraries of the extra `mcmc`; what a page says after importing one that is missing is skipped."""
+NEEDED_BY_PAGES = {"blackjax": "mcmc", "numpyro": "mcmc", "matplotlib": "viz"}
+"""Libraries with their extras; what a page says after importing one that is missing is skipped."""
 
 
 def name_of(page):
@@ -96,8 +96,8 @@ def sides_of(page):
 def test_the_code_of_a_page_runs(page):
     names = {"__name__": page.stem}
     for block in code_of(page):
-        for library in NEEDED_BY_PAGES & set(re.findall(r"^import (\w+)", block, re.MULTILINE)):
-            pytest.importorskip(library, reason=f"the rest of {page.name} needs the extra mcmc")
+        for library in NEEDED_BY_PAGES.keys() & set(re.findall(r"^import (\w+)", block, re.MULTILINE)):
+            pytest.importorskip(library, reason=f"the rest of {page.name} needs the extra {NEEDED_BY_PAGES[library]}")
         exec(compile(block, str(page), "exec"), names)
     assert len(names) > 2
 
