@@ -1,5 +1,7 @@
 """Frames that are marginalised against the same frames that stay."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
