@@ -18,7 +18,7 @@ from jaxfilters.trackers.head.common.estimate import refined
 from jaxfilters.trackers.head.common.search import Searches, at, first_diffusion, searches
 from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState, compiled
 from jaxfilters.trackers.head.stereo.registration import register
-from jaxfilters.trackers.head.stereo.track import SHARPENING, advance, begin
+from jaxfilters.trackers.head.stereo.tracking import SHARPENING, advance, begin
 from jaxfilters.trackers.head.stereo.variants import VARIANTS
 
 BATCH = 8

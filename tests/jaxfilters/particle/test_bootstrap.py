@@ -102,7 +102,9 @@ def test_score_matches_the_exact_one():
     exact = float(jax.grad(lambda std: exact_log_evidence(ys, std)[0])(0.4))
     score = jax.grad(lambda pf, key: log_evidence(pf, key, ys))
     keys = jax.random.split(jax.random.key(4), 400)
-    scores = jax.vmap(score, in_axes=(None, 0))(make_filter(num_particles=1000), keys).params.log_likelihood.callback.args[0]
+    scores = jax.vmap(score, in_axes=(None, 0))(
+        make_filter(num_particles=1000), keys
+    ).params.log_likelihood.callback.args[0]
     estimates = np.asarray(scores.noise_std, dtype=np.float64)
     assert np.all(np.isfinite(estimates))
     z = (estimates.mean() - exact) / (estimates.std(ddof=1) / np.sqrt(estimates.size))

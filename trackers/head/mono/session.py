@@ -29,7 +29,7 @@ from jaxfilters.trackers.head.mono.irises import with_irises
 from jaxfilters.trackers.head.mono.recognition import People, as_remembered, one_of, people, recognised
 from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, search_of
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
-from jaxfilters.trackers.head.mono.track import System, advance
+from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_points
 
 MOST_REPROJECTION = 0.05

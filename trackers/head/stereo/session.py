@@ -25,7 +25,7 @@ from jaxfilters.trackers.head.common.state import (
     compiled,
 )
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
-from jaxfilters.trackers.head.stereo.track import advance, begin
+from jaxfilters.trackers.head.stereo.tracking import advance, begin
 
 SAME_FACE_MM = 4.0
 """Root mean square distance between two registered shapes up to which they are of one person."""

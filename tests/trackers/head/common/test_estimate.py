@@ -13,7 +13,7 @@ from jaxfilters.trackers.head.common.estimate import MODEL_VARIANCE, RESIDUAL_SC
 from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS, HeadOptions
 from jaxfilters.trackers.head.stereo.registration import register
-from jaxfilters.trackers.head.stereo.track import begin
+from jaxfilters.trackers.head.stereo.tracking import begin
 
 refined = jax.jit(module.refined)
 MOVED = np.array([*STEREO_PLACE_MM, 0, 0, 0]) + np.array([6, -4, 15, *np.radians([3, -8, 5])])

@@ -15,7 +15,7 @@ from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, Detection
 from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST, NUM_MODES, RIGID, HeadOptions
 from jaxfilters.trackers.head.stereo import session as module
 from jaxfilters.trackers.head.stereo.session import HeadSession
-from jaxfilters.trackers.head.stereo.track import PATIENCE
+from jaxfilters.trackers.head.stereo.tracking import PATIENCE
 
 MIDDLE, EYES_APART, DISPARITY = (394.0, 200.0), 77.5, 150
 """Of the drawn face, pixels: 62 mm between the eyes, 640 mm away."""

@@ -10,7 +10,7 @@ from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import LOST, NUM_MODES, RIGID, UNITS, HeadOptions, compiled
-from jaxfilters.trackers.head.stereo import track as module
+from jaxfilters.trackers.head.stereo import tracking as module
 from jaxfilters.trackers.head.stereo.registration import register
 
 pytestmark = pytest.mark.optimised

@@ -23,7 +23,7 @@ from jaxfilters.trackers.head.common.state import DEFORMABLE, FRAME_S, LOST, PAT
 from jaxfilters.trackers.head.mono import adjustment
 from jaxfilters.trackers.head.mono.estimate import Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
-from jaxfilters.trackers.head.stereo.track import (
+from jaxfilters.trackers.head.stereo.tracking import (
     FEWEST_ANCHORED,
     LEAST_SCORE,
     MOST_STEPS,
