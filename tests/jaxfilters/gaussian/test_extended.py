@@ -147,11 +147,13 @@ NONLINEAR = {
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("linearize", "iterations"), zip(NONLINEAR.values(), (1, 3, 1, 3), strict=True), ids=NONLINEAR)
-def test_masked_components_are_as_if_they_were_not_there(x64, linearize, iterations):
+@pytest.mark.parametrize(
+    ("name", "iterations"), [("taylor", 1), ("second_order_covariance_only", 3), ("cubature", 1), ("unscented", 3)]
+)
+def test_masked_components_are_as_if_they_were_not_there(x64, name, iterations):
     belief = Gaussian(jnp.asarray(MEAN), jnp.asarray(0.3 * ROOT_P @ ROOT_P.T))
     R, y = ROOT_R @ ROOT_R.T, jnp.array([3.0, jnp.nan, 2.0])
-    options = dict(linearize=linearize, iterations=iterations)
+    options = dict(linearize=NONLINEAR[name], iterations=iterations)
     mask = jnp.array([True, False, True])
 
     @jax.jit
