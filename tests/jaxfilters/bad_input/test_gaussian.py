@@ -289,6 +289,7 @@ WRAPPERS = {
     "schmidt_kalman, scalar signature": (lambda: schmidt(signature=lambda mean: mean[0]), ("signature", "(d,)", "()")),
     "schmidt_kalman, signature": (lambda: schmidt(signature=3), ("signature", "function", "int")),
     "schmidt_kalman, tolerance": (lambda: schmidt(tolerance=-1.0), ("tolerance", "positive", "-1.0")),
+    "schmidt_kalman, no signature": (lambda: schmidt(signature=None), ("signature", "None", "1.0")),
     "schmidt_kalman, inner": (lambda: schmidt(inner=PRIOR), ("inner", "Filter", "Gaussian")),
     "schmidt_kalman, inner with roots": (
         lambda: schmidt(inner=extended(prior=ROOT_PRIOR, arithmetic=jf.arithmetic.square_root)),
