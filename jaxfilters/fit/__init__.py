@@ -14,6 +14,9 @@ Example:
     (True, True)
 """
 
+from jaxfilters.fit.calibration import Calibration as Calibration
+from jaxfilters.fit.calibration import Recording as Recording
+from jaxfilters.fit.calibration import calibrate as calibrate
 from jaxfilters.fit.composite import Godambe as Godambe
 from jaxfilters.fit.composite import correlation_lags as correlation_lags
 from jaxfilters.fit.composite import godambe as godambe
