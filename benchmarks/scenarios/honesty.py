@@ -5,23 +5,27 @@ deviations (68, 95 and 99.7 % are right), with an interval by drawing whole reco
 from frame to frame; the ratio of claims to errors (sharpness, 1 is right); the continuous ranked probability score. Of
 all coordinates together: the normalised error squared with its band for as many frames as the errors are worth, and
 the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is right; `log_score_gain_` is
-what the claim is better than the constant. A folder given with `--out` receives a calibration curve of each. Systems
+what the claim is better than the constant. Last come three filters of the same detected key points, whose errors are
+taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of each. Systems
 whose recordings are missing are named and left out.
 """
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
-from jaxfilters.benchmarks.scenarios import people_pets
+from jaxfilters.benchmarks.scenarios import _keypoint_filters, people_pets
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
 from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
+from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
 from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, Contender, MonoRun, follow_all, talking_head
 from jaxfilters.benchmarks.scenarios._pets import load_pets
 from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_capture, track_lengths, true_lengths
@@ -39,6 +43,9 @@ NUM_HEADS, QUICK_NUM_HEADS = 6, 2
 NUM_FRAMES, QUICK_NUM_FRAMES = 300, 90
 QUICK_PEOPLE_FRAMES = 60
 QUICK_CAPTURE_FRAMES, CAPTURE_FRAMES = 1000, 3000
+QUICK_KEYPOINT_FRAMES = 400
+SETTLED = 30
+"""Frames of key points after which the start is forgotten."""
 
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
@@ -130,6 +137,27 @@ def by_person(truth: FloorTracks, tracks: dict[int, list[Sighting]], camera_m: n
     return recordings
 
 
+def keypoint_claims(model: str, quick: bool, seed: int) -> Claims:
+    """Key points that a network detected, filtered with one model of their errors; one recording a joint.
+
+    The joints are of one video, so that intervals over them are too short.
+    """
+    del seed
+    points = _keypoint_filters.load_keypoints(recording_folder("handpose_tracks"))
+    half = len(points.truth) // 2
+    end = half + QUICK_KEYPOINT_FRAMES if quick else None
+    constants = _keypoint_filters.constants_of(Keypoints(points.detected[:half], points.truth[:half]))
+    judged = slice(half, end)
+    found = _keypoint_filters.filtered(
+        _keypoint_filters.filters_of(constants)[model], jnp.asarray(points.detected[judged], jnp.float32)
+    )
+    mean, std = (np.asarray(values, float)[SETTLED:] for values in found)
+    errors = mean - points.truth[judged][SETTLED:]
+    joints = range(0, errors.shape[1], 2)
+    recordings = [Recording(errors[:, i : i + 2], std[:, i : i + 2]) for i in joints]
+    return Claims(f"keypoints_{model}", "nyu", ("x_mm", "y_mm"), recordings)
+
+
 def _heads(quick: bool, seed: int) -> range:
     return range(FIRST_HEAD + seed, FIRST_HEAD + seed + (QUICK_NUM_HEADS if quick else NUM_HEADS))
 
@@ -149,5 +177,6 @@ SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
     "people, PETS 2009": people_claims,
     "head before two cameras, rendered": stereo_claims,
     "head before one camera, rendered": mono_claims,
+    **{f"key points as {model} noise, NYU": partial(keypoint_claims, model) for model in MODELS},
 }
 """One function `(quick, seed) -> Claims` for each system and kind of data."""

@@ -23,6 +23,9 @@ from jaxfilters.math import linalg
 _SHARE = 4
 """One over the largest share of a grid in one window, and over the least share of the information outside of it."""
 
+_UNCORRELATED = 0.2
+"""Autocorrelation below which residuals count as nearly independent."""
+
 
 class Godambe(NamedTuple):
     """The certainty of an estimate."""
@@ -144,8 +147,9 @@ def _window_sums(values: Float[Array, "*grid k"], widths: Sequence[int]) -> Floa
 def correlation_lags(residuals: ArrayLike, *, most: int = 64) -> tuple[int, ...]:
     """Lags for `score_covariance` from the correlation of residuals along each axis of their grid.
 
-    Along an axis it is twice the first lag at which the autocorrelation is below 2 / sqrt(number of residuals) or 0.05,
-    whichever is larger: weights that fall linearly count half of the correlation at half of the largest lag.
+    Along an axis it is twice the first lag at which the autocorrelation is below 0.2, or 2 / sqrt(number of residuals)
+    where that is larger: weights that fall linearly count half of the correlation at half of the largest lag. A smaller
+    limit would be lost in the sampling error that the correlation itself makes large.
 
     Args:
         residuals: Residuals on the grid at the estimate, concrete; NaN where there is none.
@@ -172,7 +176,7 @@ def correlation_lags(residuals: ArrayLike, *, most: int = 64) -> tuple[int, ...]
     if read.sum() < 2:
         raise ValueError(f"residuals must have at least two finite numbers; got {read.sum()}.")
     e = np.where(read, values - values[read].mean(), 0.0)
-    limit = max(2 / math.sqrt(read.sum()), 0.05)
+    limit = max(2 / math.sqrt(read.sum()), _UNCORRELATED)
     lags = []
     for axis, size in enumerate(values.shape):
         found = next(
