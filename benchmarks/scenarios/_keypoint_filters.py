@@ -1,9 +1,9 @@
 """Detected key points of real hands, filtered with three models of their errors.
 
-Each coordinate of each joint, in millimetres at its true depth, is filtered alone: position and velocity, driven by white
-acceleration. The errors of a detector last. The three filters take them for a Gauss-Markov process beside white noise,
-for white noise of the true size, and for white noise inflated by (1 + phi) / (1 - phi). Constants are from the first
-half of the frames: the drive from second differences of the truth, and variances and time constant from the
+Each coordinate of each joint, in millimetres at its true depth, is filtered alone: position and velocity, driven by
+white acceleration. The errors of a detector last. The three filters take them for a Gauss-Markov process beside white
+noise, for white noise of the true size, and for white noise inflated by (1 + phi) / (1 - phi). Constants are from the
+first half of the frames: the drive from second differences of the truth, and variances and time constant from the
 autocovariances of the errors at the lags 0 to 2. The second half is judged.
 """
 
@@ -62,7 +62,7 @@ def load_keypoints(folder: Path, network: str = NETWORK) -> Keypoints:
 
 
 def constants_of(points: Keypoints) -> Constants:
-    """From frames whose truth is known (G. U. Yule 1927, with white noise beside the process: lags 1 and 2 tell phi)."""
+    """From frames whose truth is known: the lags 1 and 2 tell phi, as white noise has no correlation there."""
     second = np.diff(points.truth, n=2, axis=0).ravel() ** 2
     second = np.sort(second)[: int((1 - TRIMMED) * second.size)]
     errors = points.detected - points.truth

@@ -6,8 +6,8 @@ from frame to frame; the ratio of claims to errors (sharpness, 1 is right); the 
 all coordinates together: the normalised error squared with its band for as many frames as the errors are worth, and
 the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is right; `log_score_gain_` is
 what the claim is better than the constant. Last come three filters of the same detected key points, whose errors are
-taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of each. Systems
-whose recordings are missing are named and left out.
+taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of
+each. Systems whose recordings are missing are named and left out.
 """
 
 import sys
