@@ -111,34 +111,34 @@ def metrics_of(claims: Claims, scores: Scores) -> dict[str, Metric]:
 
 def table(judged: list[tuple[Claims, Scores]]) -> str:
     """One line a coordinate, and above those of a system what is of all its coordinates."""
-    header = (
-        "system, data",
-        "coordinate",
-        "1 sigma %",
-        "2 sigma %",
-        "95 % interval",
-        "3 sigma %",
-        "autocorr.",
-        "sharpness",
-    )
-    rows = [(*header, "crps")]
+    header = ("coordinate", "1 sigma %", "2 sigma %", "95 % interval", "3 sigma %", "autocorr.", "sharpness", "crps")
+    rows = [row for claims, scores in judged for row in _by_coordinate(claims, scores)]
+    head, line, *lines = aligned([header, *rows], numbers=range(1, 8)).splitlines()
+    shown = [head, line]
     for claims, scores in judged:
         low, high = scores.nees_band
-        rows.append(
-            (
-                f"{claims.system}, {claims.data}",
-                f"NEES {scores.nees:.3g} ({low:.3g} .. {high:.3g}), log score {scores.log_score:.3g} "
-                f"(constant {scores.log_score_of_constant:.3g}), {scores.effective_frames:.0f} effective frames",
-                *[""] * 7,
-            )
-        )
-        for i, coordinate in enumerate(claims.coordinates):
-            one, two, three = 100 * scores.coverage[:, i]
-            ends = "-" if np.isnan(scores.interval[0, i]) else "{:.0f} .. {:.0f}".format(*100 * scores.interval[:, i])
-            correlation = "-" if np.isnan(scores.autocorrelation[i]) else f"{scores.autocorrelation[i]:.2f}"
-            values = (f"{one:.0f}", f"{two:.0f}", ends, f"{three:.0f}", correlation)
-            rows.append(("", coordinate, *values, f"{scores.sharpness[i]:.2g}", f"{scores.crps[i]:.3g}"))
-    return aligned(_with_wide_lines(rows), numbers=range(2, 9))
+        count = len(claims.coordinates)
+        shown += [
+            f"{claims.system}, {claims.data}: NEES {scores.nees:.3g} ({low:.3g} .. {high:.3g} if claims are true), "
+            f"log score {scores.log_score:.3g} ({scores.log_score_of_constant:.3g} of a constant), "
+            f"{scores.effective_frames:.0f} effective frames",
+            *lines[:count],
+        ]
+        lines = lines[count:]
+    return "\n".join(shown)
+
+
+def _by_coordinate(claims: Claims, scores: Scores) -> list[tuple[str, ...]]:
+    rows = []
+    for i, coordinate in enumerate(claims.coordinates):
+        one, two, three = (f"{100 * share:.0f}" for share in scores.coverage[:, i])
+        low, high = 100 * scores.interval[:, i]
+        interval = "-" if np.isnan(low) else f"{low:.0f} .. {high:.0f}"
+        phi = scores.autocorrelation[i]
+        correlation = "-" if np.isnan(phi) else f"{phi:.2f}"
+        sizes = (f"{scores.sharpness[i]:.2g}", f"{scores.crps[i]:.3g}")
+        rows.append((f"  {coordinate}", one, two, interval, three, correlation, *sizes))
+    return rows
 
 
 def draw_calibration(folder: Path, claims: Claims, scores: Scores) -> None:
@@ -148,11 +148,6 @@ def draw_calibration(folder: Path, claims: Claims, scores: Scores) -> None:
     axes = jf.plot.calibration(scores.transforms)
     axes.set_title(f"{claims.system}, {claims.data}: {axes.get_title()}")
     axes.figure.savefig(folder / f"calibration_{claims.system}_{claims.data}.png")
-
-
-def _with_wide_lines(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Lines about a whole system in the first column alone, so that they widen no other."""
-    return [(f"{row[0]}: {row[1]}", *[""] * 8) if row[0] and row[2] == "" else row for row in rows]
 
 
 def _claimed(recording: Recording) -> Recording:

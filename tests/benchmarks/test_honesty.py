@@ -22,6 +22,7 @@ def claims_of(scale, phi=0.0, recordings=8, frames=500):
     return Claims("system", "data", ("a_mm", "b_deg"), made)
 
 
+@pytest.mark.system
 def test_true_claims_have_the_right_numbers():
     """4000 independent errors: shares within four standard errors (a false alarm has 1e-3 over all 12 numbers)."""
     scores = _claims.judge(claims_of(1.0))
@@ -43,6 +44,7 @@ def test_claims_that_are_too_narrow_show_in_every_number_and_lasting_errors_are_
     assert scores.log_score > scores.log_score_of_constant + 0.5
 
 
+@pytest.mark.system
 def test_metrics_and_the_table_name_system_data_and_coordinates():
     claims = claims_of(1.0, frames=50)
     scores = _claims.judge(claims)
