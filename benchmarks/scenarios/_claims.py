@@ -160,7 +160,7 @@ def _draws(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     if len(recording.errors) < 2:
         return np.ones(recording.errors.shape[1]), np.full(recording.errors.shape[1], np.nan)
     found = jf.diagnostics.effective_draws(jnp.asarray(recording.errors, jnp.float32))
-    return np.asarray(found.count, float), np.asarray(found.correlation, float)
+    return np.asarray(found.number, float), np.asarray(found.correlation, float)
 
 
 def _mean_correlation(correlations: list[np.ndarray], lengths: list[int]) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxfilters.typing import AnyKey
 class Draws(NamedTuple):
     """Effective numbers of draws of each component of errors."""
 
-    count: Float[Array, " m"]
+    number: Float[Array, " m"]
     """Between 1 and the number of frames."""
     correlation: Float[Array, " m"]
     """Autocorrelation from one frame to the next."""
@@ -41,7 +41,7 @@ def effective_draws(errors: Float[Array, "t m"]) -> Draws:
     Example:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
-        >>> jf.diagnostics.effective_draws(jnp.ones((100, 1))).count.tolist()
+        >>> jf.diagnostics.effective_draws(jnp.ones((100, 1))).number.tolist()
         [1.0]
     """
     phi = jnp.clip(autocorrelation(errors, 1)[1], 0.0, 1.0)

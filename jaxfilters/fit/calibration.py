@@ -147,7 +147,8 @@ def calibrate(
     _check(recordings, believed, by_score)
     filter_of = as_pytree(filter_of)
     data = _stacked(recordings)
-    density = partial(_density, key, filter_of, as_pytree(believed) if by_score else None, data)
+    believed = None if believed is None else as_pytree(believed)
+    density = partial(_density, key, filter_of, believed if by_score else None, data)
     fit = maximize(density(data.mask), start, constraints, method=method)
     num_draws = _check_draws(filter_of(fit.theta), data, min_draws)
 
@@ -157,7 +158,7 @@ def calibrate(
         mask = data.mask & (jnp.arange(count) != left_out)
         thetas.append(maximize(density(mask), fit.theta, constraints, method=method).theta)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *thetas)
-    folds = _judged(filter_of, None if believed is None else as_pytree(believed), key, stacked, data)
+    folds = _judged(filter_of, believed, key, stacked, data)
     return _summary(key, fit, num_draws, folds, data)
 
 

@@ -80,7 +80,7 @@ def godambe(
     J = -jax.hessian(lambda x: jnp.sum(log_likelihoods(x)))(x)
     K = score_covariance(scores, lags)
     root = jnp.linalg.cholesky(0.5 * (J + J.T))
-    half = linalg.solve_triangular(root, factor.identity(x.size, x.dtype) + jnp.zeros_like(root))
+    half = linalg.solve_triangular(root, jnp.eye(x.size, dtype=x.dtype))
     inverse = factor.inner(half, half)
     inverse = jnp.where(jnp.all(jnp.isfinite(root)), inverse, jnp.nan)
     adjusted = factor.turned(inverse, K)
@@ -113,7 +113,8 @@ def score_covariance(scores: Float[Array, "*grid d"], lags: int | Sequence[int])
     if scores.ndim < 2:
         raise ValueError(f"scores must have the axes of a grid and then (d,); got the shape {scores.shape}.")
     grid = scores.shape[:-1]
-    widths = [int(lag) + 1 for lag in (np.broadcast_to(lags, (len(grid),)) if np.ndim(lags) == 0 else lags)]
+    each = (lags,) * len(grid) if isinstance(lags, int) else tuple(lags)
+    widths = [int(lag) + 1 for lag in each]
     if len(widths) != len(grid) or min(widths) < 1:
         raise ValueError(f"lags must be at least 0, one number or {len(grid)}, one for each axis; got {lags}.")
     pixels, window = math.prod(grid), math.prod(widths)

@@ -25,7 +25,6 @@ from jaxfilters.gaussian.correlated import CorrelatedNoise, check_dt, check_inne
 from jaxfilters.gaussian.extended import ExtendedKalman, as_observation
 from jaxfilters.gaussian.gauss_markov import GaussMarkov, check_process
 from jaxfilters.gaussian.linearize import taylor
-from jaxfilters.gaussian.manifold import with_mean
 from jaxfilters.gaussian.noise_models import NonAdditiveNoise
 from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, only_inputs
@@ -255,8 +254,7 @@ def _conditioned(belief: Gaussian, clone: Clone, rows: _Rows) -> tuple[Gaussian,
     moved = jnp.hstack([jnp.eye(belief.mean.shape[0], dtype=e.dtype), clone.F])
     to_x = linalg.matmul(moved, root)
     spread = linalg.solve_triangular(C, to_x.T)
-    posterior = with_mean(belief, belief.mean + factor.apply(to_x, u))
-    posterior = replace(posterior, covariance=factor.outer(spread.T, spread.T))
+    posterior = Gaussian(belief.mean + factor.apply(to_x, u), factor.outer(spread.T, spread.T))
     left = e - factor.apply(A, u)
     nis = jnp.sum(left * left) + jnp.sum(u * u)
     log_scales = 0.5 * np.log(2 * np.pi) - jnp.log(jnp.where(rows.counts, scale, 1.0))
