@@ -38,7 +38,7 @@ def effective_draws(errors: Float[Array, "t m"]) -> Draws:
     Raises:
         ValueError: If there are fewer than two frames.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> jf.diagnostics.effective_draws(jnp.ones((100, 1))).number.tolist()
@@ -77,7 +77,7 @@ def cluster_interval(
     Raises:
         ValueError: If there is one recording, or `probability` is outside (0, 1).
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> shares = jnp.array([0.9, 1.0, 0.5, 0.95, 0.98, 0.4])

@@ -128,7 +128,7 @@ def calibrate(
             long they would have to be.
         TypeError: If a recording is no `Recording`.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> def filter_of(theta):

@@ -61,7 +61,7 @@ def godambe(
         ValueError: If `x` is no vector, or as for `score_covariance`.
         TypeError: If `x` is no array of floating-point numbers.
 
-    Example:
+    Examples:
         The mean of a series with errors that last: 400 readings are worth far fewer.
 
         >>> import jax, jax.numpy as jnp
@@ -163,7 +163,7 @@ def correlation_lags(residuals: ArrayLike, *, most: int = 64) -> tuple[int, ...]
         ValueError: If residuals are correlated along a whole axis, or fewer than two are finite.
         TypeError: If they are traced.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> jf.fit.correlation_lags(jax.random.normal(jax.random.key(0), (50, 60)))

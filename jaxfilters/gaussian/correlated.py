@@ -179,7 +179,7 @@ def correlated_noise(
             or shapes do not fit one another.
         TypeError: If an argument is of another kind.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -95,7 +95,7 @@ def measurement_differencing(inner: Filter, noise: GaussMarkov, *, dt: ArrayLike
             not independent, or shapes do not fit one another.
         TypeError: If an argument is of another kind.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -29,7 +29,7 @@ class GaussMarkov:
     elements $B_{ij} (1 / \tau_i + 1 / \tau_j)$ is positive semidefinite; for a matrix T of time constants it is
     $T^{-1} B + B T^{-T}$.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> noise = jf.GaussMarkov(jnp.array(2.0), jnp.array([4.0, 9.0]))

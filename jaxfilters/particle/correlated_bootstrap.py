@@ -120,7 +120,7 @@ def correlated_bootstrap(
         ValueError: If a number is out of range, the components of `process` are not independent, or, when the filter is
             traced, if a function returns an array of another shape.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> move = lambda noise, x: x + 0.1 * noise
         >>> lasting = jf.GaussMarkov(jnp.array(20.0), jnp.array([1.0, 1.0]))
