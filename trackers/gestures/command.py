@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -16,7 +17,7 @@ from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
 from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
-from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
+from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes, usable
 
 COLUMNS = ("stroke", "symbol", "confidence", "lead_nats", "label")
 """Of a table: the symbol is empty where a stroke is rejected; the label is what the data call it."""
@@ -42,7 +43,8 @@ def fit_gestures(options: argparse.Namespace) -> str:
         before = read_symbols(options.add) if options.add else None
         if before and before.dimensions != examples.dimensions:
             raise InputError(
-                f"--add: {options.add} is of strokes in {before.dimensions} dimensions, DATA in {examples.dimensions}."
+                f"--add: {options.add} has models of {_features(before.dimensions)}, DATA are for models of "
+                f"{_features(examples.dimensions)}."
             )
         states = before.symbols.models.log_initial.shape[-1] if before else options.states
         floor = before.min_variance if before else None
@@ -80,7 +82,7 @@ def recognise(options: argparse.Namespace) -> str:
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
-    strokes = _read(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
+    strokes = _to_recognise(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
     found = as_input_error(lambda: _judged(file, strokes, options.margin))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
@@ -95,18 +97,30 @@ def recognise(options: argparse.Namespace) -> str:
     return "\n".join([*lines, _summary(rows), *([f"table in {options.out}"] if options.out else [])])
 
 
-def _read(path: Path) -> StrokeSet:
-    strokes = read_strokes(path)
-    for text in strokes.warnings[:_MOST_WARNINGS]:
+def _features(dimensions: int) -> str:
+    if not dimensions:
+        return "direction codes and numbers of fingertips"
+    return f"the shapes of strokes in {dimensions} dimensions ({3 * dimensions + 2} features a point)"
+
+
+def _warned(path: Path, warnings: Sequence[str]) -> None:
+    for text in warnings[:_MOST_WARNINGS]:
         warn(text)
-    if len(strokes.warnings) > _MOST_WARNINGS:
-        warn(f"{path}: {len(strokes.warnings) - _MOST_WARNINGS} more such segments")
+    if len(warnings) > _MOST_WARNINGS:
+        warn(f"{path}: {len(warnings) - _MOST_WARNINGS} more such strokes")
+
+
+def _to_recognise(path: Path) -> StrokeSet:
+    strokes = read_strokes(path)
+    _warned(path, [*strokes.warnings, *(f"{fault}; it is rejected" for fault in strokes.faults if fault)])
     return strokes
 
 
 def _examples(options: argparse.Namespace) -> tuple[StrokeSet, str]:
     if options.data:
-        return _read(options.data), options.data.name
+        examples = usable(read_strokes(options.data))
+        _warned(options.data, examples.warnings)
+        return examples, options.data.name
     return _drawn(WRITERS, TRIALS, options.seed), "symbols drawn by the generator"
 
 
