@@ -97,7 +97,9 @@ def recogniser_of(file: SymbolsFile) -> Recogniser:
 
     def recognise(stroke: Stroke) -> Recognised:
         if file.dimensions:
-            found = coded.recognise_path(file.symbols, stroke.points, stroke.counts)
+            # Symbols with margins of their own need no common one.
+            margin = coded.MARGIN if file.symbols.margins is None else 0.0
+            found = coded.recognise_path(file.symbols, stroke.points, stroke.counts, margin=margin)
         else:
             found = coded.recognise(file.symbols, stroke.codes, stroke.counts, margin=0.0)
         label = int(found.label)

@@ -6,6 +6,9 @@ An `.npz` with the arrays `owner` (m,), the symbol that each model is a way to d
     {"format": "jaxfilters symbols", "version": 1, "names": [...], "emission": "shape" or "codes",
      "settings": {...}, "source": "what it was estimated from", "parameters": {...}}
 
+Where confidences and margins were fitted to strokes of people left out, `margins` (k,) has the nats a point by which
+each symbol has to beat the threshold model, and `settings` the share `sharpness` of a log-likelihood that counts.
+
 States of kind `shape` have `mean` and `variance` (m, Q, 3 d + 2) of the features of strokes in d dimensions, those of
 kind `codes` `log_codes` (m, Q, 17) and `log_counts` (m, Q, 6). `jaxfilters fit gestures` writes such files.
 """
@@ -71,12 +74,13 @@ def write_symbols(path: str | Path, file: SymbolsFile) -> None:
         directions, tips = emission.parts
         kind, values = CODES, (directions.log_probability, tips.log_probability)
         setting = directions.pseudo_count
+    sharpness, margins = file.symbols.sharpness, file.symbols.margins
     header = {
         "format": FORMAT,
         "version": VERSION,
         "names": list(file.symbols.names),
         "emission": kind,
-        "settings": {_SETTINGS[kind]: setting},
+        "settings": {_SETTINGS[kind]: setting} | ({} if sharpness is None else {"sharpness": float(sharpness)}),
         "source": file.source,
         "parameters": file.parameters,
     }
@@ -86,6 +90,7 @@ def write_symbols(path: str | Path, file: SymbolsFile) -> None:
         "log_initial": np.asarray(models.log_initial, np.float32),
         "log_transition": np.asarray(models.log_transition, np.float32),
         **{name: np.asarray(value, np.float32) for name, value in zip(_ARRAYS[kind], values, strict=True)},
+        **({} if margins is None else {"margins": np.asarray(margins, np.float32)}),
     }
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -123,7 +128,12 @@ def read_symbols(path: str | Path) -> SymbolsFile:
     models = HiddenMarkovModel(
         jnp.asarray(arrays["log_initial"], float), jnp.asarray(arrays["log_transition"], float), emission
     )
-    symbols = Symbols(models, jnp.asarray(arrays["owner"], jnp.int32), tuple(str(name) for name in names))
+    sharpness = settings.get("sharpness") if isinstance(settings, dict) else None
+    if sharpness is not None and not (isinstance(sharpness, int | float) and 0 < sharpness <= LARGEST):
+        raise InputError(f"{path}: sharpness must be positive; got {shown(sharpness)}.")
+    margins = jnp.asarray(arrays["margins"], float) if "margins" in arrays else None
+    owner = jnp.asarray(arrays["owner"], jnp.int32)
+    symbols = Symbols(models, owner, tuple(str(name) for name in names), sharpness, margins)
     return SymbolsFile(symbols, str(header.get("source", "")), header["parameters"])
 
 
@@ -151,8 +161,9 @@ def _check(arrays: dict[str, np.ndarray], kind: str, num_names: int, path: Path)
         "variance": (num_models, num_states, *symbols),
         "log_codes": (num_models, num_states, STILL),
         "log_counts": (num_models, num_states, MOST_TIPS + 1),
+        "margins": (num_names,),
     }
-    for name in needed:
+    for name in (*needed, *(["margins"] if "margins" in arrays else [])):
         if arrays[name].shape != shapes[name] or arrays[name].dtype.kind != ("i" if name == "owner" else "f"):
             raise InputError(
                 f"{path}: {name} must be numbers {shapes[name]}; got {arrays[name].shape} {arrays[name].dtype}."
