@@ -21,8 +21,9 @@ NUM_STATES, MIN_VARIANCE = 10, 0.1
 """Of strokes with several pieces or in space."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
-EXAMPLES_TO_PART = 40
-"""Examples of a symbol from which on models are trained to be told apart: with 8 of each no decision changes."""
+EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
+"""Examples of a symbol from which on models are trained to be told apart, of which fewer do: with 8 examples of each
+no decision changes, and with 20 ways models learn the training strokes by heart."""
 NUM_FOLDS, FEWEST_SCORES = 3, 20
 """Parts of the strokes that are left out in turn to calibrate, and recognised strokes that this takes."""
 
@@ -74,34 +75,34 @@ def learn_strokes(
         strokes: In two dimensions or in three.
         labels: The symbol of each.
         num_states: States of each model; `None` is as many as suit the kind of strokes.
-        num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`.
+        num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`, and at most
+            `MOST_WAYS_APART` of models that are trained to be told apart.
         min_variance: Floor of the variances of features; `None` is what suits the kind of strokes.
 
     Raises:
         ValueError: If there is no stroke, `labels` has another length, or a stroke has no sample or one that is not
             finite.
     """
-    ways = ways_of(labels) if num_variants is None else num_variants
     if is_path(strokes):
         paths = [(np.asarray(pieces[0]), np.full(len(pieces[0]), fingers, int)) for pieces, fingers in strokes]
         return learn_paths(
             paths,
             labels,
             num_states=num_states or PATH_STATES,
-            num_variants=ways,
+            num_variants=ways_of(labels) if num_variants is None else num_variants,
             min_variance=PATH_VARIANCE if min_variance is None else min_variance,
         )
     features = stacked(strokes)
+    are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
+    most = MOST_WAYS_APART if are_many else MOST_WAYS
     symbols = learn(
         features,
         labels,
         num_states=num_states or NUM_STATES,
-        num_variants=ways,
+        num_variants=min(ways_of(labels), most) if num_variants is None else num_variants,
         min_variance=MIN_VARIANCE if min_variance is None else min_variance,
     )
-    if np.median(np.unique(np.asarray(labels), return_counts=True)[1]) < EXAMPLES_TO_PART:
-        return symbols
-    return trained_apart(symbols, features, labels)
+    return trained_apart(symbols, features, labels) if are_many else symbols
 
 
 def leave_one_out(
