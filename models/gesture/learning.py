@@ -185,7 +185,8 @@ def calibrated(symbols: Symbols, scores: Scores) -> Symbols:
     if np.sum(scores.is_right & np.isfinite(scores.lead)) < FEWEST_SCORES:
         return symbols
     found = calibration.fitted(scores)
-    return replace(symbols, sharpness=found.sharpness, margins=jnp.asarray(found.margins, float))
+    margins = jnp.asarray(found.margins, float)
+    return replace(symbols, sharpness=found.sharpness, lapse=found.lapse, margins=margins)
 
 
 def judged(found: Sequence[LeftOut]) -> list[Judged]:
@@ -195,9 +196,9 @@ def judged(found: Sequence[LeftOut]) -> list[Judged]:
         others = [other.scores for other in found if other is not one]
         known = bool(others) and sum(int(other.is_right.sum()) for other in others) >= FEWEST_SCORES
         fitted = calibration.fitted(together(others)) if known else None
-        share = fitted.sharpness if fitted else SHARPNESS
+        share, lapse = (fitted.sharpness, fitted.lapse) if fitted else (SHARPNESS, 0.0)
         margins = fitted.margins if fitted else np.zeros(len(one.scores.log_likelihood))
-        confidence = calibration.confidences(one.scores, share)
+        confidence = calibration.confidences(one.scores, share, lapse)
         rows.append(Judged(one.person, one.scores.is_right, confidence, one.scores.lead - margins[one.scores.best]))
     return rows
 

@@ -36,6 +36,8 @@ class Symbols:
     names: tuple[str, ...] = field(metadata={"static": True})
     sharpness: Any = None
     """Share of a log-likelihood that counts towards confidence, of `calibration.fitted`; `None` is `SHARPNESS`."""
+    lapse: Any = None
+    """Probability that a stroke may be any symbol, of `calibration.fitted`; `None` is 0."""
     margins: Any = None
     """(k,): nats a point by which each symbol has to beat the threshold model, of `calibration.fitted`; `None` is 0."""
 
@@ -139,7 +141,9 @@ def extended(symbols: Symbols, others: Symbols) -> Symbols:
         margins = jnp.concatenate([jnp.asarray(own) for own in zeros])
     # A stroke of one set may be taken for a symbol of the other, of which nothing was measured: the less certain holds.
     shares = [float(one.sharpness) for one in (symbols, others) if one.sharpness is not None]
-    return Symbols(models, owner, symbols.names + others.names, min(shares, default=None), margins)
+    lapses = [float(one.lapse) for one in (symbols, others) if one.lapse is not None]
+    names = symbols.names + others.names
+    return Symbols(models, owner, names, min(shares, default=None), max(lapses, default=None), margins)
 
 
 def network(symbols: Symbols) -> hmm.Network:
@@ -247,9 +251,9 @@ def _decided(symbols, seen, bar, lengths, margin, distance, sharpness) -> Recogn
     accepted = possible & (lead >= own_margin + margin) & (apart >= distance)
     if sharpness is None:
         sharpness = SHARPNESS if symbols.sharpness is None else symbols.sharpness
-    return Recognition(
-        jnp.where(accepted, best, -1), jax.nn.softmax(sharpness * usual, axis=0), totals / num_points, lead
-    )
+    lapse = 0.0 if symbols.lapse is None else symbols.lapse
+    confidence = (1 - lapse) * jax.nn.softmax(sharpness * usual, axis=0) + lapse / len(symbols.names)
+    return Recognition(jnp.where(accepted, best, -1), confidence, totals / num_points, lead)
 
 
 @partial(jax.jit, static_argnames="max_iterations")

@@ -17,9 +17,21 @@ def drawn(num_strokes, share, seed=0):
 
 
 def test_the_temperature_that_strokes_were_drawn_with_is_found():
-    """Its standard deviation over 20 seeds is 1.1 %, so that 5 % fails by chance in one of 10^5 runs."""
+    """Of 20 000 strokes its standard deviation over seeds is 1.1 %, so that 6 % are five of them."""
     for share in (0.02, 0.3, 1.5):
-        assert abs(calibration.sharpness(drawn(20_000, share)) / share - 1) < 0.05
+        found, lapse = calibration.softness(drawn(20_000, share))
+        assert abs(found / share - 1) < 0.06
+        assert lapse < 0.01
+
+
+def test_strokes_that_are_any_symbol_do_not_change_the_temperature():
+    """One in ten: a binomial deviation of that share is 0.2 %."""
+    scores = drawn(20_000, 0.3)
+    rng = np.random.default_rng(1)
+    truth = np.where(rng.random(20_000) < 0.1, rng.integers(0, 4, 20_000), scores.truth)
+    share, lapse = calibration.softness(scores._replace(truth=truth))
+    assert abs(share / 0.3 - 1) < 0.1
+    assert abs(lapse - 0.1) < 0.02
 
 
 def test_confidences_of_the_right_temperature_are_calibrated_and_others_are_not():
