@@ -141,6 +141,25 @@ def leave_one_out(
     return found
 
 
+def cross_calibrated(
+    symbols: Symbols,
+    strokes: Sequence[Drawn],
+    labels: Sequence[str],
+    people: Sequence[str],
+    *,
+    num_states: int | None = None,
+    num_variants: int | None = None,
+) -> Symbols:
+    """`calibrated` by `cross_scores` of the strokes that the symbols were fitted to; as they are if these are too few.
+
+    Arguments are those of `leave_one_out`.
+    """
+    if len(strokes) < FEWEST_SCORES:
+        return symbols
+    found = cross_scores(strokes, labels, people, num_states=num_states, num_variants=num_variants)
+    return calibrated(symbols, found)
+
+
 def cross_scores(
     strokes: Sequence[Drawn],
     labels: Sequence[str],

@@ -8,14 +8,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxfilters.models.gesture.calibration import Scores, calibration_error
+from jaxfilters.models.gesture.calibration import calibration_error
 from jaxfilters.models.gesture.coded import codes_of, recognise_each
 from jaxfilters.models.gesture.learning import (
     Judged,
     LeftOut,
     accuracy,
     calibrated,
-    cross_scores,
+    cross_calibrated,
     judged,
     learn_strokes,
     leave_one_out,
@@ -76,7 +76,8 @@ def fit_gestures(options: argparse.Namespace) -> str:
             trained = as_input_error(lambda: calibrated(trained, together([one.scores for one in found])))
             lines = _of_held_out(judged(found))
         elif options.data:
-            trained = as_input_error(lambda: calibrated(trained, _crossed(examples, states, ways)))
+            drawings = (examples.strokes, examples.labels, examples.people)
+            trained = as_input_error(lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=ways))
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
         symbols = as_input_error(lambda: extended(before.symbols, trained)) if before else trained
         source = f"{before.source}; {source}" if before else source
@@ -198,10 +199,6 @@ def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
             csv.writer(content).writerows([COLUMNS, *rows])
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}.") from None
-
-
-def _crossed(examples: StrokeSet, states: int | None, ways: int | None) -> Scores:
-    return cross_scores(examples.strokes, examples.labels, examples.people, num_states=states, num_variants=ways)
 
 
 def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[LeftOut]:
