@@ -1,4 +1,4 @@
-"""Models of symbols trained to be told apart: maximum mutual information by gradient through the forward recursion.
+"""Discriminative training of models of symbols: maximum mutual information by gradient through the forward recursion.
 
 Maximum likelihood fits every model to its own strokes alone. Here the means and variances of all states maximise the
 conditional log-likelihood log p(symbol | stroke), as a softmax over the models' tempered log evidences (L. Bahl et al.,
@@ -10,7 +10,6 @@ the steps, to stand for other people's.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
+from scipy.linalg import expm
 
 from jaxfilters import hmm
 from jaxfilters.models.gesture.stroke import shape_features
@@ -49,7 +49,7 @@ class _Data(NamedTuple):
 def trained_apart(
     symbols: Symbols, features: Float[Array, "n p f"], labels: Sequence[str], *, num_epochs: int = NUM_EPOCHS
 ) -> Symbols:
-    """Models that tell the symbols of a set of strokes apart; transitions stay as they are.
+    """Models that separate the symbols of a set of strokes; transitions stay as they are.
 
     Args:
         symbols: Of `symbols.learn`, the start; of a single symbol they are returned as they are.
@@ -86,22 +86,23 @@ def trained_apart(
             own = order[i * batch : (i + 1) * batch]
             shown = jnp.asarray(data.features[own])
             if step % 2:
-                shown = distorted(jax.random.key(step), shown, data.dimensions)
+                shown = distorted(shown, jnp.asarray(distortions(rng, len(own), data.dimensions), shown.dtype))
             is_own = owner[rivals[own]] == classes[own, None]
             params, state = _step(_with(symbols, params), state, shown, rivals[own], is_own, decay(step))
     return _with(symbols, params)
 
 
-@partial(jax.jit, static_argnames="dimensions")
-def distorted(key: Array, features: Float[Array, "n p f"], dimensions: int) -> Float[Array, "n p f"]:
-    """Features of strokes after a random turn and stretch each, as if other people had drawn them."""
-    first, second = jax.random.split(key)
-    shape = (len(features), dimensions, dimensions)
-    loose = jax.random.normal(first, shape, features.dtype)
-    turn = TURN_RAD * (jnp.triu(loose, 1) - jnp.swapaxes(jnp.triu(loose, 1), 1, 2))
-    change = jax.scipy.linalg.expm(turn) @ (
-        jnp.eye(dimensions, dtype=features.dtype) + STRETCH * jax.random.normal(second, shape, features.dtype)
-    )
+def distortions(rng: np.random.Generator, num_strokes: int, dimensions: int) -> Float[np.ndarray, "n d d"]:
+    """Random matrices: a turn and a stretch for each stroke."""
+    shape = (num_strokes, dimensions, dimensions)
+    upper = np.triu(TURN_RAD * rng.normal(size=shape), 1)
+    return expm(upper - np.swapaxes(upper, 1, 2)) @ (np.eye(dimensions) + STRETCH * rng.normal(size=shape))
+
+
+@jax.jit
+def distorted(features: Float[Array, "n p f"], change: Float[Array, "n d d"]) -> Float[Array, "n p f"]:
+    """Features of strokes whose points went through a linear map each, as if other people had drawn them."""
+    dimensions = change.shape[-1]
     # Features of the shape do not depend on place and size, so that positions among them stand for the points.
     points = jnp.einsum("npd,ned->npe", features[..., :dimensions], change, precision="highest")
     return jnp.concatenate([jax.vmap(shape_features)(points), features[..., 3 * dimensions :]], axis=-1)

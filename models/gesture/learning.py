@@ -22,7 +22,7 @@ NUM_STATES, MIN_VARIANCE = 10, 0.1
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
 EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
-"""Examples of a symbol from which on models are trained to be told apart, of which fewer do: with 8 examples of each
+"""Examples of a symbol from which on models are trained discriminatively, of which fewer do: with 8 examples of each
 no decision changes, and with 20 ways models learn the training strokes by heart."""
 NUM_FOLDS, FEWEST_SCORES = 3, 20
 """Parts of the strokes that are left out in turn to calibrate, and recognised strokes that this takes."""
@@ -68,7 +68,7 @@ def learn_strokes(
 ) -> Symbols:
     """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
 
-    Others are fitted by `symbols.learn` and, where there are many, trained to be told apart by
+    Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
     `discriminative.trained_apart`.
 
     Args:
@@ -76,7 +76,7 @@ def learn_strokes(
         labels: The symbol of each.
         num_states: States of each model; `None` is as many as suit the kind of strokes.
         num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`, and at most
-            `MOST_WAYS_APART` of models that are trained to be told apart.
+            `MOST_WAYS_APART` of models that are trained discriminatively.
         min_variance: Floor of the variances of features; `None` is what suits the kind of strokes.
 
     Raises:

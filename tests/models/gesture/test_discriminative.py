@@ -1,10 +1,9 @@
-"""Models that are trained to be told apart: what the gradient does to them, and how they recognise strokes."""
+"""Discriminative training: what the gradient does to them, and how they recognise strokes."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from jaxfilters import hmm
 from jaxfilters.models.gesture import discriminative, symbols
@@ -24,7 +23,7 @@ def paths(num_strokes, bump, seed):
 
 
 @pytest.mark.system
-def test_strokes_of_a_small_difference_are_told_apart_better(monkeypatch):
+def test_strokes_of_a_small_difference_are_separated_better(monkeypatch):
     """Of 400 strokes; by maximum likelihood 90 % are right, and a deviation is 1.5 %."""
     monkeypatch.setattr(discriminative, "CHUNK", 128)
     monkeypatch.setattr(symbols, "CHUNK", 512)
@@ -42,18 +41,16 @@ def test_strokes_of_a_small_difference_are_told_apart_better(monkeypatch):
     assert np.asarray(after.models.emission.variance).min() >= 0.5 * before.models.emission.min_variance - 1e-6
 
 
-def test_distortions_are_linear_maps_of_the_points(monkeypatch):
+def test_distortions_of_features_are_linear_maps_of_the_points(monkeypatch):
     """Without a stretch they are turns, which change directions and positions alike."""
     monkeypatch.setattr(discriminative, "STRETCH", 0.0)
     features = jnp.asarray(paths(3, 0.4, 0))
-    fresh = jax.jit(discriminative.distorted.__wrapped__, static_argnums=2)
-    turned = np.asarray(fresh(jax.random.key(1), features, 2))
-    for before, after in zip(np.asarray(features), turned, strict=True):
-        found = Rotation.align_vectors(np.pad(after[:, :2], ((0, 0), (0, 1))), np.pad(before[:, :2], ((0, 0), (0, 1))))[
-            0
-        ].as_matrix()[:2, :2]
-        np.testing.assert_allclose(after[:, :2], before[:, :2] @ found.T, atol=1e-4)
-        np.testing.assert_allclose(after[:, 2:4], before[:, 2:4] @ found.T, atol=2e-3)
+    turns = discriminative.distortions(np.random.default_rng(0), 3, 2)
+    np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(2), (3, 1, 1)), atol=1e-12)
+    turned = np.asarray(discriminative.distorted(features, jnp.asarray(turns, jnp.float32)))
+    for before, after, turn in zip(np.asarray(features), turned, turns, strict=True):
+        np.testing.assert_allclose(after[:, :2], before[:, :2] @ turn.T, atol=1e-4)
+        np.testing.assert_allclose(after[:, 2:4], before[:, 2:4] @ turn.T, atol=2e-3)
         np.testing.assert_array_equal(after[:, 6:], before[:, 6:])
 
 
