@@ -15,7 +15,7 @@ from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.people.checkpoints import has_checkpoint, load, save
 from jaxfilters.trackers.people.recorded import Sighting, height_of, spreads
 from jaxfilters.trackers.people.session import PeopleSession
-from jaxfilters.trackers.people.silhouettes import body_of, place_of
+from jaxfilters.trackers.people.silhouettes import body_of, observed_place
 from jaxfilters.trackers.people.state import PeopleScene
 
 COLUMNS = ("frame", "id", "x_m", "y_m", "radial_std_m", "lateral_std_m", "height_m", "score", "mode")
@@ -137,7 +137,7 @@ def write_mot(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]],
     """
     lines = []
     for identity, seen in by_frame(tracks):
-        shown = outline(scene.cameras[camera].P, body_of(place_of(jnp.asarray(seen.mean, jnp.float32))))
+        shown = outline(scene.cameras[camera].P, body_of(observed_place(scene, jnp.asarray(seen.mean, jnp.float32))))
         if int(shown.code) != VISIBLE:
             continue
         left, top, right, bottom = (float(edge) for edge in ellipse_of(shown).box)

@@ -1,5 +1,6 @@
 """Where the silhouettes say that everybody is: joint search over position and height, and how sure that is."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,16 +10,17 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
     contrasts_of,
     line_of_sight,
     log_likelihood,
-    place_of,
+    observed_place,
     share_seen,
     unexplained_of,
     views_of,
 )
-from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleScene
+from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, CameraFrame, PeopleScene
 
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction a person is searched for, along each axis."""
@@ -34,6 +36,8 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
 """Inverse square metres: below it a direction counts as not observed at all."""
+LEAST_PROBE_M, MOST_PROBE_M = 0.1, 0.2
+"""Bounds on the distance over which the flattest direction is taken for a parabola."""
 PASSES = 2
 NEAR_M = 1.5
 """Two who are nearer may be one."""
@@ -79,10 +83,11 @@ def fit_people(
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
     """
-    start = place_of(predicted.mean)
-    prior = _prior(predicted)
+    start = jax.vmap(observed_place, in_axes=(None, 0))(scene, predicted.mean)
+    covariance = _observed_covariance(scene, predicted)
+    prior = jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
-    reach = _reach(predicted, axes)
+    reach = _reach(covariance, axes)
     views = jax.vmap(views_of, in_axes=(None, None, 0, 0, 0))(scene, frames, start, axes, reach)
     order = _nearest_first(scene, views, start, active)
 
@@ -130,13 +135,19 @@ def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
         candidates = places[k] + jnp.concatenate([around * steps[k], -away, away]) @ axes[k]
-        values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
+
+        def likelihood(place):
+            return log_likelihood(scene, place, mine, contrasts)
+
+        values = jax.vmap(likelihood)(candidates)
         scores = values / scene.config.independent_patches
+        quadratic = foreground.quadratic_fit(values[:-2], steps[k])
+        quadratic = _widened(quadratic, lambda d: likelihood(places[k] + d @ axes[k]), values[middle])
         fit = Fit(
             places[k],
             axes[k],
             steps[k],
-            foreground.quadratic_fit(values[:-2], steps[k]),
+            quadratic,
             scores[middle],
             share_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
@@ -157,6 +168,25 @@ def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
     )
     order = jnp.argsort(~active)
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
+
+
+def _widened(quadratic: Quadratic, likelihood: Callable[[Array], Array], value: Array) -> Quadratic:
+    """The parabola with slope and curvature along its flattest direction from points about a standard deviation away.
+
+    Feet and head of a person who is taller and nearer change little in one image: over a few pixels, which fit the
+    other directions, noise decides about the slope of that ridge.
+    """
+    eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
+    flattest, curvature = vectors[:, 0], eigenvalues[0]
+    step = 1 / jnp.sqrt(jnp.clip(curvature, MOST_PROBE_M**-2, LEAST_PROBE_M**-2))
+    before, after = jax.vmap(likelihood)(jnp.array([-1.0, 1.0])[:, None] * step * flattest)
+    slope = (after - before) / (2 * step)
+    bend = (2 * value - before - after) / step**2
+    return Quadratic(
+        quadratic.value,
+        quadratic.gradient + (slope - quadratic.gradient @ flattest) * flattest,
+        quadratic.curvature + (bend - curvature) * jnp.outer(flattest, flattest),
+    )
 
 
 def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
@@ -192,7 +222,7 @@ def as_measurement(
         eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
         seen = eigenvalues > LEAST_CURVATURE
         curvature = jnp.where(seen, eigenvalues, 1.0)
-        limit = jnp.linalg.norm(steps)
+        limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_PROBE_M))
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
         return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen
@@ -200,10 +230,11 @@ def as_measurement(
     return jax.vmap(one)(fit.place, fit.axes, fit.steps, fit.quadratic)
 
 
-def _prior(predicted):
-    pick = jnp.array(PLACE)
-    covariance = predicted.covariance[:, pick[:, None], pick]
-    return jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
+def _observed_covariance(scene, predicted):
+    """Of what the silhouettes show: places and their displacements by the biases."""
+    factors = jax.vmap(bias_factor, in_axes=(None, 0))(scene, predicted.mean)
+    shows = jnp.broadcast_to(jnp.eye(STATE)[jnp.array(PLACE)], (len(factors), 4, STATE)).at[:, :, BIAS].set(factors)
+    return jnp.einsum("kpi,kij,kqj->kpq", shows, predicted.covariance, shows)
 
 
 def _axes(scene, place):
@@ -212,19 +243,12 @@ def _axes(scene, place):
 
 def _steps(scene, places):
     """From the size of a pixel of the camera that sees each person finest."""
-
-    def pixel_m(camera):
-        first, second, third = camera.P[:, :3]
-        focal = jnp.sqrt(jnp.linalg.norm(jnp.cross(first, third)) * jnp.linalg.norm(jnp.cross(second, third)))
-        depth = camera.project(jnp.insert(places[:, :2], 2, 1.0, axis=1))[1]
-        return jnp.where(depth > 0, depth, jnp.inf) / focal
-
-    finest = jnp.min(jnp.stack([pixel_m(camera) for camera in scene.cameras]), axis=0)
+    finest = jnp.min(jnp.stack([pixel_m(camera, places[:, :2]) for camera in scene.cameras]), axis=0)
     return jnp.clip(CURVATURE_PX * finest, LEAST_STEP_M, MOST_STEP_M)[:, None] * jnp.array(STEP_SHARES)
 
 
-def _reach(predicted, axes):
-    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], predicted.covariance[:, :2, :2], axes[:, :2, :2])
+def _reach(covariance, axes):
+    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], covariance[:, :2, :2], axes[:, :2, :2])
     return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
 
 
