@@ -1,6 +1,5 @@
 """Where the silhouettes say that everybody is: joint search over position and height, and how sure that is."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -36,8 +35,8 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
 """Inverse square metres: below it a direction counts as not observed at all."""
-LEAST_PROBE_M, MOST_PROBE_M = 0.1, 0.2
-"""Bounds on the distance over which the flattest direction is taken for a parabola."""
+MOST_SHIFT_M = 0.2
+"""A reading along a direction in which the score is flat is no farther than this from where the search ended."""
 PASSES = 2
 NEAR_M = 1.5
 """Two who are nearer may be one."""
@@ -135,19 +134,13 @@ def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
         candidates = places[k] + jnp.concatenate([around * steps[k], -away, away]) @ axes[k]
-
-        def likelihood(place):
-            return log_likelihood(scene, place, mine, contrasts)
-
-        values = jax.vmap(likelihood)(candidates)
+        values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
         scores = values / scene.config.independent_patches
-        quadratic = foreground.quadratic_fit(values[:-2], steps[k])
-        quadratic = _widened(quadratic, lambda d: likelihood(places[k] + d @ axes[k]), values[middle])
         fit = Fit(
             places[k],
             axes[k],
             steps[k],
-            quadratic,
+            foreground.quadratic_fit(values[:-2], steps[k]),
             scores[middle],
             share_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
@@ -168,25 +161,6 @@ def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
     )
     order = jnp.argsort(~active)
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
-
-
-def _widened(quadratic: Quadratic, likelihood: Callable[[Array], Array], value: Array) -> Quadratic:
-    """The parabola with slope and curvature along its flattest direction from points about a standard deviation away.
-
-    Feet and head of a person who is taller and nearer change little in one image: over a few pixels, which fit the
-    other directions, noise decides about the slope of that ridge.
-    """
-    eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
-    flattest, curvature = vectors[:, 0], eigenvalues[0]
-    step = 1 / jnp.sqrt(jnp.clip(curvature, MOST_PROBE_M**-2, LEAST_PROBE_M**-2))
-    before, after = jax.vmap(likelihood)(jnp.array([-1.0, 1.0])[:, None] * step * flattest)
-    slope = (after - before) / (2 * step)
-    bend = (2 * value - before - after) / step**2
-    return Quadratic(
-        quadratic.value,
-        quadratic.gradient + (slope - quadratic.gradient @ flattest) * flattest,
-        quadratic.curvature + (bend - curvature) * jnp.outer(flattest, flattest),
-    )
 
 
 def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
@@ -222,7 +196,7 @@ def as_measurement(
         eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
         seen = eigenvalues > LEAST_CURVATURE
         curvature = jnp.where(seen, eigenvalues, 1.0)
-        limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_PROBE_M))
+        limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_SHIFT_M))
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
         return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen

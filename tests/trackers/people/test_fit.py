@@ -9,7 +9,7 @@ import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
-from jaxfilters.trackers.people.fit import MOST_PROBE_M, Fit, _nearest_first, as_measurement, fit_people
+from jaxfilters.trackers.people.fit import MOST_SHIFT_M, Fit, _nearest_first, as_measurement, fit_people
 from jaxfilters.trackers.people.state import STATE, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -68,7 +68,7 @@ def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_m
     y, H, R, seen = (np.asarray(leaf)[0] for leaf in as_measurement(fit, 0.0))
     assert seen.sum() == 2
     assert np.isfinite(R).all()
-    assert np.abs(y - H @ np.asarray(fit.place)[0]).max() <= 1.001 * MOST_PROBE_M
+    assert np.abs(y - H @ np.asarray(fit.place)[0]).max() <= 1.001 * MOST_SHIFT_M
 
 
 @pytest.fixture(scope="module")
