@@ -6,7 +6,7 @@ The filter is `rao_blackwell_shared` on the 22-number hand with `HandMotion`; it
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,13 +24,13 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.motion import HandMotion, per_coordinate
 from jaxfilters.models.hand.observation import (
-    REACH,
     HandImage,
     HandLikelihood,
     crop,
     hand_image,
     isolate,
     union,
+    window_stride,
 )
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
 from jaxfilters.models.hand.skeleton import (
@@ -40,22 +40,21 @@ from jaxfilters.models.hand.skeleton import (
     hand_center,
     hand_geometry,
     local,
-    mirrored,
     open_palm,
     retract,
 )
-from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
+from jaxfilters.models.hand.start import BATCH, SCALES, Start, find_starts, registered
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.trackers.hand_depth.detect import nearest_hand
+from jaxfilters.trackers.hand_depth.detect import NEAREST, hand_sightings
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
 from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
-SEARCHING, TRACKING, LOST = range(3)
+SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
 
 
 @dataclass(frozen=True)
@@ -66,9 +65,10 @@ class HandDepthConfig:
     """`rbpf` carries the velocity of each particle in a Kalman filter, `pf` has none."""
     num_particles: int = 512
     stride: int | None = None
-    """Every how many pixels one is compared; `None` chooses for a hand at 0.6 m to fill the window."""
+    """Every how many pixels one is compared; `None` lets the hand fill the window at any distance."""
     seed: int = 0
     hand: str = "right"
+    """`right`, `left`, or `auto`, which decides between them by what they explain."""
     scale: float | None = None
     """Size of the hand relative to the average adult's; `None` fits it to the first frame."""
     guide: bool = True
@@ -81,13 +81,15 @@ class HandDepthConfig:
     def __post_init__(self) -> None:
         choices = {
             "filter": ("rbpf", "pf"),
-            "hand": ("right", "left"),
+            "hand": ("right", "left", "auto"),
             "surface": ("capsules", "mesh"),
             "missing": ("auto", "background", "unknown"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        if self.hand == "auto" and self.surface == "mesh":
+            raise ValueError("hand must be right or left where surface is mesh; got auto.")
         if self.num_particles < 1:
             raise ValueError(f"num_particles must be at least 1; got {self.num_particles}.")
         if self.stride is not None and self.stride < 1:
@@ -112,6 +114,22 @@ PATIENCE = 5
 """Frames in a row without the hand before it is searched anew."""
 FRAME_INTERVAL = 1 / 30
 """Seconds before the first frame."""
+SECOND_CHANCE, RACE_INTERVAL, QUIET_INTERVAL = 0.3, 1.0, 3.0
+"""Seconds from a start to the first race of new starts against the track, between races while it is doubtful, and
+while it is not."""
+NUM_RACING = BATCH
+"""Hypotheses that are registered for a race."""
+BETTER = 0.85
+"""Share of the cost of the track, or of the hand that was asked for, below which another explanation is better."""
+AS_GOOD = 1.03
+"""Share of the cost of the track up to which another explanation puts it in doubt."""
+DIFFERENT = 0.025
+"""Metres between the joints of two explanations, in the mean, from which on they are different."""
+DOUBTFUL_COST = 0.03
+"""Metres, as `Start.cost`, above which a start explains the frame too badly to be believed."""
+WORST_START = 0.04
+"""Metres, likewise, above which nothing is believed to be a hand."""
+SIDES = {"right": 1.0, "left": -1.0}
 
 MOTION = HandMotion(
     per_coordinate(0.008, 0.064, math.radians(12)) ** 2 * 30,
@@ -131,6 +149,12 @@ class TrackState(NamedTuple):
     """Of the filter."""
     scale: Float[Array, ""]
     """Size of the hand relative to the average one; NaN until it was fitted to a frame."""
+    side: Float[Array, ""]
+    """+1 for a right hand, -1 for a left hand; NaN until it was decided."""
+    doubt: Array
+    """Whether another explanation is as good, or this one is bad."""
+    race_time: Float[Array, ""]
+    """Seconds: from when on the next frame has new starts compete with the track."""
     missing_is_background: Array
     time: Float[Array, ""]
     """Of the last frame, seconds."""
@@ -147,17 +171,26 @@ class _Setup:
     likelihood: HandLikelihood
     """Of the hand of scale 1."""
     config: HandDepthConfig = field(metadata={"static": True})
-    stride: int = field(metadata={"static": True})
+    stride: int | None = field(metadata={"static": True})
+
+    def spacing(self, depth: Float[Array, ""]) -> float | Float[Array, ""]:
+        """Pixels of the frame for one of the window about a hand at `depth` metres."""
+        return window_stride(self.camera, depth, WINDOW[1]) if self.stride is None else self.stride
+
+    def hand(self, state: "TrackState") -> HandLikelihood:
+        """The likelihood of the hand that is tracked."""
+        scaled = self.likelihood.scaled(state.scale)
+        geometry = replace(scaled.geometry, side=state.side)
+        return replace(scaled, surface=replace(scaled.surface, geometry=geometry))
 
 
 def build(camera: Pinhole, config: HandDepthConfig | None = None) -> Tracker:
     """A hand tracker for the frames of one depth camera."""
     config = config or HandDepthConfig()
-    stride = config.stride or max(1, round(float(camera.focal[0]) * 2 * REACH / 0.6 / WINDOW[1]))
-    geometry = hand_geometry() if config.hand == "right" else mirrored(hand_geometry())
+    geometry = replace(hand_geometry(), side=jnp.asarray(SIDES.get(config.hand, 1.0), dtype=float))
     surface = CapsuleHand(geometry) if config.surface == "capsules" else triangle_hand(geometry)
     likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
-    setup = _Setup(camera, likelihood, config, stride)
+    setup = _Setup(camera, likelihood, config, config.stride)
     return Tracker(partial(_start, setup), partial(_advance, setup))
 
 
@@ -188,57 +221,116 @@ def _start(setup: _Setup, key: Array, frame: np.ndarray) -> TrackState:
     background = {"auto": share_missing > 0.5, "background": True, "unknown": False}[setup.config.missing]
     key, place_key = jax.random.split(key)
     scale = jnp.asarray(setup.config.scale or math.nan, dtype=float)
-    nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
+    side = jnp.asarray(SIDES.get(setup.config.hand, math.nan), dtype=float)
     state = TrackState(
-        _placed(setup, place_key, nowhere, scale),
-        scale,
-        jnp.asarray(background),
-        jnp.asarray(-FRAME_INTERVAL, dtype=float),
-        jnp.asarray(PATIENCE, jnp.int32),
-        key,
+        ensemble=None,
+        scale=scale,
+        side=side,
+        doubt=jnp.asarray(False),
+        race_time=jnp.asarray(math.inf, dtype=float),
+        missing_is_background=jnp.asarray(background),
+        time=jnp.asarray(-FRAME_INTERVAL, dtype=float),
+        misses=jnp.asarray(PATIENCE, jnp.int32),
+        key=key,
     )
-    return _search(setup, state, frame)
+    nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
+    state = state._replace(ensemble=_placed(setup, place_key, nowhere, state))
+    return _search(setup, state, frame, 0.0)
 
 
-def _search(setup: _Setup, state: TrackState, frame: np.ndarray) -> TrackState:
+def _search(setup: _Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
     """Place the ensemble anew where the frame shows a hand, of the known size if any; unchanged where it shows none."""
-    sighting = nearest_hand(setup.camera, np.asarray(frame))
-    if sighting is None:
+    starts = []
+    for sighting in hand_sightings(setup.camera, np.asarray(frame)):
+        window = _window(setup, state, sighting.frame, sighting.center)
+        starts += find_starts(*window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
+    wanted = [start for start in starts if not start.side * float(state.side) < 0]
+    if not wanted:
         return state
-    scales = jnp.where(jnp.isnan(state.scale), jnp.array(SCALES), state.scale)
-    image = _filled(jnp.asarray(frame), state.missing_is_background)
-    # Stretched fingers look like an arm to the detector, so what it took for one must prove itself.
-    candidates = [
-        _match(setup.camera, setup.likelihood, setup.stride, image, seen, scales)
-        for seen in (sighting, sighting._replace(forearm=jnp.zeros_like(sighting.forearm)))
-    ]
-    found = min(candidates, key=lambda start: float(start.cost))
-    if not found.cost < LOST_COST:
+    found = min(wanted, key=lambda start: start.cost)
+    if not found.cost < WORST_START:
         return state
+    best = min(start.cost for start in starts)
+    doubt = found.cost > DOUBTFUL_COST or best < BETTER * found.cost
+    return _begun(setup, state, found, time, doubt)
+
+
+def _race(setup: _Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
+    """Let new starts compete with the track on one frame: the better one goes on, in doubt if they differ in vain.
+
+    They look where the track is. A track that lost the hand altogether is lost by its own cost, and searched for.
+    """
+    pose, _ = pose_moments(*_particles(state.ensemble))
+    scale, side = float(state.scale), float(state.side)
+    palm = np.asarray(hand_center(pose, 0.6 * scale))
+    if not (np.isfinite(palm).all() and palm[2] > NEAREST):
+        return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
+    window = _window(setup, state, np.asarray(frame), palm)
+    average = setup.likelihood.geometry
+    track = registered(*window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
+    sides = (1.0, -1.0) if setup.config.hand == "auto" else (side,)
+    sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
+    starts = find_starts(*window, palm, average, sizes, sides, NUM_RACING)
+    rivals = [start for start in starts if _distance(average, start, track) > DIFFERENT]
+    rival = min(rivals, key=lambda start: start.cost, default=None)
+    if rival is not None and rival.cost < BETTER * track.cost:
+        return _begun(setup, state, rival, time, rival.cost > DOUBTFUL_COST)
+    doubt = track.cost > DOUBTFUL_COST or (rival is not None and rival.cost < AS_GOOD * track.cost)
+    pause = RACE_INTERVAL if doubt else QUIET_INTERVAL
+    return state._replace(doubt=jnp.asarray(doubt), race_time=jnp.asarray(time + pause, dtype=float))
+
+
+def _begun(setup: _Setup, state: TrackState, found: Start, time: float, doubt: bool) -> TrackState:
+    """The state with an ensemble about a start."""
     key, place_key = jax.random.split(state.key)
-    ensemble = _placed(setup, place_key, found.pose, found.scale)
-    return state._replace(ensemble=ensemble, scale=found.scale, misses=jnp.zeros_like(state.misses), key=key)
+    state = state._replace(
+        scale=jnp.asarray(found.scale, dtype=float),
+        side=jnp.asarray(found.side, dtype=float),
+        doubt=jnp.asarray(doubt),
+        race_time=jnp.asarray(time + SECOND_CHANCE, dtype=float),
+        misses=jnp.zeros_like(state.misses),
+        key=key,
+    )
+    return state._replace(ensemble=_placed(setup, place_key, jnp.asarray(found.pose), state))
 
 
-@partial(jax.jit, static_argnames="stride")
-def _match(
-    camera: Pinhole, likelihood: HandLikelihood, stride: int, frame: Array, sighting: Sighting, scales: Array
-) -> Start:
-    """The best start in a window about the sighting; apart from the set-up, so that all filters share its program."""
-    camera, observed = crop(camera, frame, sighting.center, WINDOW, stride)
-    return find_start(camera, observed, sighting, likelihood, scales)
+def _sizes(state: TrackState) -> tuple[float, ...]:
+    scale = float(state.scale)
+    return SCALES if math.isnan(scale) else (scale,)
+
+
+def _window(setup: _Setup, state: TrackState, frame: np.ndarray, center: np.ndarray) -> tuple[Pinhole, Array]:
+    return _cropped(setup, jnp.asarray(frame), jnp.asarray(center), state.missing_is_background)
 
 
 @jax.jit
-def _placed(setup: _Setup, key: Array, pose: Array, scale: Array) -> Any:
+def _cropped(setup: _Setup, frame: Array, center: Array, missing_is_background: Array) -> tuple[Pinhole, Array]:
+    return crop(setup.camera, _filled(frame, missing_is_background), center, WINDOW, setup.spacing(center[2]))
+
+
+def _distance(average: HandGeometry, one: Start, other: Start) -> float:
+    """Between the joints of two hands, metres, in the mean."""
+    joints = [
+        _joints(jnp.asarray(each.pose), replace(average.scaled(each.scale), side=jnp.asarray(each.side, dtype=float)))
+        for each in (one, other)
+    ]
+    return float(jnp.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+
+
+@jax.jit
+def _joints(pose: Array, geometry: HandGeometry) -> Array:
+    return forward_kinematics(pose, geometry).joints
+
+
+@jax.jit
+def _placed(setup: _Setup, key: Array, pose: Array, state: TrackState) -> Any:
     """An ensemble about a pose."""
-    filter = _filter(setup, pose, scale)
+    filter = _filter(setup, pose, setup.hand(state))
     return filter.init(filter.params, key)
 
 
-def _filter(setup: _Setup, pose: Array, scale: Array) -> Filter:
-    """The filter of a hand of the given scale that starts about `pose`."""
-    likelihood = setup.likelihood.scaled(scale)
+def _filter(setup: _Setup, pose: Array, likelihood: HandLikelihood) -> Filter:
+    """The filter of a hand that starts about `pose`."""
     with_velocity = setup.config.filter == "rbpf"
     velocity = START_VELOCITY_STD if with_velocity else START_VELOCITY_STD[:0]
     inner = rao_blackwell_shared(
@@ -295,16 +387,17 @@ def _advance(setup: _Setup, state: TrackState, frames: np.ndarray, times: np.nda
     pieces, first = [], 0
     while first < len(frames):
         if int(state.misses) >= PATIENCE:
-            state = _search(setup, state, frames[first])
+            state = _search(setup, state, frames[first], float(times[first]))
             state = state._replace(time=jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float))
+        elif float(state.race_time) <= float(times[first]):
+            state = _race(setup, state, frames[first], float(times[first]))
         if int(state.misses) >= PATIENCE:
             pieces.append(_nothing_found())
             first += 1
             continue
-        state, (track, misses) = _scan(setup, state, frames, times, first)
+        state, (track, done) = _scan(setup, state, frames, times, first)
         state = _through_the_host(state)
-        gone = np.flatnonzero((np.asarray(misses) >= PATIENCE) & (np.arange(len(frames)) >= first))
-        end = int(gone[0]) + 1 if len(gone) else len(frames)
+        end = first + int(np.sum(done))
         pieces.append(jax.tree.map(lambda rows: np.asarray(rows)[first:end], track))  # noqa: B023
         first = end
     return state, HandTrack(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
@@ -321,7 +414,7 @@ def _through_the_host(state: TrackState) -> TrackState:
 def _scan(
     setup: _Setup, state: TrackState, frames: Array, times: Array, first: Array
 ) -> tuple[TrackState, tuple[HandTrack, Array]]:
-    """Track from frame `first` until the hand has been missed too often; the state stands still from there on."""
+    """Track from frame `first` until the hand was missed too often or a race is due; the state then stands still."""
 
     def skip(state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
         _, track = jax.eval_shape(partial(_step, setup), state, frame, time)
@@ -329,9 +422,9 @@ def _scan(
 
     def body(state: TrackState, inputs: tuple) -> tuple[TrackState, tuple[HandTrack, Array]]:
         frame, time, index = inputs
-        active = (index >= first) & (state.misses < PATIENCE)
+        active = (index >= first) & (state.misses < PATIENCE) & ((index == first) | (time < state.race_time))
         state, track = jax.lax.cond(active, partial(_step, setup), skip, state, frame, time)
-        return state, (track, state.misses)
+        return state, (track, active)
 
     return jax.lax.scan(body, state, (frames, times, jnp.arange(frames.shape[0])))
 
@@ -340,11 +433,12 @@ def _scan(
 def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
-    filter = _filter(setup, open_palm(jnp.zeros(3)), state.scale)
+    likelihood = setup.hand(state)
+    filter = _filter(setup, open_palm(jnp.zeros(3)), likelihood)
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
     expected, _ = pose_moments(*_particles(predicted))
-    image = look(setup.camera, _filled(frame, state.missing_is_background), expected, state.scale, setup.stride)
+    image = look(setup, _filled(frame, state.missing_is_background), expected, state.scale)
 
     def update(ensemble: Any) -> tuple[Any, ParticleInfo]:
         return filter.update(filter.params, update_key, ensemble, image, elapsed)
@@ -356,7 +450,6 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
     something = image.observed_count >= FEWEST_PIXELS
     ensemble, info = jax.lax.cond(something, update, coast, predicted)
     pose, covariance = pose_moments(*_particles(ensemble))
-    likelihood = setup.likelihood.scaled(state.scale)
     seen = something & (likelihood.cost(pose, image) < LOST_COST)
     misses = jnp.where(seen, 0, state.misses + 1)
     track = HandTrack(
@@ -365,16 +458,16 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
         joints=forward_kinematics(pose, likelihood.geometry).joints,
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
-        status=jnp.where(seen, TRACKING, LOST).astype(jnp.int32),
+        status=jnp.where(seen, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
     return state._replace(ensemble=ensemble, time=time, misses=misses, key=key), track
 
 
-def look(camera: Pinhole, frame: Array, expected: Float[Array, " 22"], scale: float | Array, stride: int) -> HandImage:
+def look(setup: _Setup, frame: Array, expected: Float[Array, " 22"], scale: Float[Array, ""]) -> HandImage:
     """The window of a frame in which a hand is expected, with everything else taken out."""
     center = hand_center(expected, scale)
     center = center.at[2].set(jnp.maximum(center[2], 0.1))  # a lost hand may be predicted behind the camera
-    window, observed = crop(camera, frame, center, WINDOW, stride)
+    window, observed = crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
     return hand_image(window, isolate(window, observed, expected, scale))
 
 
