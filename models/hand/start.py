@@ -40,9 +40,15 @@ NUM_ROLLS = 12
 TILTS = np.deg2rad([-45.0, 0.0, 45.0])
 """Of the fingers towards the camera and away from it."""
 SCALES = (0.85, 0.925, 1.0, 1.075, 1.15)
-BATCH = 12
-"""Hypotheses in one compiled call."""
-NUM_REGISTERED, NUM_FINALISTS = 48, 6
+STRAIGHT, BENT = np.deg2rad([[0.0, 0.0, 0.0], [45.0, 0.0, 70.0]])
+"""Angles of a finger in two of the variants of a finalist."""
+TURN = 0.25
+"""Radians about the palm's normal, to either side, of two more."""
+BATCH = 14
+"""Hypotheses in one compiled call; the variants of one finalist."""
+NUM_VARIED = (4, 2)
+"""Finalists that are varied, in the first and in the second round."""
+NUM_REGISTERED, NUM_FINALISTS = 56, 6
 """Hypotheses that are registered with the middle one of the sizes, and of these with every size."""
 REGISTRATION_STRIDE, JUDGING_STRIDE = 4, 2
 """Every how many pixels of the window one is used; coarser pixels mistake the back of a hand for its palm."""
@@ -152,12 +158,65 @@ def find_starts(
         tried = tried.rows(np.repeat(finalists, len(scales)))._replace(scales=repeats)
     else:
         tried = tried.rows(finalists)
-    tried, costs = _refined(image, tried, FINE)
-    costs = costs + UNUSUAL_SIZE * (np.log(tried.scales) / SIZE_STD) ** 2
+    tried, costs = _sized(*_refined(image, tried, FINE))
+    for count in NUM_VARIED[:1] if num_registered < NUM_REGISTERED else NUM_VARIED:
+        best = tried.rows(_distinct(tried, costs))
+        varied, varied_costs = _sized(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
+        tried = Hypotheses(*(np.concatenate(leaves) for leaves in zip(tried, varied, strict=True)))
+        costs = np.concatenate([costs, varied_costs])
     return [
         Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
         for i in _distinct(tried, costs)
     ]
+
+
+def _sized(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray]:
+    """Costs with what an unusual size costs more."""
+    return tried, costs + UNUSUAL_SIZE * (np.log(tried.scales) / SIZE_STD) ** 2
+
+
+def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
+    """What registration cannot reach from a finalist.
+
+    One digit straight or bent, all fingers off by one, and the hand of the other side, as it is or turned over.
+    """
+    poses, scales, found_sides = [], [], []
+    turned_over, aside = np.array([0.0, 0.0, 1.0, 0.0]), np.array([math.cos(TURN / 2), 0.0, 0.0, math.sin(TURN / 2)])
+    for pose, scale, side in zip(*finalists, strict=True):
+        variants = []
+        for digit in range(5):
+            for angles in (STRAIGHT, BENT):
+                variant = pose.copy()
+                variant[7 + 3 * digit : 10 + 3 * digit] = angles if digit else 0.5 * angles[::-1]
+                variants.append((variant, side))
+        other = -side if -side in sides else side
+        for turn, to in ((turned_over, other), (np.array([1.0, 0.0, 0.0, 0.0]), other), (aside, side)):
+            variants.append((_turned(pose, scale, turn), to))
+        variants.append((_turned(pose, scale, aside * [1, -1, -1, -1]), side))
+        for variant, to in variants:
+            poses.append(variant)
+            scales.append(scale)
+            found_sides.append(to)
+    return Hypotheses(np.stack(poses), np.asarray(scales, np.float32), np.asarray(found_sides, np.float32))
+
+
+def _turned(pose: np.ndarray, scale: float, turn: np.ndarray) -> np.ndarray:
+    """The pose turned in its own frame by a quaternion, about the middle of its palm."""
+    before, turned = pose[3:7], _product(pose[3:7], turn)
+    middle = pose[:3] - PALM_TO_WRIST * scale * _second_axis(before)
+    wrist = middle + PALM_TO_WRIST * scale * _second_axis(turned)
+    return np.concatenate([wrist, turned, pose[7:]]).astype(np.float32)
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    vector = p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], vector])
+
+
+def _second_axis(q: np.ndarray) -> np.ndarray:
+    """Where a rotation takes the y axis."""
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
 
 
 def registered(

@@ -21,6 +21,8 @@ USUAL_INSET = 0.038
 APART = 0.07
 """Metres between the middles of two palms that are tried."""
 MOST_SIGHTINGS = 3
+FARTHER = 0.6
+"""Metres behind the nearest of these places within which others are tried."""
 SKIN_TO_MIDDLE = 0.015
 """Metres from the skin to the middle of the palm."""
 
@@ -55,6 +57,8 @@ def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
     cost = 3.0 * z + np.abs(np.log(inset[rows, cols] / USUAL_INSET))
     chosen: list[int] = []
     for i in np.argsort(cost):
+        if z[i] > z.min() + FARTHER:
+            continue
         if all(np.linalg.norm(centers[i] - centers[j]) > APART for j in chosen):
             chosen.append(int(i))
         if len(chosen) == MOST_SIGHTINGS:

@@ -121,7 +121,7 @@ NUM_RACING = BATCH
 """Hypotheses that are registered for a race."""
 BETTER = 0.85
 """Share of the cost of the track, or of the hand that was asked for, below which another explanation is better."""
-AS_GOOD = 1.03
+AS_GOOD = 1.1
 """Share of the cost of the track up to which another explanation puts it in doubt."""
 DIFFERENT = 0.025
 """Metres between the joints of two explanations, in the mean, from which on they are different."""
@@ -250,8 +250,7 @@ def _search(setup: _Setup, state: TrackState, frame: np.ndarray, time: float) ->
     found = min(wanted, key=lambda start: start.cost)
     if not found.cost < WORST_START:
         return state
-    best = min(start.cost for start in starts)
-    doubt = found.cost > DOUBTFUL_COST or best < BETTER * found.cost
+    doubt = found.cost > DOUBTFUL_COST or _is_rivalled(setup, found, starts)
     return _begun(setup, state, found, time, doubt)
 
 
@@ -271,13 +270,18 @@ def _race(setup: _Setup, state: TrackState, frame: np.ndarray, time: float) -> T
     sides = (1.0, -1.0) if setup.config.hand == "auto" else (side,)
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
     starts = find_starts(*window, palm, average, sizes, sides, NUM_RACING)
-    rivals = [start for start in starts if _distance(average, start, track) > DIFFERENT]
-    rival = min(rivals, key=lambda start: start.cost, default=None)
-    if rival is not None and rival.cost < BETTER * track.cost:
-        return _begun(setup, state, rival, time, rival.cost > DOUBTFUL_COST)
-    doubt = track.cost > DOUBTFUL_COST or (rival is not None and rival.cost < AS_GOOD * track.cost)
+    rival = starts[0] if starts else track
+    if rival.cost < BETTER * track.cost:
+        return _begun(setup, state, rival, time, rival.cost > DOUBTFUL_COST or _is_rivalled(setup, rival, starts))
+    doubt = track.cost > DOUBTFUL_COST or _is_rivalled(setup, track, starts)
     pause = RACE_INTERVAL if doubt else QUIET_INTERVAL
     return state._replace(doubt=jnp.asarray(doubt), race_time=jnp.asarray(time + pause, dtype=float))
+
+
+def _is_rivalled(setup: _Setup, found: Start, starts: list[Start]) -> bool:
+    """Whether a different explanation of the same frame is about as good as the one found."""
+    rivals = [start for start in starts if start.cost < AS_GOOD * found.cost]
+    return any(_distance(setup.likelihood.geometry, start, found) > DIFFERENT for start in rivals)
 
 
 def _begun(setup: _Setup, state: TrackState, found: Start, time: float, doubt: bool) -> TrackState:
