@@ -27,6 +27,27 @@ SKIN_TO_MIDDLE = 0.015
 """Metres from the skin to the middle of the palm."""
 
 
+TOO_NEAR, TOO_FAR = 0.3, 2.0
+"""Metres: no reading beyond the first, or none nearer than the second, is what a wrong unit of length gives."""
+
+
+def check_unit(frame: np.ndarray) -> str | None:
+    """A warning where all readings of a frame (metres) are too far away for any hand; `None` where they are not.
+
+    Raises:
+        ValueError: all readings are nearer than a depth camera can measure.
+    """
+    readings = frame[np.isfinite(frame)]
+    if not readings.size:
+        return None
+    near, far = np.percentile(readings, (1, 99))
+    if far < TOO_NEAR:
+        raise ValueError(f"depth must be in metres: no reading is beyond {far:.3g} m; is the unit off by ten or more?")
+    if near > TOO_FAR:
+        return f"no reading is nearer than {near:.3g} m, where no hand is looked for; is the unit of depth right?"
+    return None
+
+
 class Sighting(NamedTuple):
     """Something that may be a hand."""
 

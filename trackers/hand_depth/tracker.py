@@ -5,9 +5,11 @@ The filter is `rao_blackwell_shared` on the 22-number hand with `HandMotion`; it
 """
 
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import jax
@@ -50,7 +52,7 @@ from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guid
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.trackers.hand_depth.detect import NEAREST, hand_sightings
+from jaxfilters.trackers.hand_depth.detect import NEAREST, check_unit, hand_sightings
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
 from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
@@ -209,10 +211,14 @@ def track(
         The track as NumPy arrays, the frame axis first.
 
     Raises:
-        ValueError: There are no frames, or more or fewer than times.
+        ValueError: There are no frames, or more or fewer than times, or their unit cannot be metres.
     """
     config = config or HandDepthConfig()
-    return track_frames(build(camera, config), jax.random.key(config.seed), frames, times_s)
+    source = iter(frames)
+    first = list(islice(source, 1))
+    if first and (warning := check_unit(np.asarray(first[0]))):
+        warnings.warn(warning, stacklevel=2)
+    return track_frames(build(camera, config), jax.random.key(config.seed), chain(first, source), times_s)
 
 
 def _start(setup: _Setup, key: Array, frame: np.ndarray) -> TrackState:
