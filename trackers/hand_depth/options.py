@@ -36,6 +36,6 @@ def add_tracker_options(parser: argparse.ArgumentParser) -> None:
         help="what pixels without a reading are (default: auto, background if more than half of the first frame)",
     )
     parser.add_argument(
-        "--hand", choices=("right", "left", "auto"), help="which hand; auto decides by the depth (default: right)"
+        "--hand", choices=("right", "left", "auto"), help="which hand (default: auto, by what the depth shows)"
     )
     add_seed(parser)
