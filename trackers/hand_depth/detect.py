@@ -84,7 +84,7 @@ def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
             chosen.append(int(i))
         if len(chosen) == MOST_SIGHTINGS:
             break
-    return [_sighting(frame, labels, centers[i], labels[rows[i], cols[i]]) for i in chosen]
+    return [_sighting(frame, labels, centers[i], int(labels[rows[i], cols[i]])) for i in chosen]
 
 
 def _without_small_holes(frame: np.ndarray) -> np.ndarray:

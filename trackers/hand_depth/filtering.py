@@ -96,7 +96,7 @@ class Setup:
 
 
 @jax.jit
-def placed(setup: Setup, key: Array, pose: Array, state: TrackState) -> Any:
+def placed(key: Array, setup: Setup, pose: Array, state: TrackState) -> Any:
     """An ensemble about a pose."""
     filter = build_filter(setup, pose, setup.hand(state))
     return filter.init(filter.params, key)
@@ -149,6 +149,7 @@ def pose_moments(
 
 
 def filled(frame: Array, missing_is_background: Array) -> Array:
+    """The frame with pixels without a reading as background, if that is what they are."""
     return jnp.where(jnp.isnan(frame) & missing_is_background, jnp.inf, frame)
 
 
@@ -161,5 +162,6 @@ def look(setup: Setup, frame: Array, expected: Float[Array, " 22"], scale: Float
 
 
 def particles_of(state: RaoBlackwellState | GuidedState) -> tuple[Array, Array]:
+    """The particles of the state of either filter, and their log weights."""
     ensemble = state.ensemble if isinstance(state, GuidedState) else state
     return ensemble.particles, ensemble.log_weights

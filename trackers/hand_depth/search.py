@@ -69,10 +69,10 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     window = _window(setup, state, np.asarray(frame), palm)
     average = setup.likelihood.geometry
     track = registered(*window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
-    sides = (1.0, -1.0) if setup.config.hand == "auto" else (side,)
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
-    starts = find_starts(*window, palm, average, sizes, sides, NUM_RACING)
-    rival = starts[0] if starts else track
+    starts = find_starts(*window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
+    allowed = [start for start in starts if setup.config.hand == "auto" or start.side == side]
+    rival = allowed[0] if allowed else track
     if rival.cost < BETTER * track.cost:
         return _begun(setup, state, rival, time, rival.cost > DOUBTFUL_COST or _is_rivalled(setup, rival, starts))
     doubt = track.cost > DOUBTFUL_COST or _is_rivalled(setup, track, starts)
@@ -97,7 +97,7 @@ def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bo
         misses=jnp.zeros_like(state.misses),
         key=key,
     )
-    return state._replace(ensemble=placed(setup, place_key, jnp.asarray(found.pose), state))
+    return state._replace(ensemble=placed(place_key, setup, jnp.asarray(found.pose), state))
 
 
 def _sizes(state: TrackState) -> tuple[float, ...]:

@@ -6,7 +6,8 @@ import pytest
 
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
-from jaxfilters.trackers.hand_depth.tracker import LOST, SEARCHING, TRACKING, HandDepthConfig
+from jaxfilters.trackers.hand_depth.config import HandDepthConfig
+from jaxfilters.trackers.hand_depth.tracker import DOUBTFUL, LOST, SEARCHING, TRACKING
 from jaxfilters.trackers.io.depth import open_depth
 
 pytestmark = pytest.mark.optimised
@@ -103,6 +104,13 @@ def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequen
     assert np.all(track.status == [SEARCHING] * 2 + [TRACKING] * (CHUNK - 2))
     assert abs(float(state.scale) - 1) < 0.051
     assert joint_errors_mm(track, np.concatenate([sequence[1][:2], sequence[1]])[:CHUNK])[2:].mean() < 15
+
+
+@pytest.mark.system
+def test_the_other_hand_is_doubted(sequence):
+    config = HandDepthConfig(num_particles=NUM_PARTICLES, hand="left")
+    track = follow(hand_depth.build(kinect_v2(), config), sequence[0][:CHUNK])
+    assert np.all(track.status == DOUBTFUL)
 
 
 @pytest.mark.system
