@@ -40,6 +40,7 @@ from jaxfilters.trackers.hand_depth.filtering import (
     particles_of,
     placed,
     pose_moments,
+    standard_deviations,
 )
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
 from jaxfilters.trackers.hand_depth.search import race, search
@@ -182,7 +183,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     misses = jnp.where(seen, 0, state.misses + 1)
     track = HandTrack(
         pose=pose,
-        pose_std=jnp.sqrt(jnp.diagonal(covariance)),
+        pose_std=standard_deviations(pose, covariance),
         joints=forward_kinematics(pose, likelihood.geometry).joints,
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
