@@ -15,6 +15,8 @@ STEEPEST = 4.0
 """Depth over width from pixel to pixel that is still one surface."""
 SMALLEST_AREA = 0.002
 """Square metres of surface below which an object is not a hand."""
+LARGEST_PART = 0.008
+"""Square metres above which another surface is not a finger before the palm."""
 PALM_INSET = (0.018, 0.065)
 """Metres from the middle of a palm to the outline of the hand; a forearm has less than a body or a desk, too."""
 USUAL_INSET = 0.038
@@ -54,7 +56,7 @@ class Sighting(NamedTuple):
     center: np.ndarray
     """(3,) metres, camera frame: the middle of the palm."""
     frame: np.ndarray
-    """(rows, cols) metres: the surface that it belongs to; others are `inf` where they are farther away, else NaN."""
+    """(rows, cols) metres: without other large surfaces, which are `inf` where they are farther away, else NaN."""
 
 
 def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
@@ -64,7 +66,8 @@ def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
     """
     depth = _without_small_holes(frame)
     depth = np.where((depth > NEAREST) & (depth < FARTHEST), depth, np.inf).astype(np.float32)
-    labels = _surfaces(depth, float(camera.focal[0]))
+    surfaces, area = _surfaces(depth, float(camera.focal[0]))
+    labels = np.where(area[surfaces] > SMALLEST_AREA, surfaces, 0)
     inset = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, 5)
     inset = np.where(labels > 0, inset * np.where(np.isfinite(depth), depth, 0.0) / float(camera.focal[0]), 0.0)
     peaks = (inset >= cv2.dilate(inset.astype(np.float32), np.ones((5, 5), np.uint8)) - 1e-6) & (inset > PALM_INSET[0])
@@ -84,7 +87,7 @@ def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
             chosen.append(int(i))
         if len(chosen) == MOST_SIGHTINGS:
             break
-    return [_sighting(frame, labels, centers[i], int(labels[rows[i], cols[i]])) for i in chosen]
+    return [_sighting(frame, surfaces, area, centers[i], int(labels[rows[i], cols[i]])) for i in chosen]
 
 
 def _without_small_holes(frame: np.ndarray) -> np.ndarray:
@@ -96,8 +99,8 @@ def _without_small_holes(frame: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(filled), filled, np.where(near > 0, near, np.inf))
 
 
-def _surfaces(depth: np.ndarray, focal: float) -> np.ndarray:
-    """(rows, cols) int: numbers of the surfaces that are large enough for a hand, 0 elsewhere.
+def _surfaces(depth: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, cols) int: numbers of the surfaces, 0 between them; and their areas in square metres, that of 0 being 0.
 
     The farther one of two neighbours across a jump is taken out, so that what is in front keeps its shape.
     """
@@ -109,12 +112,11 @@ def _surfaces(depth: np.ndarray, focal: float) -> np.ndarray:
     mask = (finite & ~jumps).astype(np.uint8)
     count, labels = cv2.connectedComponents(mask, connectivity=4)
     area = np.bincount(labels.ravel(), weights=np.where(mask > 0, (z / focal) ** 2, 0.0).ravel(), minlength=count)
-    return np.where(area[labels] > SMALLEST_AREA, labels, 0)
+    return labels, np.where(np.arange(count) > 0, area, 0.0)
 
 
-def _sighting(frame: np.ndarray, labels: np.ndarray, center: np.ndarray, label: int) -> Sighting:
-    # One pixel more than the surface: its outline was taken for a jump where it faces something nearer.
-    mine = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    mine &= ~(np.isfinite(frame) & (labels > 0) & (labels != label))
+def _sighting(frame: np.ndarray, surfaces: np.ndarray, area: np.ndarray, center: np.ndarray, label: int) -> Sighting:
+    # Small surfaces stay: fingers before the palm are separated from it by a jump.
+    other = (surfaces != label) & ((surfaces == 0) | (area[surfaces] > LARGEST_PART)) & np.isfinite(frame)
     behind = np.where(frame > center[2], np.inf, np.nan)
-    return Sighting(center.astype(np.float32), np.where(mine, frame, behind).astype(np.float32))
+    return Sighting(center.astype(np.float32), np.where(other, behind, frame).astype(np.float32))

@@ -42,9 +42,9 @@ WORST_START = 0.04
 
 def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
     """Place the ensemble anew where the frame shows a hand, of the known size if any; unchanged where it shows none."""
-    starts = []
-    for sighting in hand_sightings(setup.camera, np.asarray(frame)):
-        window = _window(setup, state, sighting.frame, sighting.center)
+    starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
+    for sighting in hand_sightings(setup.camera, image):
+        window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
         starts += find_starts(*window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
     wanted = [start for start in starts if not start.side * float(state.side) < 0]
     if not wanted:
@@ -66,7 +66,8 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     palm = np.asarray(hand_center(pose, 0.6 * scale))
     if not (np.isfinite(palm).all() and palm[2] > NEAREST):
         return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
-    window = _window(setup, state, np.asarray(frame), palm)
+    image = filled(jnp.asarray(frame), state.missing_is_background)
+    window = _cropped(setup, image, jnp.asarray(palm))
     average = setup.likelihood.geometry
     track = registered(*window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
@@ -105,13 +106,9 @@ def _sizes(state: TrackState) -> tuple[float, ...]:
     return SCALES if math.isnan(scale) else (scale,)
 
 
-def _window(setup: Setup, state: TrackState, frame: np.ndarray, center: np.ndarray) -> tuple[Pinhole, Array]:
-    return _cropped(setup, jnp.asarray(frame), jnp.asarray(center), state.missing_is_background)
-
-
 @jax.jit
-def _cropped(setup: Setup, frame: Array, center: Array, missing_is_background: Array) -> tuple[Pinhole, Array]:
-    return crop(setup.camera, filled(frame, missing_is_background), center, WINDOW, setup.spacing(center[2]))
+def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]:
+    return crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
 
 
 def _distance(average: HandGeometry, one: Start, other: Start) -> float:
