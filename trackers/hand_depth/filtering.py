@@ -86,7 +86,7 @@ class TrackState(NamedTuple):
     doubt: Array
     """Whether another explanation is as good, or this one is bad."""
     race_time: Float[Array, ""]
-    """Seconds: from when on the next frame has new starts compete with the track."""
+    """Seconds: from when on the next frame is searched, or has new starts compete with the track."""
     missing_is_background: Array
     time: Float[Array, ""]
     """Of the last frame, seconds."""

@@ -41,17 +41,19 @@ WORST_START = 0.04
 
 
 def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
-    """Place the ensemble anew where the frame shows a hand, of the known size if any; unchanged where it shows none."""
+    """Place the ensemble anew where the frame shows a hand, of the known size if any.
+
+    Where what it shows is no hand, `race_time` says when to look again: not in every frame, since it takes a second.
+    """
     starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
     for sighting in hand_sightings(setup.camera, image):
         window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
         starts += find_starts(*window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
     wanted = [start for start in starts if not start.side * float(state.side) < 0]
-    if not wanted:
-        return state
-    found = min(wanted, key=lambda start: start.cost)
-    if not found.cost < WORST_START:
-        return state
+    found = min(wanted, key=lambda start: start.cost, default=None)
+    if found is None or not found.cost < WORST_START:
+        pause = SECOND_CHANCE if starts else 0.0
+        return state._replace(race_time=jnp.asarray(time + pause, dtype=float))
     doubt = found.cost > DOUBTFUL_COST or _is_rivalled(setup, found, starts)
     return _begun(setup, state, found, time, doubt)
 

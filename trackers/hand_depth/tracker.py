@@ -97,7 +97,7 @@ def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
         scale=scale,
         side=side,
         doubt=jnp.asarray(False),
-        race_time=jnp.asarray(math.inf, dtype=float),
+        race_time=jnp.asarray(0.0, dtype=float),
         missing_is_background=jnp.asarray(background),
         time=jnp.asarray(-FRAME_INTERVAL, dtype=float),
         misses=jnp.asarray(PATIENCE, jnp.int32),
@@ -115,10 +115,11 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
     """
     pieces, first = [], 0
     while first < len(frames):
-        if int(state.misses) >= PATIENCE:
+        due = float(state.race_time) <= float(times[first])
+        if due and int(state.misses) >= PATIENCE:
             state = search(setup, state, frames[first], float(times[first]))
             state = state._replace(time=jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float))
-        elif float(state.race_time) <= float(times[first]):
+        elif due:
             state = race(setup, state, frames[first], float(times[first]))
         if int(state.misses) >= PATIENCE:
             pieces.append(_nothing_found())
@@ -126,6 +127,8 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
             continue
         state, (track, done) = _scan(setup, state, frames, times, first)
         state = _through_the_host(state)
+        if int(state.misses) >= PATIENCE:
+            state = state._replace(race_time=jnp.asarray(times[first], dtype=float))
         end = first + int(np.sum(done))
         pieces.append(jax.tree.map(lambda rows: np.asarray(rows)[first:end], track))  # noqa: B023
         first = end
