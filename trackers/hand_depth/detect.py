@@ -15,6 +15,8 @@ STEEPEST = 4.0
 """Depth over width from pixel to pixel that is still one surface."""
 SMALLEST_AREA = 0.002
 """Square metres of surface below which an object is not a hand."""
+LARGEST_AREA = 0.8
+"""Square metres above which it is a wall or a floor; a person who reaches out is one surface with the hand."""
 LARGEST_PART = 0.008
 """Square metres above which another surface is not a finger before the palm."""
 PALM_INSET = (0.018, 0.065)
@@ -29,6 +31,8 @@ SKIN_TO_MIDDLE = 0.015
 """Metres from the skin to the middle of the palm."""
 
 
+FEWEST_NEAR = 50
+"""Readings that may be noise."""
 TOO_NEAR, TOO_FAR = 0.3, 2.0
 """Metres: no reading beyond the first, or none nearer than the second, is what a wrong unit of length gives."""
 
@@ -42,7 +46,7 @@ def check_unit(frame: np.ndarray) -> str | None:
     readings = frame[np.isfinite(frame)]
     if not readings.size:
         return None
-    near, far = np.percentile(readings, (1, 99))
+    near, far = np.sort(readings)[min(FEWEST_NEAR, readings.size - 1)], np.percentile(readings, 99)
     if far < TOO_NEAR:
         raise ValueError(f"depth must be in metres: no reading is beyond {far:.3g} m; is the unit off by ten or more?")
     if near > TOO_FAR:
@@ -67,7 +71,7 @@ def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
     depth = _without_small_holes(frame)
     depth = np.where((depth > NEAREST) & (depth < FARTHEST), depth, np.inf).astype(np.float32)
     surfaces, area = _surfaces(depth, float(camera.focal[0]))
-    labels = np.where(area[surfaces] > SMALLEST_AREA, surfaces, 0)
+    labels = np.where((area[surfaces] > SMALLEST_AREA) & (area[surfaces] < LARGEST_AREA), surfaces, 0)
     inset = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, 5)
     inset = np.where(labels > 0, inset * np.where(np.isfinite(depth), depth, 0.0) / float(camera.focal[0]), 0.0)
     peaks = (inset >= cv2.dilate(inset.astype(np.float32), np.ones((5, 5), np.uint8)) - 1e-6) & (inset > PALM_INSET[0])

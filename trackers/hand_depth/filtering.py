@@ -22,7 +22,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.motion import HandMotion, per_coordinate
 from jaxfilters.models.hand.observation import HandImage, HandLikelihood, crop, hand_image, isolate, window_stride
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
-from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, hand_center, local, retract
+from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, hand_center, local, retract
 from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
@@ -40,6 +40,8 @@ FEWEST_PIXELS = 50
 """Hand pixels in the window below which nothing is there."""
 LOST_COST = 0.07
 """Metres: of the best pose above which the hand counts as not there; 0.1 is no overlap at all."""
+BEHIND = 0.025
+"""Metres behind the farthest part of the expected hand from which on a reading is of something else."""
 PATIENCE = 5
 """Frames in a row without the hand before it is searched anew."""
 FRAME_INTERVAL = 1 / 30
@@ -173,12 +175,21 @@ def filled(frame: Array, missing_is_background: Array) -> Array:
     return jnp.where(jnp.isnan(frame) & missing_is_background, jnp.inf, frame)
 
 
-def look(setup: Setup, frame: Array, expected: Float[Array, " 22"], scale: Float[Array, ""]) -> HandImage:
+def look(setup: Setup, state: TrackState, frame: Array, expected: Float[Array, " 22"]) -> HandImage:
     """The window of a frame in which a hand is expected, with everything else taken out."""
-    center = hand_center(expected, scale)
+    center = hand_center(expected, state.scale)
     center = center.at[2].set(jnp.maximum(center[2], 0.1))  # a lost hand may be predicted behind the camera
     window, observed = crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
-    return hand_image(window, isolate(window, observed, expected, scale))
+    return hand_image(
+        window, _before_what_is_behind(setup, state, isolate(window, observed, expected, state.scale), expected)
+    )
+
+
+def _before_what_is_behind(setup: Setup, state: TrackState, observed: Array, expected: Array) -> Array:
+    """The readings without those well behind every part of the expected hand: a wall or a desk, which says nothing."""
+    capsules = forward_kinematics(expected, setup.hand(state).geometry).capsules
+    farthest = jnp.max(jnp.maximum(capsules.start[:, 2], capsules.end[:, 2]) + capsules.radius)
+    return jnp.where(jnp.isfinite(observed) & (observed > farthest + BEHIND), jnp.nan, observed)
 
 
 def particles_of(state: RaoBlackwellState | GuidedState) -> tuple[Array, Array]:

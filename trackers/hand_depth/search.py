@@ -34,9 +34,9 @@ AS_GOOD = 1.1
 """Share of the cost of the track up to which another explanation puts it in doubt."""
 DIFFERENT = 0.025
 """Metres between the joints of two explanations, in the mean, from which on they are different."""
-DOUBTFUL_COST = 0.03
+DOUBTFUL_COST = 0.024
 """Metres, as `Start.cost`, above which a start explains the frame too badly to be believed."""
-WORST_START = 0.04
+WORST_START = 0.032
 """Metres, likewise, above which nothing is believed to be a hand."""
 
 

@@ -170,7 +170,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
     expected, _ = pose_moments(*particles_of(predicted))
-    image = look(setup, filled(frame, state.missing_is_background), expected, state.scale)
+    image = look(setup, state, filled(frame, state.missing_is_background), expected)
 
     def update(ensemble: Any) -> tuple[Any, ParticleInfo]:
         return filter.update(filter.params, update_key, ensemble, image, elapsed)
