@@ -42,7 +42,7 @@ def crop(
     frame: Float[Array, "rows cols"],
     center: Float[Array, " 3"],
     shape: tuple[int, int],
-    stride: float | Float[Array, ""],
+    stride: int | float | Float[Array, ""],
 ) -> tuple[Pinhole, Float[Array, "height width"]]:
     """The window of `shape` pixels, `stride` pixels of the frame apart, about the projection of `center` (metres).
 

@@ -191,8 +191,8 @@ def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
                 variants.append((variant, side))
         other = -side if -side in sides else side
         for turn, to in ((turned_over, other), (np.array([1.0, 0.0, 0.0, 0.0]), other), (aside, side)):
-            variants.append((_turned(pose, scale, turn), to))
-        variants.append((_turned(pose, scale, aside * [1, -1, -1, -1]), side))
+            variants.append((_turned(pose, float(scale), turn), to))
+        variants.append((_turned(pose, float(scale), aside * [1, -1, -1, -1]), side))
         for variant, to in variants:
             poses.append(variant)
             scales.append(scale)

@@ -107,7 +107,7 @@ class Setup:
     config: HandDepthConfig = field(metadata={"static": True})
     stride: int | None = field(metadata={"static": True})
 
-    def spacing(self, depth: Float[Array, ""]) -> float | Float[Array, ""]:
+    def spacing(self, depth: Float[Array, ""]) -> int | Float[Array, ""]:
         """Pixels of the frame for one of the window about a hand at `depth` metres."""
         return window_stride(self.camera, depth, WINDOW[1]) if self.stride is None else self.stride
 
