@@ -107,10 +107,10 @@ def test_the_size_is_fitted_to_the_first_frame_that_shows_a_hand(tracker, sequen
 
 
 @pytest.mark.system
-def test_the_other_hand_is_doubted(sequence):
+def test_the_other_hand_is_never_tracked_without_a_doubt(sequence):
     config = HandDepthConfig(num_particles=NUM_PARTICLES, hand="left")
     track = follow(hand_depth.build(kinect_v2(), config), sequence[0][:CHUNK])
-    assert np.all(track.status == DOUBTFUL)
+    assert not np.any(track.status == TRACKING)
 
 
 @pytest.mark.system
