@@ -86,7 +86,8 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
 def _is_rivalled(setup: Setup, found: Start, starts: list[Start]) -> bool:
     """Whether a different explanation of the same frame is about as good as the one found."""
     rivals = [start for start in starts if start.cost < AS_GOOD * found.cost]
-    return any(_distance(setup.likelihood.geometry, start, found) > DIFFERENT for start in rivals)
+    other_side = any(start.side != found.side and start.cost < found.cost for start in rivals)
+    return other_side or any(_distance(setup.likelihood.geometry, start, found) > DIFFERENT for start in rivals)
 
 
 def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bool) -> TrackState:
