@@ -1,4 +1,4 @@
-"""Modelled people from their images alone, with the model that comes with the package, beside `solvePnP`.
+"""Modelled people from their images alone, beside `solvePnP`.
 
 Nothing is known of a person or of where the landmarks are: the detectors find them, as for a user. The same detections
 go to OpenCV's `solvePnP` with the mean face of the same model, which is the simplest thing that could work. Both are
@@ -15,16 +15,21 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.recordings import recording_folder
+from jaxfilters.benchmarks.scenarios._mono_real import NUM_FRAMES, PEOPLE, QUICK_NUM_FRAMES, filmed, modelled_face
 from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.synthetic.ict_course import read_biwi, read_livelink
+from jaxfilters.models.synthetic.ict_face import read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.io.face_models import people_face_model
 
-SUFFIXES = {"cascades": "modelled", "mediapipe": "modelled_mediapipe"}
+SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
 """Of the metrics, by detector."""
 AXES = {"x": 0, "y": 1, "z": 2, "roll": 3, "yaw": 4, "pitch": 5}
 EVERY = 3
@@ -47,6 +52,35 @@ class DetectedRun(NamedTuple):
     """True depth."""
     lost_share: float
     """Of the frames after the start in which the face is not followed."""
+
+
+def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
+    """Errors of both detectors with a model of other people of the same kind, and with that of the package.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
+    model = read_ict(recording_folder("ict_face_model"))
+    turns = read_biwi(recording_folder("biwi_head_rotation"))
+    speech = read_livelink(recording_folder("livelinkface_take"), model.names)
+    faces = {"modelled": modelled_face(seed)}
+    if not quick:
+        faces["modelled_rendered"] = people_face_model().model
+    detectors = available_detectors()
+    runs: dict[str, list[DetectedRun]] = {}
+    for person, stretch in PEOPLE[: 1 if quick else None]:
+        made = filmed(model, turns[stretch], speech, person + seed, QUICK_NUM_FRAMES if quick else NUM_FRAMES)
+        for kind, face in faces.items():
+            for name, detector in detectors.items():
+                one = detected_run(made, face, detector, person + seed)
+                runs.setdefault(f"{kind}{SUFFIXES[name]}", []).append(one)
+                means = {"tracked": one.errors, "solvePnP": one.pnp_errors}
+                told = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
+                sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {told}\n")
+    metrics: dict[str, Metric] = {}
+    for name, of_people in runs.items():
+        metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])
+    return metrics
 
 
 def available_detectors() -> dict[str, Detector]:

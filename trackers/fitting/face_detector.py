@@ -36,7 +36,8 @@ DEPTHS_MM, ASIDE = (400.0, 900.0), (0.08, 0.05)
 """Of the heads, and how far they are from the axis of the camera: standard deviations as shares of the depth."""
 ANGLES_DEG, MOST_YAW_DEG = (4.0, 6.0, 8.0), 28.0
 """Standard deviations of roll, yaw and pitch; in every other picture the yaw is anything up to the largest."""
-MOST_SPEECH, SPEAKING = 0.35, ("jawOpen", "mouthSmile_L", "mouthSmile_R", "browInnerUp_L", "browInnerUp_R", "mouthPucker")
+MOST_SPEECH = 0.35
+SPEAKING = ("jawOpen", "mouthSmile_L", "mouthSmile_R", "browInnerUp_L", "browInnerUp_R", "mouthPucker")
 """Strength of each expression in half of the pictures, uniform from 0 on."""
 GAINS = (0.7, 1.15)
 HELD_MM = (4.5, 4.5, 1.0)
@@ -182,6 +183,6 @@ def _described(name: str, errors: DetectorErrors) -> list[str]:
     std = np.sqrt(np.diagonal(errors.covariance))
     size = lambda values: float(np.sqrt(np.mean(np.square(values))))
     return [
-        f"{name}: landmarks lie {size(errors.mean):.1f} mm off on average (root mean square of a coordinate), differ by "
-        f"{size(std):.1f} mm from person to person and by {size(errors.white):.1f} mm from image to image"
+        f"{name}: landmarks lie {size(errors.mean):.1f} mm off in all images (root mean square), differ "
+        f"by {size(std):.1f} mm from person to person and by {size(errors.white):.1f} mm from image to image"
     ]

@@ -44,8 +44,8 @@ def test_what_is_the_face_s_own_is_the_conditional_mean(drawn):
     expected = OFFSET_STD**2 * np.linalg.solve(total, (offset - mean).ravel()).reshape(4, 3)
     own = person_prior.own_offset(Person(jnp.zeros(1), jnp.asarray(offset)), prior)
     np.testing.assert_allclose(own, expected, rtol=1e-3, atol=1e-5)
-    plain = Prior(1.0, OFFSET_STD)
-    np.testing.assert_allclose(person_prior.own_offset(Person(jnp.zeros(1), jnp.asarray(offset)), plain), offset, rtol=1e-6)
+    whole = person_prior.own_offset(Person(jnp.zeros(1), jnp.asarray(offset)), Prior(1.0, OFFSET_STD))
+    np.testing.assert_allclose(whole, offset, rtol=1e-6)
 
 
 def test_a_covariance_without_a_root_is_refused():

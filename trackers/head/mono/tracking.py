@@ -19,9 +19,9 @@ from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common.near_mode import spread
 from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
-from jaxfilters.trackers.head.common.state import DEFORMABLE, FRAME_S, LOST, PATIENCE, POSE
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import adjustment
-from jaxfilters.trackers.head.mono.estimate import Estimate, aligned, projected, recalculated
+from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import (
     FEWEST_ANCHORED,
@@ -106,7 +106,8 @@ def _step(
         is_fresh=~missed,
         window=state.window._replace(ages=state.window.ages + 1),
     )
-    return state, _track(system, state, score, info.effective_sample_size, is_adjusted)
+    is_sure = ~missed & (estimate.num_anchored >= FEWEST_SURE)
+    return state, _track(system, state, score, info.effective_sample_size, is_adjusted, is_sure)
 
 
 def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoOptions) -> tuple[Array, Array]:
@@ -201,7 +202,7 @@ def _adjusted(
     return jax.lax.cond(sound, lambda: after, lambda: state), tried & sound
 
 
-def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array) -> MonoTrack:
+def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, is_sure: Array) -> MonoTrack:
     unknown, face, rig, _ = system
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
@@ -223,5 +224,5 @@ def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjust
         offset=known(state.person.offset + face.mean - unknown.mean),
         who=jnp.where(lost, -1, state.who - 1).astype(jnp.int32),
         is_adjusted=is_adjusted,
-        status=jnp.where(lost, LOST, DEFORMABLE).astype(jnp.int32),
+        status=jnp.where(lost, LOST, jnp.where(is_sure, DEFORMABLE, DOUBTFUL)).astype(jnp.int32),
     )

@@ -102,7 +102,7 @@ def test_the_longest_stretch_passes_over_skipped_moments(status, expected):
 def test_shares_of_a_run(face_track):
     track, _ = face_track
     told = shares(track)
-    assert told["status"] == {"initialising": 2, "rigid": 13, "deformable": 21, "lost": 3, "skipped": 1}
+    assert told["status"] == {"initialising": 2, "rigid": 13, "deformable": 21, "lost": 3, "doubtful": 0, "skipped": 1}
     assert told["share_tracked"] == pytest.approx(34 / 39, abs=1e-4)
     # Frames 2 to 29, without the skipped one.
     assert (told["longest_stretch_frames"], told["longest_stretch_s"]) == (27, pytest.approx(27 / 30, abs=1e-3))
