@@ -9,7 +9,7 @@ from jaxfilters.trackers.gestures.options import add_fit_gestures
 
 IDENTITIES, EXPRESSIONS, PEOPLE = 15, 5, 200
 """What the model that comes with the package was made with."""
-RENDERED_PEOPLE, RENDERED_IMAGES = 70, 12
+RENDERED_PEOPLE, RENDERED_IMAGES = 60, 10
 """What the detectors' errors that come with the package were measured on."""
 
 

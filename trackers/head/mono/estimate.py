@@ -31,8 +31,6 @@ must not be adjusted to what no person of the model does, however precisely it i
 """
 FEWEST_SURE = 7
 """Landmarks that must look as registered, where the model has them, for an estimate beyond doubt: speech hides two."""
-HIDDEN_PX = 8.0
-"""Standard deviation of a landmark that looks otherwise where an estimate is doubtful: it may be of what hides it."""
 
 
 class Estimate(NamedTuple):
@@ -75,10 +73,6 @@ def aligned(
     found, _, _ = looked_for(align, state, state.model, images, rig, x)
     x = refine(prior, found, state.slopes, state.model, loose, rig, x).belief.mean
     found, anchored, is_followed = looked_for(anywhere, state, state.model, images, rig, x)
-    # What covers half of a face moves as one, and would take the face along.
-    hidden = is_followed & (jnp.sum(jnp.any(anchored, axis=0)) < FEWEST_SURE)
-    unsure = jnp.where(hidden, HIDDEN_PX**2, 0.0)[..., None, None] * jnp.eye(2)
-    found = found._replace(covariance=found.covariance + unsure)
     fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
     M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
     sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
