@@ -152,7 +152,7 @@ def run(
             shape (t,).
         TypeError: If `filter` is no `Filter`, or `mask` no boolean array.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -27,7 +27,7 @@ class StandardNormal:
     Raises:
         ValueError: If a size is not an integer of at least 0.
 
-    Example:
+    Examples:
         >>> import jax, jaxfilters as jf
         >>> jf.StandardNormal(3)(jax.random.key(0), 1000).shape
         (3, 1000)

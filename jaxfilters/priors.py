@@ -80,7 +80,7 @@ def from_noise(transform: Callable[[Any], PyTree], noise: DrawNoise) -> FromNois
     Raises:
         TypeError: If an argument is not callable.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.from_noise(lambda noise: {"angle": jnp.pi * noise[0]}, jf.StandardNormal(1))
         >>> prior.ensemble(jax.random.key(0), 1000)["angle"].shape
@@ -103,7 +103,7 @@ def gaussian_prior(belief: Gaussian) -> GaussianPrior:
         TypeError: If `belief` is not a `Gaussian`, or does not hold floating-point numbers.
         ValueError: If the shapes are others, or the covariance is concrete and not positive semidefinite.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2), jnp.eye(2)))
         >>> prior.ensemble(jax.random.key(0), 1000).shape

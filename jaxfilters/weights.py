@@ -5,7 +5,7 @@ The ensemble axis is the last one of every leaf. Everywhere in this module a log
 Particles without weight contribute nothing, whatever their values are, NaN included. Every function raises a
 `ValueError` where `log_weights` is not a vector, and a `TypeError` where it does not hold floating-point numbers.
 
-Example:
+Examples:
     >>> import jax.numpy as jnp, jaxfilters as jf
     >>> log_weights = jnp.log(jnp.array([1.0, 3.0]))
     >>> round(float(jf.weights.mean(jnp.array([0.0, 10.0]), log_weights)), 3)

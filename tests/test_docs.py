@@ -5,6 +5,7 @@ import importlib
 import re
 import shlex
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -157,6 +158,27 @@ def test_every_page_can_be_reached_from_the_index():
         reached.add(page)
         waiting += [path for path, _ in links(page) if path in PAGES and path not in reached]
     assert not set(PAGES) - reached
+
+
+def test_the_reference_has_every_public_name_once():
+    pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
+    entries = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)
+    assert len(entries) == len(set(entries)) > 200
+    assert not [entry for entry in entries if not exists(entry)]
+    assert not without_entry(jaxfilters, "jaxfilters", entries)
+
+
+def without_entry(module, path, entries):
+    """Public names of a module that the reference has neither by themselves nor with the module that defines them."""
+    missing = []
+    for name in module.__all__:
+        value, place = getattr(module, name), f"{path}.{name}"
+        if isinstance(value, ModuleType):
+            if not any(f"{entry}.".startswith((f"{value.__name__}.", f"{place}.")) for entry in entries):
+                missing += without_entry(value, place, entries) if hasattr(value, "__all__") else [place]
+        elif place not in entries and getattr(value, "__module__", "") not in entries:
+            missing.append(place)
+    return missing
 
 
 def test_names_in_pages_exist():

@@ -42,7 +42,7 @@ def pit(y: Float[Array, "*shape"], mean: ArrayLike, std: ArrayLike) -> Float[Arr
     Raises:
         ValueError: If a concrete `std` is not positive.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> [round(float(p), 3) for p in jf.diagnostics.pit(jnp.array([0.0, 2.0]), 0.0, 1.0)]
@@ -68,7 +68,7 @@ def pit_ensemble(
     Raises:
         ValueError: If the shapes do not fit one another.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> float(jf.diagnostics.pit_ensemble(jnp.array(1.5), jnp.array([0.0, 1.0, 2.0, 3.0])))
@@ -110,7 +110,7 @@ def uniformity(values: Float[Array, " n"]) -> Uniformity:
     Raises:
         ValueError: If `values` is not a vector, or empty.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> test = jf.diagnostics.uniformity(jnp.linspace(0.05, 0.95, 10))
@@ -147,7 +147,7 @@ def sigma_coverage(
     Raises:
         ValueError: If a concrete `std` or one of `sigmas` is not positive.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> within, expected = jf.diagnostics.sigma_coverage(jnp.array([0.5, -1.5, 0.1, 2.5]), 0.0, 1.0)

@@ -44,7 +44,7 @@ def nees(truth: Float[Array, "*batch n"], beliefs: Gaussian | GaussianRoot) -> F
         ValueError: If the shapes differ.
         TypeError: If `beliefs` is of another kind.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> beliefs = jf.Gaussian(jnp.zeros((3, 2)), jnp.broadcast_to(4.0 * jnp.eye(2), (3, 2, 2)))
@@ -74,7 +74,7 @@ def nis(innovations: Float[Array, "*batch m"], covariances: Float[Array, "*batch
     Raises:
         ValueError: If the shapes do not fit one another.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> float(jf.diagnostics.nis(jnp.array([2.0, 0.0]), jnp.diag(jnp.array([4.0, 1.0]))))
@@ -100,7 +100,7 @@ def chi_square_band(dof: ArrayLike, *, probability: ArrayLike = 0.95, num_runs: 
     Raises:
         ValueError: If a concrete argument is outside its range.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> low, high = jf.diagnostics.chi_square_band(2, num_runs=50)
         >>> round(float(low), 2), round(float(high), 2)
@@ -129,7 +129,7 @@ def chi_square_quantile(probability: ArrayLike, dof: ArrayLike) -> Float[Array, 
     Raises:
         ValueError: If a concrete argument is outside its range.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> round(float(jf.diagnostics.chi_square_quantile(0.95, 3)), 3)
         7.815

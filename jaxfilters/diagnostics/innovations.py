@@ -36,7 +36,7 @@ def autocorrelation(innovations: Float[Array, "t m"], max_lag: int) -> Float[Arr
     Raises:
         ValueError: If `innovations` are not (t, m), or `max_lag` is out of range.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> jf.diagnostics.autocorrelation(jnp.array([[1.0], [-1.0], [1.0], [-1.0]]), 1).tolist()
@@ -66,7 +66,7 @@ def autocorrelation_band(num_steps: int, *, probability: ArrayLike = 0.95) -> Fl
     Raises:
         ValueError: If a number is out of range.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> round(float(jf.diagnostics.autocorrelation_band(100)), 3)
         0.196
@@ -92,7 +92,7 @@ def whiteness(innovations: Float[Array, "t m"], max_lag: int) -> Whiteness:
     Raises:
         ValueError: As for `autocorrelation`, or if `max_lag` is 0.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> noise = jax.random.normal(jax.random.key(0), (500, 1))

@@ -35,7 +35,7 @@ def pareto_k(log_weights: Float[Array, " n"]) -> Float[Array, ""]:
         ValueError: If `log_weights` is not a vector.
         TypeError: If they are not floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> bool(jf.diagnostics.pareto_k(jax.random.normal(jax.random.key(0), (1000,))) < 0.7)
@@ -61,7 +61,7 @@ def pareto_smoothed(log_weights: Float[Array, " n"]) -> ParetoSmoothed:
         ValueError: If `log_weights` is not a vector.
         TypeError: If they are not floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> log_weights, k = jf.diagnostics.pareto_smoothed(3.0 * jax.random.normal(jax.random.key(0), (1000,)))

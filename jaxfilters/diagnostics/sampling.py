@@ -28,7 +28,7 @@ def mcmc_effective_sample_size(chains: Float[Array, "c n"], *, rank_normalised: 
     Raises:
         ValueError: If `chains` is not (c, n) with n at least 4.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> draws = jax.random.normal(jax.random.key(0), (4, 500))
@@ -75,7 +75,7 @@ def r_hat(chains: Float[Array, "c n"]) -> Float[Array, ""]:
     Raises:
         ValueError: If `chains` is not (c, n) with n at least 4.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jaxfilters as jf
         >>> draws = jax.random.normal(jax.random.key(0), (4, 500))

@@ -26,7 +26,7 @@ def crps(y: Float[Array, "*shape"], mean: ArrayLike, std: ArrayLike) -> Float[Ar
     Raises:
         ValueError: If a concrete `std` is not positive.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> round(float(jf.diagnostics.crps(jnp.array(1.0), 0.0, 2.0)), 4)
@@ -57,7 +57,7 @@ def crps_ensemble(
     Raises:
         ValueError: If the shapes do not fit one another.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> float(jf.diagnostics.crps_ensemble(jnp.array(0.0), jnp.array([-1.0, 1.0])))
@@ -89,7 +89,7 @@ def log_score(y: Float[Array, "*shape"], mean: ArrayLike, std: ArrayLike) -> Flo
     Raises:
         ValueError: If a concrete `std` is not positive.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> round(float(jf.diagnostics.log_score(jnp.array(1.0), 0.0, 1.0)), 4)

@@ -1,6 +1,6 @@
 """Parameter estimation: maximum likelihood through any filter, with constraints, standard errors and a report.
 
-Example:
+Examples:
     >>> import jax, jax.numpy as jnp
     >>> import jaxfilters as jf
     >>> def filter_of(theta):

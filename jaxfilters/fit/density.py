@@ -170,7 +170,7 @@ def log_evidence(
     Raises:
         ValueError: If `observations` has no array, or `observations`, `inputs` and `mask` differ in length.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> def filter_of(noise):

@@ -86,7 +86,7 @@ def em(
             match; a length is out of range; or `max_iterations < 1`.
         TypeError: If `model` is neither a filter nor a hidden Markov model.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -47,7 +47,7 @@ def maximize(
         ValueError: If `start` violates its constraints, the log density is not finite there, or the method does not
             support the log density.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> fit = jf.fit.maximize(lambda x: -0.5 * jnp.sum((x - 3.0) ** 2), jnp.zeros(2))

@@ -22,7 +22,7 @@ Key = PRNGKeyArray | Array
 class Gaussian:
     """A Gaussian by mean and covariance.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> belief = jf.Gaussian(jnp.array([0.0, 1.0]), jnp.array([[1.0, 0.5], [0.5, 2.0]]))
@@ -63,7 +63,7 @@ class Gaussian:
 class GaussianRoot:
     """A Gaussian by mean and any root of its covariance, for `jf.arithmetic.square_root`.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> belief = jf.GaussianRoot(jnp.array([0.0, 1.0]), jnp.array([[1.0, 0.0], [0.5, 1.0]]))

@@ -94,7 +94,7 @@ def schmidt_kalman(
         TypeError: If `inner` is no filter, `constant` no boolean array, or, when the filter is traced, if the state of
             `inner` is not a `Gaussian`.
 
-    Example:
+    Examples:
         A bar of unknown length that turns: its projection tells the length only while the angle changes.
 
         >>> import jax

@@ -163,7 +163,7 @@ def continuous_extended_kalman(
             state, a concrete step is negative, or as for `extended_kalman`.
         TypeError: If an argument is of another kind.
 
-    Example:
+    Examples:
         A pendulum whose angle is read now and then.
 
         >>> import jax, jax.numpy as jnp

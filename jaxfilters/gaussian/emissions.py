@@ -162,7 +162,7 @@ def poisson(log_rate: Callable) -> Emission:
     Raises:
         TypeError: If `log_rate` is no such function.
 
-    Example:
+    Examples:
         Spikes of three neurons whose rates follow one hidden signal.
 
         >>> import jax
@@ -192,7 +192,7 @@ def binomial(logits: Callable, num_trials: Any) -> Emission:
         ValueError: If `num_trials` is not a positive integer where its value is known, or not of the shape () or (m,).
         TypeError: If `logits` is no such function.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> emission = jf.emissions.binomial(lambda x: 2.0 * x, num_trials=10)
     """
@@ -216,7 +216,7 @@ def bernoulli(logits: Callable) -> Emission:
     Raises:
         TypeError: If `logits` is no such function.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> emission = jf.emissions.bernoulli(lambda x: x[:1])
     """
@@ -235,7 +235,7 @@ def categorical(logits: Callable) -> Emission:
     Raises:
         TypeError: If `logits` is no such function.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> emission = jf.emissions.categorical(lambda x: jnp.array([0.0, x[0], x[1]]))

@@ -118,7 +118,7 @@ def ensemble_kalman(
             type, or an observation is not of shape `(m,)`.
         TypeError: If `localization` is no `Localization`, or a callback no function.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(3), jnp.eye(3)))
         >>> transition, observe = lambda noise, x: 0.9 * x + 0.1 * noise, lambda x: x[:2]

@@ -176,7 +176,7 @@ def extended_kalman(
             observations, are compared when the filter is traced.
         TypeError: If an argument is of another kind, e.g. an array of integers.
 
-    Example:
+    Examples:
         A range to the origin, in metres, from a point that moves at random.
 
         >>> import jax

@@ -129,7 +129,7 @@ def gaussian_sum(
             than states of `inner`, or log weights that are not numbers.
         TypeError: If `inner` is no filter, `start` no `GaussianSumState`, or `branch`, `margin` or `same` no function.
 
-    Example:
+    Examples:
         Two hypotheses about where a robot starts; the second observation tells them apart.
 
         >>> import jax

@@ -100,7 +100,7 @@ def imm(
             lead to other shapes than those of the states.
         TypeError: If `filters` is no list of filters, or `maps` is of another kind.
 
-    Example:
+    Examples:
         A point that rests or moves at random; it starts to move in the eleventh frame.
 
         >>> import jax

@@ -91,7 +91,7 @@ def iterated(
             is less than 1, or `start` has other shapes than the beliefs of the filter.
         TypeError: If `filter` is no filter, or `smoother` no function.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

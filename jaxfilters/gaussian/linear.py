@@ -149,7 +149,7 @@ def kalman(
             without functions of them.
         TypeError: If the prior is no belief, or a function takes other arguments than the inputs.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -42,7 +42,7 @@ def gaspari_cohn(distance: ArrayLike, radius: ArrayLike) -> Float[Array, "*shape
     Raises:
         ValueError: If a concrete radius is not positive, or a concrete distance is negative.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> [round(float(c), 4) for c in jf.ensemble.gaspari_cohn(jnp.array([0.0, 0.5, 1.0]), 1.0)]
@@ -91,7 +91,7 @@ def localization(
         ValueError: If coordinates are not (n, k) and (m, k), or a concrete radius is not positive.
         TypeError: If `distance` or `taper` is no function.
 
-    Example:
+    Examples:
         Every second of forty points on a circle is observed.
 
         >>> import jax.numpy as jnp

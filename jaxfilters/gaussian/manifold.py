@@ -80,7 +80,7 @@ def product(*blocks: Block) -> Manifold:
         ValueError: If there is no block.
         TypeError: If an argument is no `Block`.
 
-    Example:
+    Examples:
         The pose and velocity of a rigid body: 13 components with 12 dimensions.
 
         >>> import jaxfilters as jf

@@ -34,7 +34,7 @@ def mixture_moments(
         TypeError: If `beliefs` is no `Gaussian` or `GaussianRoot`, or `log_weights` no floating-point numbers.
         ValueError: If the last axis of the beliefs is not that of `log_weights`.
 
-    Example:
+    Examples:
         Two equally probable points at -1 and 1 with the variance 0.5 each.
 
         >>> import jax.numpy as jnp

@@ -79,7 +79,7 @@ def common_space(to: Sequence[Callable[[Any], Any]], back: Sequence[Callable[[An
         ValueError: If there are not as many functions back as to, or none.
         TypeError: If one of them is no function.
 
-    Example:
+    Examples:
         The second mode measures in kilometres what the first measures in metres.
 
         >>> import jaxfilters as jf
@@ -108,7 +108,7 @@ def pairwise(function: Callable[[int, int, Any], Any], *, common: int = 0) -> Pa
         TypeError: If `function` is no function.
         ValueError: If `common` is negative or no integer.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> def between(source, target, belief):
         ...     factor = (1e3, 1e-3)[source < target]
@@ -139,7 +139,7 @@ def components(indices: Sequence[Sequence[int]], fill: Gaussian | GaussianRoot) 
         ValueError: If an index is repeated or outside the state of `fill`, or `fill` is no possible belief.
         TypeError: If `fill` is of another kind.
 
-    Example:
+    Examples:
         Place and velocity in the first mode; place, velocity and acceleration in the second.
 
         >>> import jax.numpy as jnp

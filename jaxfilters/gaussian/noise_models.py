@@ -34,7 +34,7 @@ class NonAdditiveNoise:
     `process_noise` or `observation_noise` of the same builder is then the covariance of what the function receives,
     of any size.
 
-    Example:
+    Examples:
         A wheel that slips: the noise multiplies the distance driven, and turns the heading.
 
         >>> import jax

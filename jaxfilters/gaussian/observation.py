@@ -10,7 +10,7 @@ from jaxfilters.gaussian import checks
 class Observation(NamedTuple):
     """An observation with a mask and a noise of its own; Gaussian filters take a plain array `y` too.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> y = jf.Observation(jnp.array([1.0, 2.0]), mask=jnp.array([True, False]))

@@ -92,7 +92,7 @@ def parallel_kalman(
         ValueError: If shapes do not fit one another, or a field of `model` has another length than `ys`.
         TypeError: If an argument is of another kind.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> prior = jf.GaussianRoot(jnp.zeros(1), jnp.eye(1))

@@ -42,7 +42,7 @@ def posterior_linearization(inner: Filter, iterations: int = 5) -> Filter:
         ValueError: If `inner` is another kind of filter or its states are no vectors, or `iterations < 1`.
         TypeError: If `inner` is no filter.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

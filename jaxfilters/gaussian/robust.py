@@ -64,7 +64,7 @@ def robust(inner: Filter, outlier_probability: float | Float[Array, ""], outlier
             is no covariance or has another shape than the observation noise of `inner`.
         TypeError: If `inner` is no filter, or `outlier_noise` no array of floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

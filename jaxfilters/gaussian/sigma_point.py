@@ -57,7 +57,7 @@ def unscented_kalman(
         ValueError: If `alpha` is not positive, `beta` or `kappa` negative, or as for `extended_kalman`.
         TypeError: As for `extended_kalman`.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
@@ -116,7 +116,7 @@ def cubature_kalman(
         ValueError: As for `extended_kalman`.
         TypeError: As for `extended_kalman`.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

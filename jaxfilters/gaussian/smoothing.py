@@ -72,7 +72,7 @@ def rts(filter: Filter, beliefs: Belief, inputs: PyTree = None) -> Belief:
             another length than `beliefs`.
         TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
@@ -108,7 +108,7 @@ def lag_one_covariances(filter: Filter, beliefs: Belief, smoothed: Belief, input
         ValueError: As for `rts`; or if `smoothed` has other shapes than `beliefs`.
         TypeError: As for `rts`.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
@@ -149,7 +149,7 @@ def posterior_samples(
         ValueError: As for `rts`; or if `num_samples < 1`.
         TypeError: As for `rts`.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

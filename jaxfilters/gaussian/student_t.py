@@ -99,7 +99,7 @@ def student_t(
             where they are known, or `num_scales < 4`.
         TypeError: If `inner` is no filter.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

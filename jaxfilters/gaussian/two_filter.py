@@ -46,7 +46,7 @@ def two_filter(
         ValueError: If `filter` is another kind of filter or its states are no vectors, or shapes or lengths differ.
         TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

@@ -3,7 +3,7 @@
 A `HiddenMarkovModel` is a Markov chain with an emission distribution. `model.log_likelihoods` turns observations into
 log-likelihoods (T, Q) of the states, on which all recursions work; they may come from any other source as well.
 
-Example:
+Examples:
     >>> import jax.numpy as jnp
     >>> import jaxfilters as jf
     >>> emission = jf.hmm.DiagonalGaussian(jnp.array([[0.0], [5.0]]), jnp.ones((2, 1)))

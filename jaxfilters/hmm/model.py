@@ -160,7 +160,7 @@ def from_probabilities(initial: Any, transition: Any, emission: Emission | None 
         ValueError: If shapes do not match, a number is not a probability, or a sum differs from 1 by more than 1e-4.
         TypeError: If a function takes other arguments than the inputs.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
         >>> model.log_transition.shape

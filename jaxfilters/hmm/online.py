@@ -40,7 +40,7 @@ def online(model: HiddenMarkovModel) -> Filter:
     Raises:
         ValueError: If `log_initial` and `log_transition` are not (Q,) and (Q, Q).
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])

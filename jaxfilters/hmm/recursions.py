@@ -89,7 +89,7 @@ def forward(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t q *batch"
     Raises:
         ValueError: If the shapes do not match.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])

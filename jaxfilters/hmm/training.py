@@ -96,7 +96,7 @@ def baum_welch(
             NaN or a code out of range.
         TypeError: If codes are not integers.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> codes = jf.hmm.Codes(jnp.log(jnp.array([[0.7, 0.3], [0.4, 0.6]])), pseudo_count=0.1)

@@ -89,7 +89,7 @@ def match(
     Raises:
         ValueError: As for `match_noncrossing`, or if there are more than `MAX_COLUMNS` columns.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> matching = jf.math.assignment.match(jnp.array([[4.0, 1.0, 3.0], [2.0, 0.0, 5.0]]))

@@ -59,7 +59,7 @@ def start(
     Raises:
         ValueError: If `scale` is not a vector, or `scale` or `strength` is not positive.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> from jaxfilters.math import diffusion
         >>> fit = diffusion.start(jnp.array([2.0]))

@@ -74,7 +74,7 @@ def update(
     Raises:
         ValueError: If `deviation` is not (d,).
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> from jaxfilters.math import incremental_pca
         >>> pca = incremental_pca.start(size=3, num_components=1)

@@ -5,7 +5,7 @@ Every function takes one quaternion and is written as algebra on its components,
 at the identity and at rotations by pi. All functions raise a ValueError, when they are traced, if a quaternion does not
 have four components or a vector three.
 
-Example:
+Examples:
     >>> import jax.numpy as jnp
     >>> from jaxfilters.math import lie
     >>> q = lie.so3_exp(jnp.array([0.0, 0.0, jnp.pi / 2]))

@@ -55,7 +55,7 @@ def calibrate(
         ValueError: If a count is not an integer of at least 1 (2 for `num_bins`), the draws do not fit theta, or their
             number does not fit `num_bins`.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> def sample_posterior(key, y):  # of a standard normal mean, given one observation with unit noise
         ...     return 0.5 * y + jnp.sqrt(0.5) * jax.random.normal(key, (19,))

@@ -137,7 +137,7 @@ def sample(
     Raises:
         ValueError: If `num_samples` or `thin` is not an integer of at least 1.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> normal = jax.scipy.stats.norm.logpdf
         >>> sampler = jf.mcmc.pmmh(lambda key, theta: normal(1.0, theta, 0.5), normal)

@@ -199,7 +199,7 @@ def conditional_smc(
         TypeError: If `filter` was not made by `bootstrap`, or `redraw` or `scheme` is of another kind.
         ValueError: If it has one particle only, or tempers its likelihoods, which would change the target.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
         ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),

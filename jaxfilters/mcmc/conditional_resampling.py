@@ -45,7 +45,7 @@ def conditional_multinomial(
         ValueError: If `log_weights` is not a vector.
         TypeError: If it does not hold floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> jf.mcmc.conditional_multinomial(jax.random.key(0), jnp.log(jnp.array([0.0, 1.0, 0.0, 0.0])), 0).tolist()
         [0, 1, 1, 1]
@@ -81,7 +81,7 @@ def conditional_systematic(
         ValueError: If `log_weights` is not a vector.
         TypeError: If it does not hold floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> jf.mcmc.conditional_systematic(jax.random.key(0), jnp.zeros(4), 2).tolist()
         [2, 3, 0, 1]

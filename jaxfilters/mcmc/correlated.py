@@ -117,7 +117,7 @@ def correlated(
         ValueError: If `correlation` is not in [0, 1), or the lengths of the sequences differ; and when it is traced, if
             a filter was not made as above, or `sort_by` is missing for a state of several numbers.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> def filter_of(noise):

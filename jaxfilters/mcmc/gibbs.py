@@ -67,7 +67,7 @@ def particle_gibbs(
             `ConditionalSMC`.
         ValueError: If the leaves of `observations`, `inputs` and `mask` do not share one length.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> ys, normal = jnp.array([0.2, -0.3, 0.4]), jax.scipy.stats.norm.logpdf
         >>> def kernel_of(q):

@@ -121,7 +121,7 @@ def pmmh(
     Raises:
         TypeError: If an argument is not callable or no proposal.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> def filter_of(noise):
         ...     return jf.bootstrap(

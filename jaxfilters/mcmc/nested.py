@@ -108,7 +108,7 @@ def smc2(
             support of `log_prior` or the constraints, its density is NaN, or no parameter explains a frame. Under
             `jit` and `vmap` `status` says which.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> def filter_of(noise):
         ...     return jf.bootstrap(

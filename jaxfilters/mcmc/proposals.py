@@ -153,7 +153,7 @@ def random_walk(
         ValueError: If `step` is not positive, `target_acceptance` is not in (0, 1), or `constraints` holds something
             else.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> proposal = jf.mcmc.random_walk({"noise": jf.fit.positive, "bias": jf.fit.free}, step=0.1)
     """
@@ -183,7 +183,7 @@ def proposal(
     Raises:
         TypeError: If an argument is not callable.
 
-    Example:
+    Examples:
         >>> import jax, jaxfilters as jf
         >>> independent = jf.mcmc.proposal(
         ...     lambda key, theta: jax.random.normal(key), lambda proposed, theta: jax.scipy.stats.norm.logpdf(proposed)

@@ -176,7 +176,7 @@ def tempered_smc(
             a draw of the prior is outside the support of `log_prior` or the constraints, its density is NaN, no draw
             has any likelihood, or the stages did not suffice. Under `jit` and `vmap` `status` says which.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> normal = jax.scipy.stats.norm.logpdf
         >>> posterior = jf.mcmc.tempered_smc(
@@ -225,7 +225,7 @@ def waste_free_smc(
         TypeError: As `tempered_smc`.
         ValueError: As `tempered_smc`, or if `num_particles` is not a multiple of `chain_length`.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> normal = jax.scipy.stats.norm.logpdf
         >>> posterior = jf.mcmc.waste_free_smc(

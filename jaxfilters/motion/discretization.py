@@ -53,7 +53,7 @@ def discretize(A: ArrayLike, L: ArrayLike, dt: ArrayLike) -> Step:
     Raises:
         ValueError: If A is not square, L has another number of rows, or a concrete `dt` is negative or not finite.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> A, L = jnp.array([[0.0, 1.0], [0.0, 0.0]]), jnp.array([[0.0], [1.0]])
@@ -78,7 +78,7 @@ def discretize(A: ArrayLike, L: ArrayLike, dt: ArrayLike) -> Step:
 class LinearSDE:
     """A linear stochastic differential equation `dx = A x dt + L dw`, given by its matrices.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> pendulum = jf.motion.LinearSDE(jnp.array([[0.0, 1.0], [-4.0, -0.1]]), jnp.array([[0.0], [0.3]]))

@@ -80,7 +80,7 @@ def rk4(num_steps: int = 1) -> Integrate:
     Raises:
         ValueError: If `num_steps` is not an integer of at least 1.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> y = jf.motion.rk4(10)(lambda y: -y, jnp.float32(1.0), jnp.float32(1.0))
@@ -108,7 +108,7 @@ def adaptive(*, rtol: float = 1e-4, atol: float = 1e-6, max_steps: int = 4096) -
         ValueError: If a tolerance is not positive, or `max_steps` no integer of at least 1.
         ModuleNotFoundError: If diffrax is not installed.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> y = jf.motion.adaptive()(lambda y: -y, jnp.float32(1.0), jnp.float32(1.0))

@@ -118,7 +118,7 @@ def integrated_wiener(order: int, spectral_density: ArrayLike, *, dims: int = 1)
     Raises:
         ValueError: If `order` or `dims` is out of range, or a concrete `spectral_density` is negative or not finite.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> F, Q = jf.motion.integrated_wiener(1, 3.0).discretize(2.0)
         >>> F.tolist(), Q.tolist()
@@ -144,7 +144,7 @@ def constant_velocity(spectral_density: ArrayLike, *, dims: int = 1) -> Motion:
     Raises:
         ValueError: As for `integrated_wiener`.
 
-    Example:
+    Examples:
         Readings of a place in the plane, at uneven times.
 
         >>> import jax, jax.numpy as jnp
@@ -255,7 +255,7 @@ def matern(smoothness: float, length_scale: ArrayLike, std: ArrayLike, *, dims: 
         ValueError: If `smoothness` is another number, `dims < 1`, or a concrete parameter has the wrong sign or is not
             finite.
 
-    Example:
+    Examples:
         >>> import jaxfilters as jf
         >>> process = jf.motion.matern(1.5, 2.0, 3.0)
         >>> [[round(v, 3) for v in row] for row in process.stationary_covariance().tolist()]

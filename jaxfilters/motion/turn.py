@@ -105,7 +105,7 @@ def coordinated_turn(rate: ArrayLike, spectral_density: ArrayLike) -> Coordinate
     Raises:
         ValueError: If an argument is not one number, or a concrete one is not finite, or `spectral_density` negative.
 
-    Example:
+    Examples:
         A quarter of a turn about the origin.
 
         >>> import jax.numpy as jnp
@@ -139,7 +139,7 @@ def unknown_turn(spectral_density: ArrayLike, rate_density: ArrayLike) -> Unknow
     Raises:
         ValueError: If an argument is not one number, or a concrete one is negative or not finite.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> turn = jf.motion.unknown_turn(0.1, 0.01)

@@ -74,7 +74,7 @@ class BoxLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
         ValueError: When it is traced, if a bound does not match `y`, a lower bound exceeds the upper one, or there are
             no residuals.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> import optimistix

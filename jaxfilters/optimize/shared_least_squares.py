@@ -101,7 +101,7 @@ def solve_shared(
             leaves
             of `start.frames` and `data` do not share one number of frames.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> data = jnp.array([[1.0, 2.0], [4.0, 5.0]])  # one offset a frame, and one common difference

@@ -6,7 +6,7 @@ estimation system based on particle filtering with adaptive diffusion control", 
 Applications, 2005; Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion",
 2007, section 3.3).
 
-Example:
+Examples:
     >>> import jax, jax.numpy as jnp, jaxfilters as jf
     >>> fit = jf.math.diffusion.start(jnp.ones(2))
     >>> log_likelihood = lambda particles, y: -jnp.sum((particles - y[:, None]) ** 2, axis=0)

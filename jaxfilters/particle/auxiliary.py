@@ -175,7 +175,7 @@ def guided(
         ValueError: If `num_particles < 1`, or `ess_threshold` or a parameter of `temper` is out of range; and when the
             filter is traced, if a callback returns an array of the wrong shape or type.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> from jax.scipy.stats import norm
         >>> move = lambda noise, x: 0.9 * x + 0.5 * noise
@@ -242,7 +242,7 @@ def auxiliary(
         TypeError: As `guided`.
         ValueError: As `guided`; also if only one of `log_transition` and `proposal` is given, or `scheme` is transport.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> move = lambda noise, x: 0.9 * x + 0.1 * noise
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2)

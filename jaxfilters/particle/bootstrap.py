@@ -99,7 +99,7 @@ def bootstrap(
         ValueError: If `num_particles < 1`, or `ess_threshold` or a parameter of `temper` is out of range; and when the
             filter is traced, if a callback returns an array of the wrong shape or type.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> move = lambda noise, x: 0.9 * x + 0.5 * noise
         >>> log_likelihood = lambda x, y: -0.5 * jnp.sum((y - x) ** 2)

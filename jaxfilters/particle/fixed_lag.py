@@ -100,7 +100,7 @@ def fixed_lag_rts(inner: Filter, lag: int, *, inputs: PyTree = None) -> Filter:
         ValueError: If `inner` is another kind of filter, or `lag < 1`.
         TypeError: If `inner` is no filter.
 
-    Example:
+    Examples:
         >>> import jax
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf

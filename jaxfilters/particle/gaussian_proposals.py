@@ -181,7 +181,7 @@ def linearized(
         TypeError: If a callback is not callable.
         ValueError: If a covariance is not one, or a number is out of range.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp, jaxfilters as jf
         >>> one = jnp.eye(1)
         >>> optimal = jf.proposals.linearized(lambda x: 0.9 * x, one, lambda x: x, one)
@@ -230,7 +230,7 @@ def laplace(
         TypeError: If a callback is not callable.
         ValueError: If the covariance is not one, or a number is out of range.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> poisson = lambda x, y: jax.scipy.stats.poisson.logpmf(y, jnp.exp(x[0]))
         >>> proposal = jf.proposals.laplace(lambda x: 0.9 * x, 0.1 * jnp.eye(1), poisson)

@@ -97,7 +97,7 @@ def guided_rao_blackwell(
         ValueError: If `inner` is another kind of filter, or `prior_share` is out of range; and when the filter is
             traced, if `guide` or `local` returns an array of the wrong shape.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> one, R = jnp.ones((1, 1)), 0.001
         >>> dynamics = lambda x: jf.MixedDynamics(x, 0.1 * one, 0.03 * one, jnp.zeros(1), one, one)

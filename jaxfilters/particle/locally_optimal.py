@@ -66,7 +66,7 @@ def locally_optimal(
         TypeError: If an argument is of another kind.
         ValueError: If shapes do not fit one another, a covariance is not one, or a number is out of range.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
         >>> wave = lambda x: x + jnp.sin(x)

@@ -90,7 +90,7 @@ def paris(
         ValueError: If `inner` is another kind of filter, `num_draws < 1`, `max_candidates < 1`, or `log_bound` is not
             finite; when it is traced, if `increment` and `initial` return different structures, shapes or types.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
         ...     lambda key: jnp.zeros(1), lambda e, x: 0.9 * x + e, lambda x, y: -jnp.sum((x - y) ** 2),

@@ -44,7 +44,7 @@ def batch_log_likelihood(log_likelihood: LogLikelihood) -> EnsembleLogLikelihood
         `(particles (d, n), y, inputs) -> (n,)`, where the inputs are `None` by default. Two results for the same
         function are equal, so that a filter built again is not compiled again.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> jf.batch_log_likelihood(lambda x, y: -jnp.sum((x - y) ** 2))(jnp.zeros((2, 5)), jnp.ones(2)).shape

@@ -125,7 +125,7 @@ def rao_blackwell(
             `scheme` is transport, which would average Gaussians of different particles; and when the filter is
             traced, if a callback returns an array of the wrong shape or type.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> one = jnp.ones((1, 1))  # the position x is driven by an unknown velocity l
         >>> dynamics = lambda x, dt: jf.MixedDynamics(x, dt * one, 0.01 * one, jnp.zeros(1), one, 0.1 * one)
@@ -180,7 +180,7 @@ def rao_blackwell_shared(
         TypeError: As `rao_blackwell`.
         ValueError: As `rao_blackwell`; and when the filter is traced, if one of the matrices depends on x.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> one, velocity = jnp.ones((1, 1)), jf.Gaussian(jnp.zeros(1), jnp.eye(1))
         >>> dynamics = lambda x, dt: jf.MixedDynamics(x, dt * one, 0.01 * one, jnp.zeros(1), one, 0.1 * one)

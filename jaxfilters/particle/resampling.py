@@ -14,7 +14,7 @@ later", 2009, section 3.4; they and `ssp` return sorted indices, and draw anothe
 No binary search is needed. The grid is regular, so that the number of grid points below a cumulative weight follows
 from its integer and fractional part; the cumulative sum of a histogram of these numbers is the list of ancestors.
 
-Example:
+Examples:
     >>> import jax, jax.numpy as jnp, jaxfilters as jf
     >>> log_weights = jnp.log(jnp.array([0.0, 0.5, 0.5, 0.0]))
     >>> jf.resampling.systematic(jax.random.key(0), log_weights).tolist()
@@ -155,7 +155,7 @@ def metropolis(num_steps: int) -> Metropolis:
     Raises:
         ValueError: If `num_steps` is not an integer of at least 1.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> scheme = jf.resampling.metropolis(jf.resampling.metropolis_steps(4.0, 1e-3))
         >>> scheme(jax.random.key(0), jnp.log(jnp.array([0.0, 1.0, 0.0, 0.0]))).tolist()
@@ -239,7 +239,7 @@ def optimal(key: Key, log_weights: Float[Array, " m"], num_survivors: int) -> Su
         ValueError: If `num_survivors` is not an integer from 1 to m, or `log_weights` no vector.
         TypeError: If `log_weights` holds no floating-point numbers.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> log_weights = jnp.log(jnp.array([0.6, 0.1, 0.0, 0.1, 0.1, 0.1]))
         >>> kept = jf.resampling.optimal(jax.random.key(0), log_weights, 3)

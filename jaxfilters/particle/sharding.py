@@ -69,7 +69,7 @@ def placement(filter: Filter, mesh: Mesh, *, axis: str = AXIS) -> PyTree[NamedSh
         ValueError: If the filter is of another kind, the mesh has no such axis, or the length of that axis does not
             divide the number of particles.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> prior, move = lambda key: jnp.zeros(1), lambda key, x: x + jax.random.normal(key, (1,))
         >>> pf = jf.bootstrap(prior, move, lambda x, y: -jnp.sum((x - y) ** 2), num_particles=100)

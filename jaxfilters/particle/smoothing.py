@@ -59,7 +59,7 @@ def trajectories(history: History) -> PyTree:
         TypeError: If `history` is not a `History`.
         ValueError: If its leaves do not agree in the numbers of frames and particles.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> pf = jf.bootstrap(
         ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),

@@ -107,7 +107,7 @@ def switching(
             are no probabilities that sum to one (tested where their values are known); if `num_particles < 1`.
         TypeError: If `filters` is no list of filters, or `scheme` no function.
 
-    Example:
+    Examples:
         A point that rests or moves at random.
 
         >>> import jax

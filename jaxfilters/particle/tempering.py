@@ -33,7 +33,7 @@ class AdaptiveTempering:
 
     Builders reject an `ess_fraction` outside (0, 1] where its value is concrete.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp, jaxfilters as jf
         >>> temper = jf.AdaptiveTempering(0.5)
         >>> tempered = temper(jnp.array([0.0, -100.0, -200.0, -300.0]), jnp.zeros(4))

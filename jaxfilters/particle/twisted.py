@@ -185,7 +185,7 @@ def iterated_auxiliary(
         TypeError: If an argument is of another kind.
         ValueError: If shapes or lengths do not fit one another, a covariance is not one, or a number is out of range.
 
-    Example:
+    Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
         >>> one = jnp.eye(1)
         >>> prior, log_likelihood = jf.Gaussian(jnp.zeros(1), one), lambda x, y: jf.Gaussian(x, one).logpdf(y)

@@ -156,7 +156,12 @@ def test_filters_that_are_exact_have_the_evidence_and_the_gradient_of_the_textbo
     np.testing.assert_allclose(slope, SLOPE, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", SAMPLED)
+QUICK = {"ensemble_kalman", "bootstrap", "rao_blackwell"}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.system) for name in SAMPLED]
+)
 def test_filters_that_sample_agree_with_the_textbook_within_their_error(name):
     """Over 16 keys, at four standard errors of the mean: a false alarm has a probability of 6e-5 for each number.
 

@@ -335,6 +335,14 @@ def fake_head(monkeypatch, face_model):
             self.events, self.sizes = [], []
             made.append(self)
 
+        def saved(self):
+            is_lost = self.frames in (11, 12)
+            return None if is_lost or self.model is None else {"frames": self.frames, "events": self.events}
+
+        def restore(self, saved):
+            self.frames, self.events = saved["frames"], saved["events"]
+            self.model, self.contribution = face_model, 0.75
+
         def process(self, images, times):
             assert images.dtype == np.uint8
             assert images.shape[1:] == (self.rig.num_cameras, *self.rig.shape)

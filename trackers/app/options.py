@@ -22,6 +22,11 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "input", nargs="?", type=Path, metavar="INPUT", help=f"{what}; without it, a synthetic recording"
     )
+    add_resume(parser)
+
+
+def add_resume(parser: argparse.ArgumentParser) -> None:
+    """Whether an interrupted run is continued."""
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
     parser.set_defaults(overwrite=False)
 

@@ -1,5 +1,6 @@
 """What a run leaves in its folder: `track.csv`, `track.npz`, `report.json`, and `checkpoint/` to continue from."""
 
+import argparse
 import csv
 import errno
 import json
@@ -15,9 +16,13 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
+from jaxfilters.trackers.app.progress import note
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.errors import CheckpointError, OutputError
 from jaxfilters.trackers.tracker import STATUS_NAMES
+
+CHECKPOINT_EVERY_S = 2.0
+"""Seconds between checkpoints of what has no chunks; what was tracked since the last is tracked again after a crash."""
 
 
 class Columns(NamedTuple):
@@ -113,7 +118,7 @@ class TrackWriter:
             for first, part in list(self._with_first_frames())[self._saved :]:
                 checkpoint.write_npz(_part_path(self._path, first), part._asdict())
             # The state comes last: rows without it are written again.
-            checkpoint.save(_state_path(self._path), state, meta)
+            checkpoint.save(state_path(self._path), state, meta)
         self.frames_saved, self._saved = self.frames, len(self._parts)
 
     def finish(self, report: dict[str, Any], **arrays: np.ndarray) -> None:
@@ -123,7 +128,7 @@ class TrackWriter:
             checkpoint.write_npz(self._path / "track.npz", results._asdict() | arrays)
         with self._explained(self._path / "report.json"):
             (self._path / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
-        if self.frames_saved and len(self._parts) > 1:
+        if self.frames_saved == self.frames and len(self._parts) > 1:
             with self._explained(_checkpoint_folder(self._path)):
                 checkpoint.write_npz(_part_path(self._path, 0), results._asdict())
                 for first, _ in list(self._with_first_frames())[1:]:
@@ -181,7 +186,7 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
     """
     output = OutputFolder(folder)
     try:
-        path = _state_path(folder)
+        path = state_path(folder)
         if not overwrite and path.exists() and not (meta := checkpoint.load_meta(path))["complete"]:
             raise CheckpointError(
                 f"{folder} holds an unfinished run of {meta['frames']} frames: continue it with --resume, "
@@ -194,8 +199,24 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
         raise
 
 
-def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackWriter, Callable[[Any], Any]]:
-    """A writer where the last checkpoint in `folder` left off, and what restores the state of the tracker.
+def open_writer(options: argparse.Namespace, run: dict[str, Any], table: TrackTable) -> tuple[TrackWriter, Any | None]:
+    """The writer of a command, and the state where `--resume` goes on from one; None where it begins anew.
+
+    Raises:
+        CheckpointError: `--resume` does not fit what lies in the folder, or is missing.
+        OutputError: the folder cannot be written, or another run writes into it.
+    """
+    if options.resume and can_resume(options.out):
+        writer, saved = resume(options.out, run, table)
+        note(f"continuing after frame {writer.frames} of {options.out}")
+        return writer, saved
+    if options.resume:
+        note(f"nothing to resume in {options.out}: starting with the first frame")
+    return begin(options.out, run, table, overwrite=options.overwrite), None
+
+
+def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackWriter, Any]:
+    """A writer where the last checkpoint in `folder` left off, and the state of the tracker then.
 
     Args:
         folder: where the results are.
@@ -203,7 +224,7 @@ def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackW
         table: how rows are written.
 
     Returns:
-        The writer, and `template -> state`: the saved state with the structure of `template`, a state of the tracker.
+        The writer, and the state as `TrackWriter.checkpoint` was given it.
 
     Raises:
         CheckpointError: the checkpoint is damaged, or of another input, configuration or version.
@@ -211,16 +232,24 @@ def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackW
     """
     output = OutputFolder(folder)
     try:
-        meta = checkpoint.load_meta(_state_path(folder))
-        was = meta["run"]
-        if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
-            changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
-            raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
-        writer = TrackWriter(output, run, table, _saved_parts(folder, table, meta["frames"]))
-        return writer, lambda template: checkpoint.load(_state_path(folder), template)[0]
+        check_same_run(folder, run)
+        state, meta = checkpoint.load(state_path(folder))
+        return TrackWriter(output, run, table, _saved_parts(folder, table, meta["frames"])), state
     except BaseException:
         output.close()
         raise
+
+
+def check_same_run(folder: Path, run: dict[str, Any]) -> None:
+    """Whether the run whose checkpoint lies in `folder` may be continued by another one.
+
+    Raises:
+        CheckpointError: It was of another input, configuration or version, or its checkpoint is damaged.
+    """
+    was = checkpoint.load_meta(state_path(folder)).get("run", {})
+    if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
+        changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
+        raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
 
 
 def versions() -> dict[str, str]:
@@ -235,7 +264,7 @@ def versions() -> dict[str, str]:
 
 def can_resume(folder: Path) -> bool:
     """Whether `folder` holds a checkpoint."""
-    return _state_path(folder).exists()
+    return state_path(folder).exists()
 
 
 def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[Any]:
@@ -260,7 +289,8 @@ def _checkpoint_folder(folder: Path) -> Path:
     return folder / "checkpoint"
 
 
-def _state_path(folder: Path) -> Path:
+def state_path(folder: Path) -> Path:
+    """Where a folder of results has the state of its tracker."""
     return _checkpoint_folder(folder) / "state.npz"
 
 

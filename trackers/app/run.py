@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from jaxfilters.trackers.app.chunks import Progress, track_recording
-from jaxfilters.trackers.app.progress import ProgressLine, note
-from jaxfilters.trackers.app.results import TrackTable, TrackWriter, begin, can_resume, resume, versions
+from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.results import TrackTable, TrackWriter, open_writer, versions
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.recording import Recording
 from jaxfilters.trackers.tracker import STATUS_NAMES, Tracker
@@ -48,10 +48,10 @@ def run(spec: RunSpec, options: argparse.Namespace) -> str:
         KeyboardInterrupt: with what is kept as its text.
     """
     began = time.perf_counter()
-    writer, saved = _writer(options, spec)
+    writer, saved = open_writer(options, _identity(spec), spec.table)
     try:
-        state = spec.tracker.init(jax.random.key(spec.config.seed), spec.recording[0])
-        rate = _track(spec, state if saved is None else saved(state), writer)
+        state = spec.tracker.init(jax.random.key(spec.config.seed), spec.recording[0]) if saved is None else saved
+        rate = _track(spec, state, writer)
         errors = spec.errors(writer.results)
         report = _report(spec, writer.results, errors, rate, time.perf_counter() - began)
         writer.finish(report)
@@ -72,18 +72,6 @@ def _identity(spec: RunSpec) -> dict[str, Any]:
         "version": version("jaxfilters"),
         **{f"config.{name}": value for name, value in dataclasses.asdict(spec.config).items()},
     }
-
-
-def _writer(options: argparse.Namespace, spec: RunSpec) -> tuple[TrackWriter, Callable[[Any], Any] | None]:
-    """The writer, before anything is compiled; and what restores the saved state, where there is one."""
-    identity = _identity(spec)
-    if options.resume and can_resume(options.out):
-        writer, saved = resume(options.out, identity, spec.table)
-        note(f"continuing after frame {writer.frames} of {options.out}")
-        return writer, saved
-    if options.resume:
-        note(f"nothing to resume in {options.out}: starting with the first frame")
-    return begin(options.out, identity, spec.table, overwrite=options.overwrite), None
 
 
 def _track(spec: RunSpec, state: Any, writer: TrackWriter) -> float:

@@ -6,39 +6,36 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxfilters.models.gesture import coded
-from jaxfilters.trackers.app.progress import ProgressLine, warn
+from jaxfilters.trackers.app.progress import ProgressLine, note, warn
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
-from jaxfilters.trackers.fingertips.files import FingertipFiles
+from jaxfilters.trackers.fingertips.files import FingertipFiles, read_events
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
 from jaxfilters.trackers.fingertips.input import DemoHand, open_hands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures
 from jaxfilters.trackers.fingertips.session import FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.head.common.outcome import finite
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
+from jaxfilters.trackers.io.video_input import Moment, continued
 from jaxfilters.trackers.people.files import write_report
 
 
 class RunResult(NamedTuple):
     """What came of a run."""
 
-    frames: int
+    tally: Tally
     frames_per_second: float
     """Without the first frame, which compiles; NaN with one."""
-    names: Counter[str]
-    """Frames in which each fingertip was there."""
-    counts: list[int]
-    """Fingertips in each frame."""
-    errors: list[float]
-    """Pixels from the truth, where there is one."""
     interrupted: bool
     failure: InputError | None
 
@@ -53,7 +50,7 @@ def track(options: argparse.Namespace) -> str:
     """
     symbols = _symbols(options.gestures)
     source = open_hands(options.video_source, options.mask, fps=options.fps, seed=options.seed)
-    files = FingertipFiles(options.out)
+    files = FingertipFiles(options.out, _identity(source, options), resume=options.resume)
     began = time.perf_counter()
     try:
         user = _user(source, options.mask)
@@ -70,7 +67,7 @@ def track(options: argparse.Namespace) -> str:
         followed = _follow(source, user, session, files, options)
     finally:
         files.close()
-    if not followed.frames:
+    if not followed.tally.frames:
         if followed.interrupted:
             raise KeyboardInterrupt("nothing was kept")
         raise followed.failure or InputError(f"{source.name}: no image.")
@@ -79,7 +76,7 @@ def track(options: argparse.Namespace) -> str:
     for trouble in report["trouble"]:
         warn(trouble)
     if followed.failure is not None:
-        kept = f"the first {followed.frames} frames are in {files.tips}"
+        kept = f"the first {followed.tally.frames} frames are in {files.tips}"
         raise InputError(f"{str(followed.failure).removesuffix('.')}; {kept}.")
     return _told(report, options)
 
@@ -113,29 +110,42 @@ def _user(source: Any, mask: str) -> User:
         raise InputError(f"{source.name}: {error}") from None
 
 
+def _identity(source: Any, options: argparse.Namespace) -> dict[str, Any]:
+    """What two runs must share for one to continue the other."""
+    given = {name: str(getattr(options, name)) for name in ("mask", "hands", "gestures", "seed")}
+    size, rate = list(source.image_size), source.fps
+    return {"input": source.name, "image_size": size, "fps": rate, "version": version("jaxfilters"), **given}
+
+
 def _follow(
     source: Any, user: User, session: FingertipSession, files: FingertipFiles, options: argparse.Namespace
 ) -> RunResult:
-    pictures, video = FingertipPictures(), None
-    names, counts, errors, ends = Counter[str](), list[int](), list[float](), list[float]()
-    interrupted, failure, reported = False, None, 0
+    tally = Tally()
+    if files.saved is not None:
+        tally = files.saved["tally"]
+        session.restore(files.saved["session"], read_events(files.events))
+        note(f"continuing after frame {tally.frames} of {options.out}")
+    name = f"overlay_from_{tally.frames}.mp4" if tally.frames else "overlay.mp4"
+    pictures, video, ends = FingertipPictures(), None, list[float]()
+    interrupted, failure, reported = False, None, len(session.events)
     total = getattr(source, "frames", 0) or None
     try:
-        with ProgressLine("tracking", total) as line:
-            for time_s, image in _images(source, options.seconds):
+        with ProgressLine("tracking", total, done=tally.frames) as line:
+            moments = continued(_moments(source, options.seconds), [source], tally.frames, tally.time_s)
+            for time_s, (image,) in moments:
                 found = session.process(hands_in(image, user, options.hands), np.array([time_s]))
                 report = HandReport(*(field[0] for field in found))
                 events, reported = session.events[reported:], len(session.events)
-                files.append(len(counts), time_s, report, events)
+                files.append(tally.frames, time_s, report, events)
                 if options.video:
-                    picture = pictures.drawn(shown(image), len(counts), time_s, report, events)
-                    video = video or OverlayVideo(options.out / "overlay.mp4", source.fps, picture.shape)
+                    picture = pictures.drawn(shown(image), tally.frames, time_s, report, events)
+                    video = video or OverlayVideo(options.out / name, source.fps, picture.shape)
                     video.write(picture)
-                names.update(f"{hand}-{report.identity[hand, slot]}" for hand, slot in np.argwhere(report.is_tip))
-                counts.append(int(report.num_tips.sum()))
-                errors += _errors(source, report)
+                tally = tally.add(time_s, report, source.truth[-1] if isinstance(source, DemoHand) else None)
+                files.checkpoint(lambda now=tally: {"session": session.saved(), "tally": now})
                 ends.append(time.perf_counter())
-                line.show(len(counts) if total is None else min(len(counts), total), f"{counts[-1]} fingertips")
+                done = tally.frames if total is None else min(tally.frames, total)
+                line.show(done, f"{int(report.num_tips.sum())} fingertips")
     except InputError as error:
         failure = error
     except KeyboardInterrupt:
@@ -147,33 +157,22 @@ def _follow(
         video.check()
     session.finish()
     if session.events[reported:]:
-        files.append(len(counts), 0.0, _NOTHING, session.events[reported:])
+        files.append(tally.frames, 0.0, _NOTHING, session.events[reported:])
     rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else math.nan
-    return RunResult(len(counts), rate, names, counts, errors, interrupted, failure)
+    return RunResult(tally, rate, interrupted, failure)
 
 
 _NOTHING: Any = HandReport(*[np.zeros((0, 0), bool)] * len(HandReport._fields))  # type: ignore[arg-type]
 
 
-def _images(source: Any, seconds: float | None) -> Iterator[tuple[float, np.ndarray]]:
+def _moments(source: Any, seconds: float | None) -> Iterator[Moment]:
     first = None
     for time_s, image in source.images():
         first = time_s if first is None else first
         if image is not None:
-            yield time_s - first, image
+            yield Moment(time_s - first, (image,))
         if seconds and time_s - first >= seconds:
             return
-
-
-def _errors(source: Any, report: HandReport) -> list[float]:
-    """Pixels of every fingertip from the nearest true one of a synthetic hand."""
-    if not isinstance(source, DemoHand):
-        return []
-    truth = source.truth[-1]
-    if not truth.extended.any():
-        return []
-    places = report.position[report.is_tip]
-    return np.linalg.norm(places[:, None] - truth.tips[truth.extended], axis=-1).min(axis=1).tolist()
 
 
 def _report(
@@ -184,18 +183,18 @@ def _report(
     options: argparse.Namespace,
     seconds: float,
 ) -> dict[str, Any]:
-    truth = [int(frame.extended.sum()) for frame in getattr(source, "truth", [])][: followed.frames]
-    right = np.equal(truth, followed.counts).mean() if truth else math.nan
+    tally = followed.tally
+    right = tally.right_counts / tally.frames if isinstance(source, DemoHand) else math.nan
     return {
         "input": source.name,
-        "frames": followed.frames,
+        "frames": tally.frames,
         "frames_per_second": finite(followed.frames_per_second),
         "seconds": round(seconds, 2),
-        "fingertips": len(followed.names),
-        "frames_by_fingertip": dict(followed.names),
-        "frames_by_count": {str(count): n for count, n in sorted(Counter(followed.counts).items())},
+        "fingertips": len(tally.frames_by_fingertip),
+        "frames_by_fingertip": tally.frames_by_fingertip,
+        "frames_by_count": dict(sorted(tally.frames_by_count.items(), key=lambda item: int(item[0]))),
         "events": dict(Counter(f"{event.name} {event.phase}" for event in session.events)),
-        "mean_error_px": finite(float(np.mean(followed.errors))) if followed.errors else None,
+        "mean_error_px": finite(tally.mean_error_px),
         "share_of_right_counts": finite(float(right)),
         "interrupted": followed.interrupted,
         "trouble": [trouble] if (trouble := source.trouble()) else [],

@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxfilters.trackers.app.options import add_results_options, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,4 +30,5 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_seed(parser, default=0)
     add_video_options(parser)
+    add_resume(parser)
     add_results_options(parser)

@@ -97,6 +97,26 @@ class FingertipSession:
                 self._events_of(hand, now)
         return report
 
+    def saved(self) -> dict[str, Any]:
+        """All that the next frame needs but for the events, for `restore` in a session of the same user and options.
+
+        A tree that `trackers.io.checkpoint` can save.
+        """
+        return {
+            "state": self._state,
+            "handling": self._handling,
+            "drawing": self._drawing,
+            "last": self._last,
+            "now": self._now,
+            "frames": self._frames,
+        }
+
+    def restore(self, saved: dict[str, Any], events: list[Event]) -> None:
+        """Go on from what `saved` gave, with the events up to then."""
+        self._state, self._handling, self._drawing = saved["state"], saved["handling"], saved["drawing"]
+        self._last, self._now, self._frames = saved["last"], saved["now"], saved["frames"]
+        self.events = events
+
     def finish(self) -> None:
         """End what is under way: nothing more comes."""
         for hand, now in enumerate(self._now):

@@ -5,56 +5,44 @@ import os
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.trackers.io.errors import CheckpointError, InputError, shortened, shown
 from jaxfilters.trackers.io.json_files import parse_json
 from jaxfilters.trackers.io.npz import read_npz
+from jaxfilters.trackers.io.trees import put_together, taken_apart
 
 _WANTED = "expected a checkpoint"
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout below; a file of another version is refused."""
 
 
 def save(path: Path, tree: Any, meta: dict[str, Any]) -> None:
-    """Write `tree` and the JSON-able `meta` so that `path` holds either the old file or the whole new one.
+    """Write `tree`, as `trees.taken_apart` takes it, and the JSON-able `meta`.
 
-    Leaves are keyed by their place in the tree; typed random keys are stored as their data.
+    `path` holds either the old file or the whole new one.
     """
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    arrays = {_name(place): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for place, leaf in leaves}
-    header = json.dumps({"schema": SCHEMA, "meta": meta})
+    structure, arrays = taken_apart(tree)
+    header = json.dumps({"schema": SCHEMA, "meta": meta, "structure": structure})
     write_npz(path, {"header": np.asarray(header), **arrays})
 
 
-def load(path: Path, template: Any) -> tuple[Any, dict[str, Any]]:
-    """`(tree, meta)` as saved; `template` gives the structure, shapes and types. NumPy leaves stay on the host.
-
-    Raises:
-        CheckpointError: damaged file, other schema, or leaves that do not fit the template.
-    """
-    arrays, meta = _read(path)
-    leaves, treedef = jax.tree_util.tree_flatten_with_path(template)
-    if (expected := {_name(place) for place, _ in leaves}) != set(arrays):
-        different = shown(sorted(expected ^ set(arrays)), 160)
-        raise CheckpointError(f"{path}: its arrays differ from the expected ones in {different}.")
-    return jax.tree.unflatten(treedef, [_restore(path, _name(p), arrays[_name(p)], leaf) for p, leaf in leaves]), meta
-
-
-def load_names(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays by their places in the tree, as `jax.tree_util.keystr` after "tree", and the `meta`.
+def load(path: Path) -> tuple[Any, dict[str, Any]]:
+    """`(tree, meta)` as saved, with the same types, bit for bit.
 
     Raises:
         CheckpointError: damaged file, or other schema.
     """
-    return _read(path)
+    arrays, header = _read(path)
+    try:
+        return put_together(header.get("structure"), arrays), header["meta"]
+    except ValueError as error:
+        raise CheckpointError(f"{path}: not a complete checkpoint ({shortened(str(error), 160)})") from None
 
 
 def load_meta(path: Path) -> dict[str, Any]:
     """The `meta` of a checkpoint, without its arrays being looked at."""
-    return _read(path)[1]
+    return _read(path)[1]["meta"]
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -94,23 +82,4 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise CheckpointError(f"{path}: not a complete checkpoint (without schema and meta).")
     if header.get("schema") != SCHEMA:
         raise CheckpointError(f"{path}: schema {shown(header.get('schema'))}, but this version reads {SCHEMA}.")
-    return arrays, header["meta"]
-
-
-def _restore(path: Path, name: str, saved: np.ndarray, leaf: Any) -> Any:
-    expected = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-    if (saved.shape, saved.dtype) != (expected.shape, expected.dtype):
-        raise CheckpointError(
-            f"{path}: {name} is {saved.shape} {saved.dtype}; expected {expected.shape} {expected.dtype}."
-        )
-    if _is_key(leaf):
-        return jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(leaf))
-    return jnp.asarray(saved) if isinstance(leaf, jax.Array) else saved
-
-
-def _is_key(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _name(place: tuple[Any, ...]) -> str:
-    return "tree" + jax.tree_util.keystr(place)
+    return arrays, header

@@ -1,10 +1,11 @@
 """Where images come from: video files, folders of images, and live cameras; several of them on one clock."""
 
+import itertools
 import math
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -240,6 +241,24 @@ class Moment(NamedTuple):
     """From the first one."""
     images: tuple[np.ndarray | None, ...]
     """None where a source has nothing new."""
+
+
+def continued(
+    moments: Iterator[Moment], sources: Sequence[VideoSource], frames: int, time_s: float
+) -> Iterator[Moment]:
+    """The moments that an interrupted run has not had.
+
+    Args:
+        moments: From the first one.
+        sources: Of the moments. Recordings are read again from their beginning; a live camera goes on, on the clock of
+            the run.
+        frames: Moments that the run has had.
+        time_s: Of the last of them, seconds.
+    """
+    if not any(isinstance(source, LiveCamera) for source in sources):
+        return itertools.islice(moments, frames, None)
+    later_s = time_s + 1 / max(source.fps for source in sources) if frames else 0.0
+    return (moment._replace(time_s=later_s + moment.time_s) for moment in moments)
 
 
 def together(sources: list[VideoSource]) -> Iterator[Moment]:

@@ -1,7 +1,6 @@
 """`jaxfilters track people`."""
 
 import argparse
-import itertools
 import json
 import time
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from jaxfilters.trackers.io.cameras import open_camera
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
 from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.io.video_input import LiveCamera, open_video, together
+from jaxfilters.trackers.io.video_input import LiveCamera, continued, open_video, together
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.drawing import drawn, write_plan
 from jaxfilters.trackers.people.files import TracksWriter, write_mot, write_report
@@ -155,7 +154,7 @@ def _run(setup: Setup, options: argparse.Namespace, session: PeopleSession, writ
     name = f"overlay_from_{first}.mp4" if first else "overlay.mp4"
     try:
         with ProgressLine("tracking", total, done=first) as line:
-            for moment in itertools.islice(together(setup.sources), first, None):
+            for moment in continued(together(setup.sources), setup.sources, first, session.tracks.time_s):
                 images = [
                     None if image is None else undistortion.apply(image)
                     for image, undistortion in zip(moment.images, setup.undistortions, strict=True)

@@ -10,19 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
-from jaxfilters.trackers.app.results import OutputFolder
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, OutputFolder, can_resume
 from jaxfilters.trackers.io.errors import OutputError
-from jaxfilters.trackers.people.checkpoints import has_checkpoint, load, save
+from jaxfilters.trackers.people.checkpoints import load, save
 from jaxfilters.trackers.people.recorded import Sighting, height_of, spreads
 from jaxfilters.trackers.people.session import PeopleSession
 from jaxfilters.trackers.people.silhouettes import body_of, place_of
 from jaxfilters.trackers.people.state import PeopleScene
 
 COLUMNS = ("frame", "id", "x_m", "y_m", "radial_std_m", "lateral_std_m", "height_m", "score", "mode")
-
-
-CHECKPOINT_EVERY_S = 2.0
-"""Seconds between checkpoints; what was tracked since the last one is tracked again after a crash."""
 
 
 class TracksWriter:
@@ -47,7 +43,7 @@ class TracksWriter:
         self._scene, self._run, self._centers = scene, run, np.asarray(scene.centers())
         self._unsaved: list[tuple[int, Sighting]] = []
         self._num_parts, self._saved_at = 0, time.monotonic()
-        self._resumes = resume and has_checkpoint(folder)
+        self._resumes = resume and can_resume(folder)
         try:
             if self.path.exists() and not self._resumes:
                 raise OutputError(f"{self.path}: holds the tracks of another run; choose another --out, or --resume.")
@@ -68,7 +64,7 @@ class TracksWriter:
         """
         if not self._resumes:
             return
-        saved = load(self.path.parent, self._run, session)
+        saved = load(self.path.parent, self._run)
         session.restore(saved.state, saved.tracks)
         self._num_parts = saved.num_parts
         self._file.truncate(0)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import positive_integer
-from jaxfilters.trackers.app.options import add_results_options, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--capacity", type=positive_integer, metavar="N", help="people at a time, at most (default: 32)"
     )
     add_video_options(parser)
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
+    add_resume(parser)
     parser.add_argument("--mot", action="store_true", help="write tracks_mot.txt as well (MOT challenge)")
     add_seed(parser)
     add_results_options(parser)

@@ -74,7 +74,7 @@ class PeopleTracks:
         """
         self.scene, self.recorder = scene, Recorder()
         self.frames, self.people = 0, start(scene)
-        self._time_s = 0.0
+        self.time_s = 0.0
 
     def step(self, observed: tuple[CameraFrame, ...], time_s: float) -> PeopleEstimate:
         """The estimate after the next frame.
@@ -84,9 +84,9 @@ class PeopleTracks:
             time_s: Seconds since the first frame, growing.
         """
         began = time.perf_counter()
-        dt = np.float32(time_s - self._time_s)
+        dt = np.float32(time_s - self.time_s)
         self.people, report = jax.block_until_ready(step(self.scene, self.people, observed, dt))
-        seconds, self._time_s = time.perf_counter() - began, time_s
+        seconds, self.time_s = time.perf_counter() - began, time_s
         people, reported = jax.device_get((self.people, report))
         added = self.recorder.add(self.frames, time_s, people, reported)
         self.frames += 1
@@ -101,13 +101,13 @@ class PeopleTracks:
         unconfirmed = [(slot, one) for slot, some in self.recorder.unconfirmed.items() for one in some]
         return {
             "people": self.people,
-            "clock": np.array([self.frames, self._time_s]),
+            "clock": np.array([self.frames, self.time_s]),
             "unconfirmed": as_arrays(unconfirmed),
         }
 
     def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
         """Continue from what `state` gave, with the tracks up to then."""
-        self.people, (frames, self._time_s) = state["people"], map(float, state["clock"])
+        self.people, (frames, self.time_s) = state["people"], map(float, state["clock"])
         self.frames, self.recorder = int(frames), Recorder()
         for slot, one in from_arrays(state["unconfirmed"]):
             self.recorder.unconfirmed.setdefault(slot, []).append(one)

@@ -64,7 +64,7 @@ class TruncateEachStep:
     This is right for constraints on quantities that move between the steps. A constraint on a constant quantity counts
     as often as there are steps, and the belief shrinks with each of them: use `EPConstraints` for such rows.
 
-    Example:
+    Examples:
         >>> import jax.numpy as jnp
         >>> import jaxfilters as jf
         >>> rows = jf.constraints.linear_constraints([[1.0, 0.0]], lower=0.0, upper=jnp.inf)
@@ -99,7 +99,7 @@ class EPConstraints:
     `jf.constrained` raises an error where it can verify this, which is for filters made by `jf.kalman`,
     `jf.extended_kalman` and their variants with known matrices. For any other filter it is the caller's duty.
 
-    Example:
+    Examples:
         A position that moves and must stay above 0, and a length between 1 and 2 that is constant:
 
         >>> import jax.numpy as jnp
@@ -152,7 +152,7 @@ def constrained(inner: Filter, constrain: Constrain) -> Filter:
             time, or one is too narrow for a covariance in float32. Values are checked where they are known, that is,
             not under `jit` or `grad`.
 
-    Example:
+    Examples:
         A random walk that stays above 0:
 
         >>> import jax, jax.numpy as jnp

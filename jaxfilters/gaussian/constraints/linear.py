@@ -51,7 +51,7 @@ def linear_constraints(
         ValueError: A shape does not fit, a number is not finite, a normal is zero, or a lower bound is above its
             upper bound; the message names the row.
 
-    Example:
+    Examples:
         A first component in [0, 1], and a second one that is at most the first:
 
         >>> import jax.numpy as jnp

@@ -125,6 +125,7 @@ def test_gradients_are_those_of_finite_differences(x64, name, m):
     np.testing.assert_allclose(jax.grad(total)(1.0), difference, rtol=1e-6)
 
 
+@pytest.mark.system
 def test_correlations_fall_from_one_to_zero_and_are_possible():
     distance = np.linspace(0, 1.2, 25)
     z = 2 * distance

@@ -135,6 +135,7 @@ def relative_variance(P, S, y):
     return float(square / norm.pdf(y, 0.0, np.sqrt(P + S)) ** 2 - 1)
 
 
+@pytest.mark.system
 def test_the_variance_of_the_evidence_is_that_of_theory():
     """One step: n times the variance is that of one weight, N(y; x', R), or N(y; x, Q + R) with the optimal proposal.
 
@@ -209,6 +210,7 @@ def test_states_may_be_pytrees_and_inputs_reach_the_proposal():
     np.testing.assert_allclose(mean, 8.0, atol=0.1)
 
 
+@pytest.mark.system
 def test_gradients_are_those_of_finite_differences(x64):
     """Without resampling the estimate is a smooth function of the parameters."""
 
@@ -308,6 +310,7 @@ def test_missing_components_of_a_reading_say_nothing():
         np.testing.assert_allclose(a, b, rtol=1e-5)
 
 
+@pytest.mark.system
 def test_noise_in_few_directions_is_proposed_in_these():
     """A position and a velocity that one acceleration drives: Q has rank 1."""
     B = jnp.array([0.5, 1.0])

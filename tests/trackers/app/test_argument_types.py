@@ -75,7 +75,7 @@ def reason_against(read, text):
 
 
 @seed(1)
-@settings(max_examples=100, deadline=None, database=None)
+@settings(max_examples=40, deadline=None, database=None)
 @given(NUMBERS)
 @pytest.mark.parametrize("read", TYPES, ids=lambda read: read.__name__)
 def test_a_type_gives_a_value_in_its_range_or_a_short_reason(read, text):

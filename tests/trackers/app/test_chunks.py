@@ -21,12 +21,10 @@ RUN = {"input": "abc", "config.seed": 3}
 
 def track(recording, tracker, folder, *, resumed=False, stop_after=None, on_progress=lambda progress: None):
     """Follow the recording into `folder`; `stop_after` presses Ctrl-C when that many frames are done."""
-    state = tracker.init(jax.random.key(3), recording[0])
     if resumed:
-        writer, saved = resume(folder, RUN, HAND_TABLE)
-        state = saved(state)
+        writer, state = resume(folder, RUN, HAND_TABLE)
     else:
-        writer = begin(folder, RUN, HAND_TABLE)
+        writer, state = begin(folder, RUN, HAND_TABLE), tracker.init(jax.random.key(3), recording[0])
 
     def report(progress):
         on_progress(progress)

@@ -11,6 +11,7 @@ import pytest
 from jaxfilters.models.synthetic.desk_hand import desk_video
 from jaxfilters.models.synthetic.strokes import drawn, tracked
 from jaxfilters.trackers.app.cli import main
+from jaxfilters.trackers.fingertips import files
 from jaxfilters.trackers.fingertips.command import recogniser_of
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event, Stroke
 from jaxfilters.trackers.fingertips.files import COLUMNS, tip_rows
@@ -111,6 +112,35 @@ def test_tips_of_another_run_are_not_overwritten(recording, results, capsys):
     assert main(["track", "fingertips", str(recording[0]), "--out", str(results)]) == 2
     assert "another run" in capsys.readouterr().err
     assert (results / "tips.csv").read_bytes() == before
+
+
+@pytest.mark.system
+def test_a_run_that_was_killed_is_resumed_bit_for_bit(recording, results, tmp_path, monkeypatch, capsys):
+    out, command = tmp_path / "run", ["track", "fingertips", str(recording[0]), "--out", str(tmp_path / "run")]
+    monkeypatch.setattr(files, "CHECKPOINT_EVERY_S", 0.0)
+    drawn = FingertipPictures.drawn
+
+    def killed(self, image, frame, *rest):
+        if frame == 31:
+            raise RuntimeError("killed")
+        return drawn(self, image, frame, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FingertipPictures, "drawn", killed)
+        assert main(command) == 70
+    assert main([*command, "--resume", "--hands", "2"]) == 2
+    assert "hands was '1' and is '2'" in capsys.readouterr().err
+    assert main([*command, "--resume"]) == 0
+    for name in ("tips.csv", "events.jsonl"):
+        assert (out / name).read_bytes() == (results / name).read_bytes()
+    one, other = (json.loads((folder / "report.json").read_text()) for folder in (out, results))
+    for timed in ("seconds", "frames_per_second"):
+        del one[timed], other[timed]
+    assert one == other
+    assert (out / "overlay_from_31.mp4").exists()
+    (out / "tips.csv").write_text("cut")
+    assert main([*command, "--resume"]) == 2
+    assert "tips.csv: cannot be continued" in capsys.readouterr().err
 
 
 def test_a_desk_without_a_hand_is_followed_to_its_end(tmp_path, capsys):

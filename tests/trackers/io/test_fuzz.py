@@ -360,7 +360,7 @@ FORMATS = {
     "avi": Format(video(".avi", "MJPG"), lambda path: [list(open_video(str(path)).images())]),
     "mp4": Format(video(".mp4", "mp4v"), lambda path: [list(open_video(str(path)).images())]),
     # A state may hold any numbers; it is read as it was written.
-    "checkpoint": Format(saved_state, lambda path: str(checkpoint.load(path, STATE))),
+    "checkpoint": Format(saved_state, lambda path: str(checkpoint.load(path))),
 }
 TOKENS = [
     *("", "nan", "inf", "-Infinity", "1e999", "1e308", "-1e308", "1e39", "1e-320", "1e30", "0", "-1", "0.5", "1e6"),

@@ -17,7 +17,7 @@ def test_a_checkpoint_of_people_is_read_as_it_was_written(camera, floor, tmp_pat
     one = Sighting(3, 0.1, np.arange(6.0), np.eye(6), 0.5, 1, "hidden")
     save(tmp_path, run, session.state(), [(7, one)], 0)
     save(tmp_path, run, session.state(), [(8, one._replace(frame=4))], 1)
-    saved = load(tmp_path, run, PeopleSession(scene))
+    saved = load(tmp_path, run)
     assert [(who, seen.frame, seen.mode) for who, seen in saved.tracks] == [(7, 3, "hidden"), (8, 4, "hidden")]
     assert saved.num_parts == 2
     state = session.state()
@@ -25,7 +25,7 @@ def test_a_checkpoint_of_people_is_read_as_it_was_written(camera, floor, tmp_pat
         np.testing.assert_array_equal(saved.state["backgrounds"][0][name], array)
     np.testing.assert_array_equal(saved.state["people"].mode, state["people"].mode)
     with pytest.raises(CheckpointError, match="cannot be resumed: seed was 1 and is 2"):
-        load(tmp_path, {"seed": 2}, PeopleSession(scene))
+        load(tmp_path, {"seed": 2})
     (tmp_path / "checkpoint" / "tracks_000001.npz").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match=r"tracks_000001.npz: not a complete checkpoint"):
-        load(tmp_path, run, PeopleSession(scene))
+        load(tmp_path, run)

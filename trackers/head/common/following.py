@@ -59,6 +59,14 @@ class FaceTracker(Protocol):
         """The start of a track with what was found, after the `old` state, if there was one."""
         ...
 
+    def saved(self) -> Any:
+        """What the next frame needs beside the state while a face is followed: a tree of arrays and plain values."""
+        ...
+
+    def restore(self, saved: Any, state: Any) -> None:
+        """Go on from what `saved` gave, and the state at that time; no search is under way."""
+        ...
+
     def advance(self, state: Any, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray) -> tuple[Any, Any]:
         """State and track after a chunk of frames."""
         ...
@@ -116,6 +124,33 @@ class Following:
             rows.append(self._follow(images[done:stop], times[done:stop]))
             done = stop
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
+
+    def saved(self) -> dict[str, Any] | None:
+        """All that the next frame needs, for `trees.taken_apart`; None while a face is searched for.
+
+        A search gathers images of several frames: a run that is resumed begins before it.
+        """
+        if self.state is None or self._is_lost:
+            return None
+        return {
+            "state": self.state,
+            "tracker": self._tracker.saved(),
+            "events": self.events,
+            "said": sorted(self._said),
+            "frames": self._frames,
+            "time": self._time,
+            "looked": self._looked,
+            "contradictions": self._contradictions,
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from what `saved` gave."""
+        self.state, self.events, self._said = saved["state"], saved["events"], set(saved["said"])
+        self._frames, self._time = saved["frames"], saved["time"]
+        self._looked, self._contradictions = saved["looked"], saved["contradictions"]
+        self._is_lost = self._is_refuted = False
+        self._wait = None
+        self._tracker.restore(saved["tracker"], self.state)
 
     def _follow(self, images: np.ndarray, times: np.ndarray) -> Any:
         """Rows of at most a chunk of frames; the last chunk is filled up, so that one program serves all."""

@@ -4,20 +4,22 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
 from jaxfilters.trackers.app.progress import ProgressLine, warn
-from jaxfilters.trackers.app.results import TrackTable, begin
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, TrackTable, open_writer
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.head.common.drawing import draw_frame
 from jaxfilters.trackers.head.common.input import Setup
-from jaxfilters.trackers.head.common.table import STATUS_WORDS, HeadRows, with_gaps
+from jaxfilters.trackers.head.common.table import SKIPPED, STATUS_WORDS, HeadRows, with_gaps
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.paired_input import PairedInput
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import Moment, continued
 
 MOST_WAITING = 32
 """Moments after which rows are written, however few of them are whole."""
@@ -34,6 +36,14 @@ class Session(Protocol):
 
     def process(self, images: np.ndarray, times: np.ndarray) -> Any:
         """Track of the next frames, a row each, with the fields of `HeadTrack`."""
+        ...
+
+    def saved(self) -> Any:
+        """All that the next frame needs; None where a run cannot go on from here."""
+        ...
+
+    def restore(self, saved: Any) -> None:
+        """Go on from what `saved` gave."""
         ...
 
 
@@ -63,22 +73,41 @@ class RowsOf(NamedTuple):
 class HeadRun:
     """The way of images from the cameras through the session into rows and pictures."""
 
-    def __init__(self, options: argparse.Namespace, place: Setup, session: Session, rows: RowsOf, *, chunk: int):
-        """A run before its first image.
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        place: Setup,
+        session: Session,
+        rows: RowsOf,
+        config: Any,
+    ):
+        """A run before its first image, or with `--resume` after its last checkpoint.
+
+        Args:
+            options: Of the command line.
+            place: What is watched.
+            session: What follows the head.
+            rows: How its track becomes rows.
+            config: A dataclass of Python values, with `chunk`: the options of the session.
 
         Raises:
             OutputError: the folder holds another run's track, or cannot be written.
+            CheckpointError: the run that is to be resumed is another one, or its checkpoint is damaged.
         """
-        if (path := options.out / "track.csv").exists():
-            raise OutputError(f"{path}: holds the track of another run; choose another --out.")
-        self.session, self.frame_of = session, list[int]()
-        self.place, self._options, self._rows = place, options, rows
-        self.writer = begin(options.out, {}, rows.table, overwrite=True)
+        if not options.resume and (path := options.out / "track.csv").exists():
+            raise OutputError(f"{path}: holds the track of another run; choose another --out, or --resume.")
+        self.session, self.place, self._options, self._rows = session, place, options, rows
+        self.writer, saved = open_writer(options, _identity(options, place, config), rows.table)
+        self.frame_of = list[int]()
+        if saved is not None:
+            session.restore(saved)
+            self.frame_of = np.flatnonzero(self.writer.results.status != SKIPPED).tolist()
+        self._first, self._saved_at = self.writer.frames, time.monotonic()
         self._video: OverlayVideo | None = None
         self._failure: InputError | None = None
         self._last = "no images of one moment"
         self._ends, self._costs = list[tuple[float, int]](), list[float]()
-        self._chunk = chunk
+        self._chunk = config.chunk
 
     def follow(self) -> RunResult:
         """Track until the sources end, the time is over, or Ctrl-C.
@@ -129,27 +158,43 @@ class HeadRun:
     def _take(self, paired: PairedInput) -> None:
         total = min((getattr(source, "frames", 0) for source in self.place.sources), default=0) or None
         waiting: list[Moment] = []
-        with ProgressLine("tracking", total) as line:
-            for moment in self._readable(paired):
+        with ProgressLine("tracking", total, done=self._first) as line:
+            for moment in self._readable(self._remaining(paired)):
                 waiting.append(moment)
                 is_last = bool(self._options.seconds) and moment.time_s >= self._options.seconds
                 if is_last or sum(map(_is_whole, waiting)) == self._chunk or len(waiting) == MOST_WAITING:
                     self._advance(waiting)
                     line.show(self._done(total), self._last)
                     waiting = []
+                    self._checkpoint()
                 if is_last:
                     return
             if waiting:
                 self._advance(waiting)
                 line.show(self._done(total), self._last)
+        if self._failure is None:
+            self._checkpoint(complete=True)
 
     def _done(self, total: int | None) -> int:
         return self.writer.frames if total is None else min(self.writer.frames, total)
 
-    def _readable(self, paired: PairedInput) -> Iterator[Moment]:
+    def _remaining(self, paired: PairedInput) -> Iterator[Moment]:
+        """The moments after the last checkpoint."""
+        time_s = float(self.writer.results.times_s[-1]) if self._first else 0.0
+        return continued(iter(paired), self.place.sources, self._first, time_s)
+
+    def _checkpoint(self, *, complete: bool = False) -> None:
+        """Save what the next images need, unless that was done a moment ago."""
+        if not complete and time.monotonic() - self._saved_at < CHECKPOINT_EVERY_S:
+            return
+        if self.writer.frames and (saved := self.session.saved()) is not None:
+            self.writer.checkpoint(saved, complete=complete)
+            self._saved_at = time.monotonic()
+
+    def _readable(self, moments: Iterator[Moment]) -> Iterator[Moment]:
         """The straightened images up to the first that cannot be read."""
         try:
-            for moment in paired:
+            for moment in moments:
                 yield self._straightened(moment)
         except InputError as error:
             self._failure = error
@@ -193,8 +238,22 @@ class HeadRun:
             picture = draw_frame(list(moment.images), self.place.rig, rows, i)
             if self._video is None:
                 fps = max(source.fps for source in self.place.sources)
-                self._video = OverlayVideo(self._options.out / "overlay.mp4", fps, picture.shape)
+                name = f"overlay_from_{self._first}.mp4" if self._first else "overlay.mp4"
+                self._video = OverlayVideo(self._options.out / name, fps, picture.shape)
             self._video.write(picture)
+
+
+def _identity(options: argparse.Namespace, place: Setup, config: Any) -> dict[str, Any]:
+    """What two runs must share for one to continue the other."""
+    given = {name: getattr(options, name, None) for name in ("camera", "rig", "points", "model", "known", "detector")}
+    return {
+        "input": [source.name for source in place.sources],
+        "image_sizes": [list(source.image_size) for source in place.sources],
+        "fps": [source.fps for source in place.sources],
+        "version": version("jaxfilters"),
+        **{f"--{name}": str(value) for name, value in given.items() if value is not None},
+        **{f"config.{name}": value for name, value in asdict(config).items()},
+    }
 
 
 def _is_whole(moment: Moment) -> bool:

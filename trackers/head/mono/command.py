@@ -57,7 +57,7 @@ def track(options: argparse.Namespace) -> str:
         lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
     )
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
-    with closing(HeadRun(options, place, session, rows, chunk=settings.chunk)) as run:
+    with closing(HeadRun(options, place, session, rows, settings)) as run:
         return _tracked(options, settings, run, session, model, known)
 
 

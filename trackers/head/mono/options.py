@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import positive_number
-from jaxfilters.trackers.app.options import add_results_options, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -62,4 +62,5 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 750)")
     add_seed(parser)
     add_video_options(parser)
+    add_resume(parser)
     add_results_options(parser)

@@ -125,6 +125,17 @@ class MonoSession:
         """What the frames that the face is adjusted to say of the focal length; `None` before there was a face."""
         return None if self._following.state is None else self._tracker.focal_length(self._following.state)
 
+    def saved(self) -> dict[str, Any] | None:
+        """All that the next frame needs, for `restore` in a session of the same cameras and options.
+
+        A tree that `trackers.io.checkpoint` can save; None while a face is searched for.
+        """
+        return self._following.saved()
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from what `saved` gave: the next frames give the rows that they would have given then, bit for bit."""
+        self._following.restore(saved)
+
     def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
         """Track of the next frames, a row each.
 
@@ -249,6 +260,15 @@ class _MonoTracker:
         what = "registered, a face that is known" if int(state.who) else "registered"
         return Beginning(state, detections.time, what)
 
+    def saved(self) -> dict[str, Any]:
+        return {"people": self._people, "num_told": self._num_told}
+
+    def restore(self, saved: dict[str, Any], state: MonoState) -> None:
+        # Landmarks which a person gave, or which were found otherwise, are of the first images.
+        self._points = self._detections = None
+        self._people, self._num_told = saved["people"], saved["num_told"]
+        self._system = self._system._replace(face=self._followed(state))
+
     def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
         state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
         return self._recognised(state), track
@@ -264,8 +284,12 @@ class _MonoTracker:
         if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_told:
             self._num_told = int(state.num_adjusted)
             state = recognised(self._people, self.rig, state, self._compiled)
-            self._system = self._system._replace(face=one_of(self._people, int(state.who)))
+            self._system = self._system._replace(face=self._followed(state))
         return state
+
+    def _followed(self, state: MonoState) -> MultilinearFace:
+        """The face of whom the state is about."""
+        return one_of(self._people, int(state.who)) if int(state.who) else self._face
 
     def _remember(self, old: MonoState) -> None:
         """Who was followed may come back, beside those who were remembered from the first."""

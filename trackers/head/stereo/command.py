@@ -35,7 +35,7 @@ def track(options: argparse.Namespace) -> str:
         settings = dataclasses.replace(settings, chunk=1, live=True)
     session = as_input_error(lambda: _session(place, settings))
     rows = RowsOf(HEAD_TABLE, in_metres, partial(empty_rows, place.rig.num_cameras))
-    with closing(HeadRun(options, place, session, rows, chunk=settings.chunk)) as run:
+    with closing(HeadRun(options, place, session, rows, settings)) as run:
         return _tracked(options, settings, run, session)
 
 

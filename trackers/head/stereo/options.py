@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from jaxfilters.trackers.app.options import add_results_options, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -45,4 +45,5 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 1000)")
     add_seed(parser)
     add_video_options(parser)
+    add_resume(parser)
     add_results_options(parser)

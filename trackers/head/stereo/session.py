@@ -1,6 +1,6 @@
 """The head tracker from the first images on: waiting for a face, registering it, following it, finding it again."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +74,17 @@ class HeadSession:
         """Share of the deformation observed so far that the modes explain, 0 to 1; 0 before there was any."""
         state = self._following.state
         return 0.0 if state is None else float(learning.contribution(state.learner))
+
+    def saved(self) -> dict[str, Any] | None:
+        """All that the next frame needs, for `restore` in a session of the same cameras and options.
+
+        A tree that `trackers.io.checkpoint` can save; None while a face is searched for.
+        """
+        return self._following.saved()
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from what `saved` gave: the next frames give the rows that they would have given then, bit for bit."""
+        self._following.restore(saved)
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> HeadTrack:
         """Track of the next frames, a row each.
@@ -170,6 +181,14 @@ class _HeadTracker:
         if old is not None:
             state, kept = _with_known_face(state, old)
         return Beginning(state, found.time, "registered" + (", a face that is known" if kept else ""))
+
+    def saved(self) -> None:
+        """The state is all."""
+
+    def restore(self, saved: None, state: HeadState) -> None:
+        del saved, state
+        # Landmarks which a person gave are of the first image.
+        self._points = None
 
     def advance(
         self, state: HeadState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray

@@ -69,6 +69,9 @@ def fake(monkeypatch):
             self.events = []
             made.append(self)
 
+        def saved(self):
+            return None
+
         def focal_length(self):
             return FocalLength(np.float32(1.1), np.float32(0.1))
 

@@ -15,6 +15,7 @@ from jaxfilters.trackers.head.mono.estimate import UNMODELLED_MM
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.start import initialise
 from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
+from jaxfilters.trackers.io import checkpoint
 
 DEGREES = np.array([1.0, 1, 1, *np.rad2deg(np.ones(3))])
 START = 17
@@ -55,6 +56,20 @@ def test_a_face_is_followed_from_detections_on(followed, talking):
     off = np.linalg.norm(track.image_points[START:, 0] - made.uv[START:, 0], axis=-1)
     assert off.mean() < 1.5
     assert np.all(track.score[START:] > 0.8)
+
+
+@pytest.mark.system
+def test_a_session_goes_on_from_a_file_bit_for_bit(rig, face, talking, detected, followed, tmp_path):
+    made, images = talking
+    _, track = followed
+    first, second = (MonoSession(rig, face, detections=detected) for _ in range(2))
+    assert first.saved() is None
+    process(first, images[:32], made.times[:32])
+    checkpoint.save(tmp_path / "c.npz", first.saved(), {})
+    second.restore(checkpoint.load(tmp_path / "c.npz")[0])
+    rows = process(second, images[32:], made.times[32:])
+    jax.tree.map(np.testing.assert_array_equal, rows, jax.tree.map(lambda leaf: leaf[32:], track))
+    assert said(second) == ["registered"]
 
 
 @pytest.mark.system

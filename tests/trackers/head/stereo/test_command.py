@@ -11,6 +11,7 @@ from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.head.common import input as head_input
+from jaxfilters.trackers.head.common import run as head_run
 from jaxfilters.trackers.head.stereo import command as head_command
 from jaxfilters.trackers.io.cameras import write_camera
 from jaxfilters.trackers.io.errors import InputError
@@ -20,7 +21,7 @@ from jaxfilters.trackers.io.video_input import ImageFolder
 
 ROWS, COLS, FRAMES = 48, 64, 20
 K = np.array([[80.0, 0, 31.5], [0, 80, 23.5], [0, 0, 1]])
-OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4"}
+OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}
 
 
 @pytest.fixture(autouse=True)
@@ -144,7 +145,7 @@ def test_a_damaged_image_loses_nothing_before_it(stereo, fake_head, tmp_path, ca
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith(f"jaxfilters: error: {stereo[0] / '013.png'}: not a complete image")
     assert message.endswith(f"the first 13 frames are in {out / 'track.csv'}.")
-    assert {file.name for file in out.iterdir()} == OUTPUTS
+    assert {file.name for file in out.iterdir()} == OUTPUTS - {"checkpoint"}
     assert len(rows_of(out)) == 13
 
 
@@ -162,12 +163,42 @@ def test_ctrl_c_writes_what_there_is(stereo, fake_head, tmp_path, monkeypatch, c
         assert run(*stereo, "--out", out) == 0
     assert "interrupted" in capsys.readouterr().out
     assert len(rows_of(out)) == 16
-    assert {file.name for file in out.iterdir()} == OUTPUTS
+    assert {file.name for file in out.iterdir()} == OUTPUTS - {"checkpoint"}
     assert json.loads((out / "report.json").read_text())["interrupted"] is True
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 16
     assert run(*stereo, "--out", out) == 2
     assert "holds the track of another run" in capsys.readouterr().err
     assert len(rows_of(out)) == 16
+
+
+@pytest.mark.parametrize("kept_until", [0, 8, 16])
+def test_an_interrupted_run_is_resumed_bit_for_bit(stereo, fake_head, tmp_path, monkeypatch, capsys, kept_until):
+    """Ended by an error that nobody foresaw in the frames after the last checkpoint, or before the first one."""
+    process = head_command.HeadSession.process
+    monkeypatch.setattr(head_run, "CHECKPOINT_EVERY_S", 0.0)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert run(*stereo, "--out", whole) == 0
+
+    def fail(self, images, times):
+        if self.frames >= kept_until:
+            raise RuntimeError("killed")
+        return process(self, images, times)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(head_command.HeadSession, "process", fail)
+        assert run(*stereo, "--out", out) == 70
+    assert len(rows_of(out)) == kept_until
+    assert run(*stereo, "--out", out) == 2
+    assert "choose another --out, or --resume" in capsys.readouterr().err
+    assert run(*stereo, "--out", out, "--seed", 5, "--resume") == (2 if kept_until else 0)
+    if kept_until:
+        assert "config.seed was 0 and is 5" in capsys.readouterr().err
+    assert run(*stereo, "--out", out, "--resume") == (0 if kept_until else 2)
+    assert rows_of(out) == rows_of(whole)
+    report, expected = (json.loads((folder / "report.json").read_text()) for folder in (out, whole))
+    assert report["events"] == expected["events"]
+    if kept_until:
+        assert (out / f"overlay_from_{kept_until}.mp4").exists()
 
 
 def test_ctrl_c_before_anything_was_tracked(stereo, fake_head, tmp_path, monkeypatch, capsys):

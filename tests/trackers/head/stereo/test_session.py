@@ -16,6 +16,7 @@ from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST
 from jaxfilters.trackers.head.stereo import session as module
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.head.stereo.tracking import PATIENCE
+from jaxfilters.trackers.io import checkpoint
 
 MIDDLE, EYES_APART, DISPARITY = (394.0, 200.0), 77.5, 150
 """Of the drawn face, pixels: 62 mm between the eyes, 640 mm away."""
@@ -109,6 +110,20 @@ def test_pieces_of_any_size_give_the_same_rows(moving, whole, sizes):
     np.testing.assert_array_equal(pieces.status, whole.status)
     np.testing.assert_allclose(pieces.pose, whole.pose, atol=2e-3)
     np.testing.assert_allclose(pieces.image_points, whole.image_points, atol=0.01)
+
+
+@pytest.mark.system
+def test_a_session_goes_on_from_a_file_bit_for_bit(moving, tmp_path):
+    video, images = moving
+    points = video.uv[0, 0].astype(float)
+    first, second = HeadSession(video.rig, points=points), HeadSession(video.rig, points=points)
+    assert first.saved() is None
+    first.process(images[:9], video.times[:9])
+    checkpoint.save(tmp_path / "c.npz", first.saved(), {})
+    second.restore(checkpoint.load(tmp_path / "c.npz")[0])
+    expected, rows = (session.process(images[9:], video.times[9:]) for session in (first, second))
+    jax.tree.map(np.testing.assert_array_equal, rows, expected)
+    assert second.events == first.events
 
 
 @pytest.mark.system
