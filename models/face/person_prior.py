@@ -45,14 +45,14 @@ class Prior(NamedTuple):
     """Of the offset, in place of `offset_std`, where a detector placed the landmarks."""
 
     @property
-    def offset_deviations(self) -> Float[ArrayLike, "*#K #3"]:
+    def offset_deviations(self) -> Float[Array, "*K3"]:
         """Standard deviations of the offset of a face as large as the mean one, millimetres."""
-        return self.offset_std if self.misplaced is None else self.misplaced.std
+        return jnp.asarray(self.offset_std if self.misplaced is None else self.misplaced.std)
 
     @property
-    def offset_mean(self) -> Float[ArrayLike, "*#K #3"]:
+    def offset_mean(self) -> Float[Array, "*K3"]:
         """Of the same."""
-        return 0.0 if self.misplaced is None else self.misplaced.mean
+        return jnp.zeros(()) if self.misplaced is None else jnp.asarray(self.misplaced.mean)
 
 
 def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:

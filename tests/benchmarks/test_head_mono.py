@@ -1,5 +1,6 @@
 """The scenario on heads before one camera: its arithmetic on made tracks."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -136,7 +137,7 @@ def test_solve_pnp_finds_the_mean_face_where_it_is():
     face = default_face_model().model
     pose = np.array([20.0, -10.0, 620.0, 0.1, 0.3, -0.2])
     mean = shape(face, face.identity_mean, face.expression_mean)
-    points = np.asarray(project_shape(_mono_runs.camera(), mean, pose)[0][0], float)
+    points = np.asarray(project_shape(_mono_runs.camera(), mean, jnp.asarray(pose))[0][0], float)
 
     class Detector:
         errors = None

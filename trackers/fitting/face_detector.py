@@ -30,6 +30,7 @@ from jaxfilters.trackers.head.mono.start import is_symmetric
 from jaxfilters.trackers.io.detector_errors import DetectorErrors, save_detector_errors
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.ict import open_ict
+from jaxfilters.typing import AnyKey
 
 FOCAL, SHAPE = 800.0, (480, 640)
 DEPTHS_MM, ASIDE = (400.0, 900.0), (0.08, 0.05)
@@ -69,8 +70,9 @@ def fit_detector(options: argparse.Namespace) -> str:
     model = open_ict(options.data)
     detectors = {name: kind() for name, kind in DETECTORS.items() if _loads(name)}
     found: dict[str, list[list[Picture]]] = {name: [] for name in detectors}
+    key = jax.random.key(options.seed)
     for person in range(options.people):
-        pictures = of_person(model, detectors, jax.random.fold_in(jax.random.key(options.seed), person), options.images)
+        pictures = of_person(jax.random.fold_in(key, person), model, detectors, options.images)
         for name, of_one in pictures.items():
             found[name].append(of_one)
         sys.stderr.write(f"\r  {person + 1} of {options.people} people")
@@ -82,11 +84,11 @@ def fit_detector(options: argparse.Namespace) -> str:
     return "\n".join([*lines, f"errors in {options.out}"])
 
 
-def of_person(model: IctModel, detectors: dict[str, Detector], key: jax.Array, images: int) -> dict[str, list[Picture]]:
+def of_person(key: AnyKey, model: IctModel, detectors: dict[str, Detector], images: int) -> dict[str, list[Picture]]:
     """All pictures of a random person in which each detector finds the face."""
     rig = monocular(Pinhole.from_intrinsics(FOCAL, ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), SHAPE))
     found: dict[str, list[Picture]] = {name: [] for name in detectors}
-    for image, shape, pose in _rendered(model, rig, key, images):
+    for image, shape, pose in _rendered(key, model, rig, images):
         uv = np.asarray(project_shape(rig, shape, pose)[0][0])
         J = np.asarray(jacobian(rig, shape, pose)[0][0])
         scale = FOCAL / float(pose[2])
@@ -139,7 +141,7 @@ def _misplaced(pictures: list[Picture]) -> tuple[Float[np.ndarray, "10 3"], Floa
 
 
 def _rendered(
-    model: IctModel, rig: CameraRig, key: jax.Array, images: int
+    key: AnyKey, model: IctModel, rig: CameraRig, images: int
 ) -> Iterator[tuple[np.ndarray, jax.Array, jax.Array]]:
     """Grey pictures of a person, with the landmarks in the model frame and the pose."""
     who, looks, wall, noise, numbers = jax.random.split(key, 5)

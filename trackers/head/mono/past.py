@@ -11,7 +11,7 @@ from jaxfilters.trackers.head.mono.state import Window
 
 def units(face: MultilinearFace, prior: Prior) -> Float[Array, " d"]:
     """Standard deviations of identity and offset, in which a window counts its information."""
-    offset = jnp.asarray(prior.offset_deviations) * jnp.ones_like(face.mean)
+    offset = prior.offset_deviations * jnp.ones_like(face.mean)
     return jnp.concatenate([face.identity_std, offset.ravel()])
 
 

@@ -34,7 +34,10 @@ def test_what_a_detector_misplaces_does_not_turn_the_head(rig, face):
         offset = errors.mean + (own @ rng.normal(0, 1, 30)).reshape(10, 3)
         person = Person(identity, jnp.asarray(offset, face.mean.dtype))
         poses = POSE + np.column_stack([np.zeros((FRAMES, 4)), np.linspace(-0.15, 0.15, FRAMES), np.zeros(FRAMES)])
-        uv = [project_shape(rig, posed_shape(face, person, face.expression_mean), pose)[0][0] for pose in poses]
+        uv = [
+            project_shape(rig, posed_shape(face, person, face.expression_mean), pose)[0][0]
+            for pose in jnp.asarray(poses)
+        ]
         points = jnp.stack(uv) + rng.normal(0, NOISE_PX, (FRAMES, 10, 2))
         for name, one in (("plain", prior), ("known", known)):
             found = initialise(face, rig, points, one).bundle
