@@ -34,7 +34,7 @@ def test_residuals_are_those_of_the_gaussian_whatever_the_size(drawn):
     of_one = multivariate_normal(1.1 * mean.ravel(), 1.21 * total)
     energy = of_one.logpdf(1.1 * mean.ravel()) - of_one.logpdf(offset.ravel())
     np.testing.assert_allclose(0.5 * np.sum(np.square(of_offset(offset, prior, 1.1))), energy, rtol=1e-4)
-    np.testing.assert_allclose(prior.offset_deviations.ravel() ** 2, np.diagonal(total))
+    np.testing.assert_allclose(prior.offset_deviations.ravel() ** 2, np.diagonal(total), rtol=1e-5)
 
 
 def test_what_is_the_face_s_own_is_the_conditional_mean(drawn):
