@@ -33,6 +33,7 @@ MANUALS = {
     "fit gestures": "trackers/fingertips.md",
     "fit noise": "trackers/fingertips.md",
     "recognise": "trackers/fingertips.md",
+    "view": "viewer.md",
 }
 """Where the manual of each command is."""
 
