@@ -28,6 +28,7 @@ MANUALS = {
     "calibrate charuco": "trackers/people.md",
     "calibrate tsai": "trackers/people.md",
     "calibrate stereo": "trackers/head.md",
+    "fit face-detector": "trackers/head.md",
     "fit face-model": "trackers/head.md",
     "fit gestures": "trackers/fingertips.md",
     "fit noise": "trackers/fingertips.md",

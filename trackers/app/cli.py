@@ -68,6 +68,7 @@ def _command_of(options: argparse.Namespace) -> Callable[[argparse.Namespace], s
         ("fit", "noise"): ("fitting.noise", "fit_noise"),
         ("fit", "gestures"): ("gestures.command", "fit_gestures"),
         ("fit", "face-model"): ("fitting.face_model", "fit"),
+        ("fit", "face-detector"): ("fitting.face_detector", "fit_detector"),
         ("view", None): ("app.viewer", "view"),
     }
     kind = options.source if options.command == "fit" else None
