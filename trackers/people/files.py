@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline, outline
+from jaxfilters.trackers.app.progress import note
 from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, OutputFolder, can_resume
 from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.io.undistortion import Undistortion
@@ -74,6 +75,7 @@ class TracksWriter:
             return
         saved = load(self.path.parent, self._run)
         session.restore(saved.state, saved.tracks)
+        note(f"continuing after frame {session.tracks.frames} of {self.path.parent}")
         self._num_parts = saved.num_parts
         self._file.truncate(0)
         csv.writer(self._file).writerow(COLUMNS)
