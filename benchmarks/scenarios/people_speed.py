@@ -154,7 +154,7 @@ def _followed(config: PeopleConfig, places, sizes) -> People:
     empty, count = nobody(config), len(places)
     here = jnp.arange(config.capacity) < count
     mean = np.zeros(empty.belief.mean.shape, np.float32)
-    mean[:count, :2], mean[:count, 4:] = places, sizes
+    mean[:count, :2], mean[:count, 4:6] = places, sizes
     sd = jnp.array([0.1, 0.1, 0.3, 0.3, config.height_sd_m, config.width_sd_m])
     return empty._replace(
         belief=Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), empty.belief.covariance.shape)),

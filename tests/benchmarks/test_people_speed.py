@@ -63,5 +63,5 @@ def test_people_start_where_they_are():
     people = people_speed._followed(people_speed.PeopleConfig(capacity=5), places, sizes)
     assert int(jnp.sum(people.mode == TRACKED)) == 3
     np.testing.assert_allclose(people.belief.mean[:3, :2], places, rtol=1e-6)
-    np.testing.assert_allclose(people.belief.mean[:3, 4:], sizes, rtol=1e-6)
+    np.testing.assert_allclose(people.belief.mean[:3, 4:6], sizes, rtol=1e-6)
     assert people.identity.tolist() == [0, 1, 2, -1, -1]

@@ -8,8 +8,8 @@ import math
 import re
 import webbrowser
 from collections.abc import Iterator, Sequence
-from importlib.resources import files
 from pathlib import Path
+from pkgutil import get_data
 from typing import Any, NamedTuple
 
 import cv2
@@ -56,7 +56,7 @@ def view(options: argparse.Namespace) -> str:
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}.") from None
     if options.open:
-        webbrowser.open(out.resolve().as_uri())
+        webbrowser.open_new_tab(out.resolve().as_uri())
     return f"{out}: {len(text) / 1e6:.1f} MB"
 
 
@@ -82,9 +82,10 @@ def page_of(folder: Path) -> str:
         "report": _report(folder),
     }
     data |= _drawn(rows, frames, data["times_s"])
-    template = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+    template = get_data(__package__, "viewer.html")
+    assert template is not None, "The package has no viewer.html."
     # Nothing in the data may end the element that holds it.
-    return template.replace("/*DATA*/", json.dumps(data, allow_nan=False).replace("<", "\\u003c"))
+    return template.decode().replace("/*DATA*/", json.dumps(data, allow_nan=False).replace("<", "\\u003c"))
 
 
 def _read_rows(folder: Path) -> _Rows:

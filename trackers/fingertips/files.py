@@ -15,6 +15,7 @@ from jaxfilters.trackers.fingertips.events import Event
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.errors import CheckpointError, OutputError
+from jaxfilters.trackers.io.input_files import read_text
 from jaxfilters.trackers.io.json_files import parse_json
 
 COLUMNS = (
@@ -116,10 +117,8 @@ def _cut(path: Path, sizes: dict[str, int]) -> TextIO:
     size = sizes[path.name]
     if not path.exists() or path.stat().st_size < size:
         raise CheckpointError(f"{path}: cannot be continued; expected {size} bytes or more.")
-    file = path.open("r+", newline="", encoding="utf-8")
-    file.truncate(size)
-    file.seek(0, os.SEEK_END)
-    return file
+    os.truncate(path, size)
+    return path.open("a", newline="", encoding="utf-8")
 
 
 def name_of(hand: int, identity: int) -> str:
@@ -146,7 +145,7 @@ def tip_rows(frame: int, time_s: float, report: HandReport) -> list[list[Any]]:
 
 def read_events(path: Path) -> list[Event]:
     """The events of a run, from `events.jsonl`."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path, "expected the events of a run").splitlines()
     return [_event(parse_json(line, f"{path}: line {i}", "expected an event")) for i, line in enumerate(lines, 1)]
 
 

@@ -15,7 +15,7 @@ from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.remembered import Remembered
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.head.common import input as head_input
-from jaxfilters.trackers.head.common.table import with_gaps
+from jaxfilters.trackers.head.common.table import SKIPPED, with_gaps
 from jaxfilters.trackers.head.mono import command as mono_command
 from jaxfilters.trackers.head.mono.focal import FocalLength
 from jaxfilters.trackers.head.mono.state import MonoTrack
@@ -242,4 +242,4 @@ def test_rows_of_lost_and_skipped_frames_are_empty():
     assert np.isnan(rows.pose[:2]).all()
     assert np.isnan(rows.identity[:2]).all()
     assert rows.identity[2, 0] == 1.5
-    np.testing.assert_array_equal(rows.status, [3, 4, 2])
+    np.testing.assert_array_equal(rows.status, [3, SKIPPED, 2])
