@@ -27,7 +27,15 @@ from jaxfilters.models.synthetic.walkers import Walker
 from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.people.fit import PASSES
 from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS
-from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody
+from jaxfilters.trackers.people.state import (
+    NUM_BIASES,
+    TRACKED,
+    CameraFrame,
+    People,
+    PeopleConfig,
+    PeopleScene,
+    nobody,
+)
 from jaxfilters.trackers.people.tracker import people_scene, step
 
 COUNTS, QUICK_COUNTS = (1, 2, 3, 8, 32), (1, 8)
@@ -155,7 +163,7 @@ def _followed(config: PeopleConfig, places, sizes) -> People:
     here = jnp.arange(config.capacity) < count
     mean = np.zeros(empty.belief.mean.shape, np.float32)
     mean[:count, :2], mean[:count, 4:6] = places, sizes
-    sd = jnp.array([0.1, 0.1, 0.3, 0.3, config.height_sd_m, config.width_sd_m])
+    sd = jnp.array([0.1, 0.1, 0.3, 0.3, config.height_sd_m, config.width_sd_m, *[1.0] * NUM_BIASES])
     return empty._replace(
         belief=Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), empty.belief.covariance.shape)),
         mode=jnp.where(here, TRACKED, empty.mode),
