@@ -17,6 +17,7 @@ from pathlib import Path
 
 from jaxfilters.benchmarks import gate, metrics, scenarios
 from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.benchmarks.results_page import read_results, results_page
 from jaxfilters.trackers.app.devices import use_all_cores
 from jaxfilters.trackers.io.errors import InputError
 
@@ -28,7 +29,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one scenario, print its table, write its JSON."""
     use_all_cores()
     found = descriptions()
-    options = _parser(found).parse_args(argv)
+    parser = _parser(found)
+    options = parser.parse_args(argv)
+    if (options.scenario is None) == (options.report is None):
+        parser.error("expected either a SCENARIO or --report")
+    if options.report is not None:
+        return _report(options.report, found)
     if options.json and not options.json.parent.is_dir():
         return _fail(f"--json: no folder {options.json.parent}")
     try:
@@ -74,6 +80,14 @@ def descriptions() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def _report(paths: Sequence[Path], found: Mapping[str, str]) -> int:
+    try:
+        print(results_page(read_results(paths), found), end="")
+    except ValueError as error:
+        return _fail(f"--report: {error}")
+    return 0
+
+
 def _gate(bounds: Mapping[str, gate.Bound], measured: Mapping[str, metrics.Metric]) -> int:
     rows = gate.compare(bounds, measured)
     print(f"\n{gate.table(rows)}")
@@ -87,7 +101,14 @@ def _parser(found: dict[str, str]) -> argparse.ArgumentParser:
         epilog="scenarios:\n" + "\n".join(f"  {name:16} {line}" for name, line in found.items()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scenario", choices=found, metavar="SCENARIO", help="what to measure, see below")
+    parser.add_argument("scenario", nargs="?", choices=found, metavar="SCENARIO", help="what to measure, see below")
+    parser.add_argument(
+        "--report",
+        nargs="+",
+        type=Path,
+        metavar="PATH",
+        help="measure nothing; print a page of results in Markdown from files that --json wrote, or folders of them",
+    )
     parser.add_argument("--quick", action="store_true", help="fewer seeds and rounds: to see that it runs")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="first random seed (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers and the environment there")

@@ -35,9 +35,12 @@ from .gaussian.constraints.constrained_filter import EPConstraints as EPConstrai
 from .gaussian.constraints.constrained_filter import TruncateEachStep as TruncateEachStep
 from .gaussian.constraints.constrained_filter import constrained as constrained
 from .gaussian.continuous import continuous_extended_kalman as continuous_extended_kalman
+from .gaussian.correlated import correlated_noise as correlated_noise
+from .gaussian.differencing import measurement_differencing as measurement_differencing
 from .gaussian.ensemble import ensemble_kalman as ensemble_kalman
 from .gaussian.extended import Observation as Observation
 from .gaussian.extended import extended_kalman as extended_kalman
+from .gaussian.gauss_markov import GaussMarkov as GaussMarkov
 from .gaussian.gaussian_sum import GaussianSumState as GaussianSumState
 from .gaussian.gaussian_sum import gaussian_sum as gaussian_sum
 from .gaussian.gaussian_sum import map_component as map_component
@@ -63,6 +66,7 @@ from .particle.auxiliary import auxiliary as auxiliary
 from .particle.auxiliary import guided as guided
 from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
+from .particle.correlated_bootstrap import correlated_bootstrap as correlated_bootstrap
 from .particle.guided_rao_blackwell import Guidance as Guidance
 from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
 from .particle.locally_optimal import locally_optimal as locally_optimal

@@ -28,10 +28,12 @@ MANUALS = {
     "calibrate charuco": "trackers/people.md",
     "calibrate tsai": "trackers/people.md",
     "calibrate stereo": "trackers/head.md",
+    "fit face-detector": "trackers/head.md",
     "fit face-model": "trackers/head.md",
     "fit gestures": "trackers/fingertips.md",
     "fit noise": "trackers/fingertips.md",
     "recognise": "trackers/fingertips.md",
+    "view": "viewer.md",
 }
 """Where the manual of each command is."""
 

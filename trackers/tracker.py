@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-STATUS_NAMES = ("searching", "tracking", "lost")
+STATUS_NAMES = ("searching", "tracking", "lost", "doubtful")
 """Words for the integers in `status` of a track."""
 CHUNK = 16
 """Frames in one compiled call: enough to hide the call, few enough to report progress several times a second."""

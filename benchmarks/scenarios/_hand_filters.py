@@ -36,7 +36,7 @@ from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.proposals import IncrementProposal, exact
 from jaxfilters.particle.rao_blackwell import condition_on_increment, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
-from jaxfilters.trackers.hand_depth.tracker import pose_moments
+from jaxfilters.trackers.hand_depth.filtering import pose_moments
 from jaxfilters.typing import AnyKey
 
 WINDOW = (128, 128)

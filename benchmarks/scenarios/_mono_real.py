@@ -20,13 +20,13 @@ from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
 from jaxfilters.models.synthetic.face_training import ict_shapes
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
-from jaxfilters.models.synthetic.ict_sequence import ict_sequence
+from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
 from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoOptions
-from jaxfilters.trackers.io.face_models import default_face_model
+from jaxfilters.trackers.io.face_models import people_face_model
 
 PEOPLE = ((0, 1), (1, 2), (2, 0), (3, 13), (4, 5), (5, 14), (6, 3), (7, 8))
 """Random key of the person, and which stretch of recorded rotations."""
@@ -93,11 +93,11 @@ def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     if not quick:
         dense = modelled_face(seed, tuple(range(NUM_DENSE)), PAIRS_68)
         contenders["modelled_68"] = Contender(dense, MonoOptions())
-        contenders["modelled_rendered"] = Contender(default_face_model().model, MonoOptions())
+        contenders["modelled_rendered"] = Contender(people_face_model().model, MonoOptions())
     runs: dict[str, list[MonoRun]] = {name: [] for name in contenders}
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
     for person, stretch in PEOPLE[: 1 if quick else None]:
-        made = _filmed(model, turns[stretch], speech, person + seed, num_frames)
+        made = filmed(model, turns[stretch], speech, person + seed, num_frames)
         for name, one in follow_all(made, contenders, person + seed).items():
             runs[name].append(one)
             sys.stderr.write(f"  person {person}, {name}: {np.round(one.means, 1)}\n")
@@ -121,7 +121,7 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         images, fps = read_video(folder / file, QUICK_VIDEO_FRAMES if quick else None)
         rows, cols = images.shape[1:]
         rig = monocular(Pinhole.from_intrinsics(FOCAL_WIDTHS * cols, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
-        session = MonoSession(rig, default_face_model().model, MonoOptions(seed=seed))
+        session = MonoSession(rig, people_face_model().model, MonoOptions(seed=seed))
         times = np.arange(len(images)) / fps
         parts = [
             session.process(images[i : i + PIECE, None], times[i : i + PIECE]) for i in range(0, len(images), PIECE)
@@ -145,7 +145,8 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     return metrics
 
 
-def _filmed(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int):
+def filmed(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int) -> IctSequence:
+    """A person that turns and speaks as recorded, before one camera."""
     poses = biwi_course(turns, num_frames, place_mm=MONOCULAR_PLACE_MM)
     expressions = livelink_course(speech, num_frames)
     return ict_sequence(jax.random.key(FIRST_PERSON + person), model, poses, rig=camera(), expressions=expressions)

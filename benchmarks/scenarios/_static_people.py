@@ -28,7 +28,16 @@ from jaxfilters.models.synthetic.standing_person import (
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import tracker
 from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS, NEWCOMER_SD_M
-from jaxfilters.trackers.people.state import TRACKED, CameraFrame, People, PeopleConfig, PeopleScene, nobody
+from jaxfilters.trackers.people.state import (
+    BIAS,
+    NUM_BIASES,
+    TRACKED,
+    CameraFrame,
+    People,
+    PeopleConfig,
+    PeopleScene,
+    nobody,
+)
 from jaxfilters.trackers.published.people import (
     ACQUIRE,
     PaperState,
@@ -296,8 +305,8 @@ def known_people(config: PeopleConfig, xy: Float[Array, "people 2"], sd: float, 
     people, count = nobody(config), len(xy)
     known = jnp.arange(config.capacity) < count
     size = jnp.broadcast_to(jnp.array([height[0], config.width_m]), (count, 2))
-    mean = people.belief.mean.at[:count].set(jnp.concatenate([xy, jnp.zeros((count, 2)), size], axis=-1))
-    sds = jnp.array([sd, sd, config.speed_sd, config.speed_sd, height[1], config.width_sd_m])
+    mean = people.belief.mean.at[:count, : BIAS.start].set(jnp.concatenate([xy, jnp.zeros((count, 2)), size], axis=-1))
+    sds = jnp.array([sd, sd, config.speed_sd, config.speed_sd, height[1], config.width_sd_m, *[1.0] * NUM_BIASES])
     covariance = jnp.where(known[:, None, None], jnp.diag(sds**2), people.belief.covariance)
     return people._replace(
         belief=Gaussian(mean, covariance),

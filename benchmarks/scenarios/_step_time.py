@@ -25,6 +25,7 @@ from jaxfilters.models.hand.surface import triangle_hand
 from jaxfilters.models.synthetic.depth_sensor import depth_from_millimetres
 from jaxfilters.models.synthetic.hand import FRAME_INTERVAL, kinect_v2, simulate_sequence
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
+from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 
 NUM_FRAMES = 30
 """Of data B, filtered again and again from their start: both filters still follow the hand, and render as much."""
@@ -94,7 +95,7 @@ class _Tracker:
     chunk = 5
 
     def __init__(self, num_particles: int, key: Array, frames: np.ndarray):
-        config = hand_depth.HandDepthConfig(num_particles=num_particles, scale=1.0)
+        config = HandDepthConfig(num_particles=num_particles, scale=1.0)
         self._tracker = hand_depth.build(kinect_v2(), config)
         self._start = self._state = self._tracker.init(key, frames[0])
         times = FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32)

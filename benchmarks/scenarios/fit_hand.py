@@ -20,8 +20,8 @@ from jaxfilters import fit
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.cost import count_observed, gibbs_abs, union_cost
-from jaxfilters.models.hand.observation import HandLikelihood, crop, isolate, union
+from jaxfilters.models.hand.cost import count_observed, union_cost
+from jaxfilters.models.hand.observation import crop, isolate
 from jaxfilters.models.hand.proportions import HandProportions, HandStills, StillsDensity, learn
 from jaxfilters.models.hand.skeleton import (
     HandGeometry,
@@ -31,11 +31,10 @@ from jaxfilters.models.hand.skeleton import (
     open_palm,
     retract,
 )
-from jaxfilters.models.hand.start import find_start
-from jaxfilters.models.hand.surface import CapsuleHand
+from jaxfilters.models.hand.start import find_starts
 from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
-from jaxfilters.trackers.hand_depth.detect import nearest_hand
+from jaxfilters.trackers.hand_depth.detect import hand_sightings
 
 TRUE = HandProportions(*(jnp.asarray(factor) for factor in (0.93, [0.95, 0.9, 0.92, 0.93, 1.0], 1.05)))
 NOISE = 0.003
@@ -99,17 +98,17 @@ def recorded(path: Path) -> Stills:
     with np.load(path) as held:
         millimetres, is_hand, K = held["depth_mm"], held["mask"] > 0, held["K"]
     camera = Pinhole.from_matrix(K, millimetres.shape[1:])
-    surface = CapsuleHand(hand_geometry())
-    likelihood = HandLikelihood(surface, jnp.asarray(0.002), MAX_ERROR, union, gibbs_abs)
     windows, starts = [], list[Array]()
     for frame, hand in zip(millimetres, is_hand, strict=True):
         depth = np.where(hand, np.where(frame > 0, frame / 1000, np.nan), np.inf).astype(np.float32)
-        sighting = nearest_hand(camera, np.nan_to_num(depth, nan=np.inf))
-        if sighting is None:
+        sightings = hand_sightings(camera, depth)
+        if not sightings:
             raise ValueError(f"{path}: no hand in frame {len(starts)}.")
-        nearby = crop(camera, jnp.asarray(depth), sighting.center, SEARCH_WINDOW, SEARCH_STRIDE)
-        starts.append(_find_start(*nearby, sighting, likelihood).pose)
-        window, observed = crop(camera, jnp.asarray(depth), sighting.center, WINDOW, STRIDE)
+        center = jnp.asarray(sightings[0].center)
+        nearby = crop(camera, jnp.asarray(sightings[0].frame), center, SEARCH_WINDOW, SEARCH_STRIDE)
+        found = find_starts(*nearby, sightings[0].center, hand_geometry(), (1.0,), (1.0,))
+        starts.append(jnp.asarray(found[0].pose))
+        window, observed = crop(camera, jnp.asarray(depth), center, WINDOW, STRIDE)
         windows.append((window, isolate(window, observed, starts[-1])))
     return _stills(windows, starts)
 
@@ -166,11 +165,6 @@ def _density(stills: Stills) -> StillsDensity:
 
 def _poses(stills: Stills, theta: HandStills) -> Float[Array, "f 22"]:
     return jax.vmap(retract)(stills.starts, jnp.asarray(POSE_SPREAD, jnp.float32) * theta.steps)
-
-
-@jax.jit
-def _find_start(camera, observed, sighting, likelihood):
-    return find_start(camera, observed, sighting, likelihood, jnp.ones(1))
 
 
 @jax.jit

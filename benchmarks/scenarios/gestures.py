@@ -9,7 +9,9 @@ Recordings are read from the folder JAXFILTERS_DATA; what is missing there is sa
 holds 26 symbols that fingertips drew in the air, with approach and retreat: every person is recognised from the strokes
 of the others. `unipen_digits` holds digits by pens of several donors: each is recognised from at most 120 examples a
 digit of each of the others. Settings are the same for both and were chosen with these recordings. An accuracy is
-that of the best symbol of all strokes; `_accepted` is the share that also beats the threshold model.
+that of the best symbol of all strokes; `accepted` is the share that also beats the threshold model by the margin of the
+symbol, and `accepted_right` the share of these that is right. Margins, and the temperature of the confidences whose
+`calibration_error` is given, are fitted to the strokes of the other people, as `jaxfilters fit gestures` does.
 
 `sfinge3d_gestures` holds streams of hands with 13 gestures to spot; `_sfinge.py` says what counts as detected. Settings
 were chosen with these streams.
@@ -18,11 +20,14 @@ were chosen with these streams.
 import sys
 from pathlib import Path
 
+import numpy as np
+
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._drawn_symbols import FULL, QUICK, drawn_metrics
 from jaxfilters.benchmarks.scenarios._sfinge import sfinge_metrics
-from jaxfilters.models.gesture.learning import accuracy, leave_one_out
+from jaxfilters.models.gesture.calibration import calibration_error
+from jaxfilters.models.gesture.learning import accuracy, judged, leave_one_out
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.strokes import read_strokes
 
@@ -67,11 +72,15 @@ def recorded_metrics(name: str, *, quick: bool) -> dict[str, Metric]:
     except InputError as error:
         raise RecordingError(str(error)) from None
     people = sorted(set(recorded.people))[: QUICK_PEOPLE if quick else None]
-    found = leave_one_out(recorded.strokes, recorded.labels, recorded.people, most=most, left_out=people)
-    accepted = 100 * sum(one.accepted for one in found) / sum(one.total for one in found)
-    worst = min(accuracy([one]) for one in found)
+    found = judged(leave_one_out(recorded.strokes, recorded.labels, recorded.people, most=most, left_out=people))
+    right, confidence, beyond = (
+        np.concatenate([getattr(one, field) for one in found]) for field in ("right", "confidence", "beyond")
+    )
+    accepted = beyond >= 0
     return {
         f"accuracy_{name}": Metric(accuracy(found), "%", "higher"),
-        f"accuracy_{name}_worst_person": Metric(worst, "%", "higher"),
-        f"accepted_{name}": Metric(accepted, "%", "higher"),
+        f"accuracy_{name}_worst_person": Metric(min(accuracy([one]) for one in found), "%", "higher"),
+        f"accepted_{name}": Metric(100 * float(accepted.mean()), "%", "higher"),
+        f"accepted_right_{name}": Metric(100 * float(right[accepted].mean()), "%", "higher"),
+        f"calibration_error_{name}": Metric(calibration_error(confidence, right), "", "lower"),
     }

@@ -10,9 +10,12 @@ user's eyes to a millimetre, `b_past_` keeps the information of frames that leav
 `b_latest_` choose frames otherwise, `b_rendered_modelled_` has the model of people of the ICT face model. `_paper` is
 the tracker of the thesis, `_paper_map` the same with priors, `_projected` without measured landmarks. Starts are judged
 by how widely the five heads are turned. Modelled people are followed by two models of faces, by one of them also from
-68 landmarks, `modelled_68_`; they need `ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder
-JAXFILTERS_DATA, the videos `talking_face_video`; what is missing is said and left out. All of it takes hours: with
-`--out`, a run that was cut off goes on after the last user and the last part that it had finished.
+68 landmarks, `modelled_68_`. Metrics that end in `_modelled` are of the same people from their images alone, as a
+detector finds their landmarks, beside `solvePnP` on the same landmarks (`pnp_`); in `_modelled_rendered` with the model
+of the package, in `_mediapipe` with MediaPipe's mesh where it is installed. They need `ict_face_model`,
+`biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos `talking_face_video`; what is
+missing is said and left out. All of it takes hours: with `--out`, a run that was cut off goes on after the last user
+and the last part that it had finished.
 """
 
 import sys
@@ -26,6 +29,7 @@ import numpy as np
 from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.benchmarks.scenarios._mono_detected import people_metrics
 from jaxfilters.benchmarks.scenarios._mono_floor import size_errors
 from jaxfilters.benchmarks.scenarios._mono_real import cross_model, modelled_metrics, video_metrics
 from jaxfilters.benchmarks.scenarios._mono_runs import (
@@ -78,6 +82,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
         "starts": lambda: start_metrics(learnt_from(people_but(None), 10, seed).face, seed, 2 if quick else 40),
         "speed": lambda: speed_metrics(seed, 3 if quick else 25),
         "modelled": lambda: modelled_metrics(quick, seed),
+        "detected": lambda: people_metrics(quick, seed),
         "videos": lambda: video_metrics(quick, seed),
     }
     for name, part in parts.items():

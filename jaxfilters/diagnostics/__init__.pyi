@@ -3,6 +3,9 @@ from .calibration import pit as pit
 from .calibration import pit_ensemble as pit_ensemble
 from .calibration import sigma_coverage as sigma_coverage
 from .calibration import uniformity as uniformity
+from .clusters import Draws as Draws
+from .clusters import cluster_interval as cluster_interval
+from .clusters import effective_draws as effective_draws
 from .consistency import Band as Band
 from .consistency import chi_square_band as chi_square_band
 from .consistency import chi_square_quantile as chi_square_quantile

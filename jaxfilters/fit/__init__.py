@@ -14,6 +14,13 @@ Examples:
     (True, True)
 """
 
+from jaxfilters.fit.calibration import Calibration as Calibration
+from jaxfilters.fit.calibration import Recording as Recording
+from jaxfilters.fit.calibration import calibrate as calibrate
+from jaxfilters.fit.composite import Godambe as Godambe
+from jaxfilters.fit.composite import correlation_lags as correlation_lags
+from jaxfilters.fit.composite import godambe as godambe
+from jaxfilters.fit.composite import score_covariance as score_covariance
 from jaxfilters.fit.constraints import Constraint as Constraint
 from jaxfilters.fit.constraints import fixed as fixed
 from jaxfilters.fit.constraints import free as free

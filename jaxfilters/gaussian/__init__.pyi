@@ -4,11 +4,14 @@ from . import belief as belief
 from . import consider as consider
 from . import constraints as constraints
 from . import continuous as continuous
+from . import correlated as correlated
+from . import differencing as differencing
 from . import emission_update as emission_update
 from . import emissions as emissions
 from . import ensemble as ensemble
 from . import ensemble_analysis as ensemble_analysis
 from . import extended as extended
+from . import gauss_markov as gauss_markov
 from . import gaussian_sum as gaussian_sum
 from . import imm as imm
 from . import linear as linear

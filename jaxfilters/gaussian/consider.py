@@ -7,6 +7,9 @@ nothing new still corrects what moves, but the constant quantities are only *con
 stay (S. F. Schmidt, "Application of state-space methods to navigation problems", in "Advances in Control Systems" 3,
 1966), and so does the memory of constraints on them. A repeated view therefore adds no information about them,
 whatever the linearisation.
+
+Without a description of views the quantities are considered in every frame: nuisances, such as the error of a
+calibration or the common misplacement of a detector, widen the belief about everything else for good.
 """
 
 from collections.abc import Callable
@@ -22,6 +25,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.constraints.constrained_filter import ConstrainedState
+from jaxfilters.gaussian.manifold import Manifold, euclidean
 from jaxfilters.typing import AnyKey, as_pytree
 
 
@@ -57,7 +61,7 @@ class SchmidtKalman:
     """Parameters of a filter made by `schmidt_kalman`; its arguments describe them."""
 
     inner: Filter
-    signature: Callable
+    signature: Callable | None
     constant: Bool[Array, " n"]
     tolerance: Float[Array, ""]
     capacity: int = field(metadata={"static": True})
@@ -65,24 +69,30 @@ class SchmidtKalman:
 
 def schmidt_kalman(
     inner: Filter,
-    signature: Callable[[Array], Float[Array, " d"]],
+    signature: Callable[[Array], Float[Array, " d"]] | None,
     constant: Bool[Array, " n"],
-    tolerance: float | Float[Array, ""],
+    tolerance: float | Float[Array, ""] | None = None,
     *,
     capacity: int = 64,
 ) -> Filter:
     """Schmidt-Kalman filter: `inner`, with constant quantities that only new views update.
 
     A view is new if its signature differs from all in the memory by more than `tolerance` in some component. The state
-    is a `SchmidtState`, the info a `SchmidtInfo`.
+    is a `SchmidtState`, the info a `SchmidtInfo`. Without a `signature` no view is new: the chosen components are never
+    updated. They are then the considered nuisances of S. F. Schmidt, whose covariance stays that of the prior or, for
+    the lasting errors of `correlated_noise`, of their process. Errors that rows or sensors share have one component,
+    and enter the rows through `loading`.
 
     Args:
         inner: Filter with a `Gaussian` for its state, or `constrained` of one; it updates everything. Where the
             constant quantities stay, so does its memory of constraints.
         signature: `mean -> signature`, (n,) to (d,): a description of what the state looks like, e.g. noise-free
-            features without what says nothing about the constant quantities, such as the place in the image.
-        constant: True for components of the state that never change, (n,).
+            features without what says nothing about the constant quantities, such as the place in the image. `None` if
+            no view may update them.
+        constant: True for components of the state that never change, (n,), or that are considered. On a manifold, for
+            components of increments; they must belong to vectors in it.
         tolerance: Least difference of a new view, in the unit of the signature; a few standard deviations of the noise.
+            `None` without a signature, and only there.
         capacity: Number of views in the memory, at least 1; a new one replaces the oldest.
 
     Returns:
@@ -108,35 +118,61 @@ def schmidt_kalman(
         >>> _, (states, infos) = jf.run(filter, jax.random.key(0), jnp.full((5, 1), 50.0))
         >>> infos.is_new.tolist()
         [True, False, False, False, False]
+
+        A bias of the readings, of 0.5 to one standard deviation, that no number of readings tells from the place.
+
+        >>> inner = jf.kalman(jf.Gaussian(jnp.zeros(1), 9.0 * jnp.eye(1)), jnp.eye(1), 0.0 * Q[:1, :1], jnp.eye(1), R)
+        >>> biased = jf.correlated_noise(inner, jf.GaussMarkov(jnp.array(jnp.inf), jnp.array([0.25])))
+        >>> filter = jf.schmidt_kalman(biased, None, jnp.array([False, True]))
+        >>> last, _ = jf.run(filter, jax.random.key(0), jnp.ones((1000, 1)))
+        >>> [round(float(variance) ** 0.5, 2) for variance in jnp.diagonal(last.inner.covariance)]
+        [0.5, 0.5]
     """
     checks.is_filter("inner", inner)
-    checks.function("signature", signature)
+    if signature is not None:
+        checks.function("signature", signature)
+    if (signature is None) != (tolerance is None):
+        raise ValueError(
+            "signature and tolerance must both be given, or both be None; "
+            f"got {'no' if signature is None else 'a'} signature and the tolerance {tolerance}."
+        )
     if jnp.ndim(constant) != 1:
         raise ValueError(f"constant must have the shape (n,), that of the mean; got {jnp.shape(constant)}.")
     checks.boolean("constant", constant, jnp.shape(constant))
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity must be an integer of at least 1; got {capacity!r}.")
-    if not isinstance(tolerance, jax.core.Tracer) and not tolerance > 0:
+    if tolerance is not None and not isinstance(tolerance, jax.core.Tracer) and not tolerance > 0:
         raise ValueError(f"tolerance must be positive, in the unit of the signature; got {tolerance!r}.")
-    params = SchmidtKalman(inner, as_pytree(signature), constant, jnp.asarray(tolerance, dtype=float), capacity)
+    if signature is not None:
+        signature = as_pytree(signature)
+    tolerance = jnp.asarray(0.0 if tolerance is None else tolerance, dtype=float)
+    params = SchmidtKalman(inner, signature, constant, tolerance, capacity)
     return Filter(params, _init, _predict, _update)
 
 
-def consider(before: Gaussian, after: Gaussian, constant: Bool[Array, " n"]) -> Gaussian:
+def consider(
+    before: Gaussian, after: Gaussian, constant: Bool[Array, " n"], manifold: Manifold = euclidean
+) -> Gaussian:
     """Belief after an update whose gain is set to zero for the constant components.
 
     With P - P' = K S K^T for the optimal gain K, a gain with zeros in these rows leaves their own block of the
     covariance as it was, and gives all others the optimal one.
     """
     block = constant[:, None] & constant
-    return Gaussian(jnp.where(constant, before.mean, after.mean), jnp.where(block, before.covariance, after.covariance))
+    covariance = jnp.where(block, before.covariance, after.covariance)
+    if manifold.flat:
+        return Gaussian(jnp.where(constant, before.mean, after.mean), covariance)
+    moved = jnp.where(constant, 0.0, manifold.local(before.mean, after.mean))
+    return Gaussian(manifold.retract(before.mean, moved), covariance)
 
 
 def _init(model: SchmidtKalman, key: AnyKey) -> SchmidtState:
     state = model.inner.init(model.inner.params, key)
     belief = _belief(state)
     checks.belief("the state of inner", belief, Gaussian)
-    checks.boolean("constant", model.constant, belief.mean.shape, ", that of the mean of the state")
+    checks.boolean("constant", model.constant, belief.covariance.shape[:1], ", that of the mean of the state")
+    if model.signature is None:
+        return SchmidtState(state, ViewMemory(jnp.zeros((0, 0), belief.mean.dtype), jnp.zeros((), jnp.int32)))
     shape = jax.eval_shape(model.signature, belief.mean)
     checks.floating("the result of signature", shape)
     if shape.ndim != 1:
@@ -153,11 +189,15 @@ def _update(
     model: SchmidtKalman, key: AnyKey, state: SchmidtState, observation: PyTree, inputs: PyTree
 ) -> tuple[SchmidtState, SchmidtInfo]:
     updated, info = model.inner.update(model.inner.params, key, state.inner, observation, inputs)
-    signature = jax.lax.stop_gradient(model.signature(_belief(updated).mean))
-    new = is_new(state.views, signature, model.tolerance)
-    considered = consider(_belief(state.inner), _belief(updated), model.constant)
+    manifold = getattr(model.inner.params, "manifold", euclidean)
+    considered = consider(_belief(state.inner), _belief(updated), model.constant, manifold)
     if isinstance(updated, ConstrainedState):
         considered = state.inner._replace(belief=considered)
+    if model.signature is None:
+        none = jnp.zeros((), bool)
+        return state._replace(inner=considered), SchmidtInfo(info.log_evidence, info, none, state.views.num_views)
+    signature = jax.lax.stop_gradient(model.signature(_belief(updated).mean))
+    new = is_new(state.views, signature, model.tolerance)
     views = with_view(state.views, signature)
     if_new, if_known = SchmidtState(updated, views), SchmidtState(considered, state.views)
     after = jax.tree.map(lambda yes, no: jnp.where(new, yes, no), if_new, if_known)

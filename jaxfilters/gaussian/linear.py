@@ -91,6 +91,10 @@ class Kalman:
         del belief
         return self._at("R", inputs)
 
+    def given(self) -> tuple[Any, ...]:
+        """The matrices and vectors as they were given: arrays, functions of the inputs, or None."""
+        return tuple(getattr(self, name) for name in Matrices._fields)
+
     def matrices(self, inputs: PyTree) -> Matrices:
         """The model of one step, with shapes that fit one another."""
         found = Matrices(*(self._at(name, inputs) for name in Matrices._fields))
@@ -230,7 +234,7 @@ def _updated(model: Kalman, belief: Belief, observation: Observation, inputs: Py
 
 
 def _refuse_unused(model: Kalman, inputs: PyTree) -> None:
-    if jax.tree.leaves(inputs) and not any(callable(getattr(model, name)) for name in Matrices._fields):
+    if jax.tree.leaves(inputs) and not any(map(callable, model.given())):
         raise ValueError(
             "inputs must be None for a filter made by kalman of arrays alone: "
             "at least one of F, Q, H, R, b and d must be a function of them."

@@ -138,10 +138,11 @@ def box(face: MultilinearFace, start: Bundle, prior: Prior, reach: Reach) -> tup
     pose = jnp.asarray(reach.pose, start.poses.dtype)
     a_low, a_high = sides(start.expressions, a_mean, a_std, reach.expression)
     s_low, s_high = sides(start.person.identity, s_mean, s_std, reach.identity)
-    most = widest * jnp.asarray(prior.offset_std) * jnp.ones_like(start.person.offset)
+    middle = prior.offset_mean * jnp.ones_like(start.person.offset)
+    most = widest * prior.offset_deviations * jnp.ones_like(start.person.offset)
     return (
-        Bundle(start.poses - pose, a_low, Person(s_low, -most)),
-        Bundle(start.poses + pose, a_high, Person(s_high, most)),
+        Bundle(start.poses - pose, a_low, Person(s_low, middle - most)),
+        Bundle(start.poses + pose, a_high, Person(s_high, middle + most)),
     )
 
 
@@ -207,7 +208,8 @@ def _units(face: MultilinearFace, start: Bundle, prior: Prior) -> Bundle:
     s_std = face.identity_std
     a_std = face.expression_std
     like = lambda unit, value: jnp.broadcast_to(jnp.asarray(unit, value.dtype), value.shape)
-    offset = jnp.where(jnp.asarray(prior.offset_std) > 0, prior.offset_std, 1.0)
+    deviations = prior.offset_deviations
+    offset = jnp.where(deviations > 0, deviations, 1.0)
     return Bundle(
         like(POSE_UNITS, start.poses),
         like(a_std, start.expressions),

@@ -41,5 +41,27 @@ _TABLE = np.array(
 MEAN_SHAPE = _TABLE - _TABLE.mean(axis=0)
 """(10, 3) millimetres about the centroid: x to the image's right, y down, z away from a camera that the face faces."""
 
+_PEOPLE = np.array(
+    [
+        (-44.5, -26.6, -31.7),
+        (-18.6, -25.9, -37.6),
+        (18.6, -25.9, -37.6),
+        (44.5, -26.6, -31.7),
+        (-24.6, 43.4, -42.8),
+        (24.6, 43.4, -42.8),
+        (-6.0, 20.1, -58.7),
+        (6.0, 20.1, -58.7),
+        (-14.0, -50.1, -53.2),
+        (14.0, -50.1, -53.2),
+    ]
+)
+_COS, _SIN = np.cos(np.radians(1.4)), np.sin(np.radians(1.4))
+"""The upright heads of two models of people, this one and the ICT face model, differ by 2.8 degrees of pitch and by .9
+mm beside that; what is upright here lies in the middle."""
+PEOPLE_SHAPE = (_PEOPLE - _PEOPLE.mean(axis=0)) @ np.array([[1, 0, 0], [0, _COS, -_SIN], [0, _SIN, _COS]])
+"""(10, 3) the same of people: vertices 33, 133, 61, 97 and 107 of the canonical face of MediaPipe, and those opposite
+(`face_model_with_iris.obj`, Apache licence 2.0), in millimetres and these axes. Eyes lie farther back, nostrils nearer
+together than in `MEAN_SHAPE`, which the synthetic faces vary about."""
+
 RIGID_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 0.1, 0.1])
 """(10,) how far each landmark speaks for the motion of the skull."""

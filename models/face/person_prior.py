@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxfilters.models.face import square_root_prior as past
 from jaxfilters.models.face.landmarks import EYES
+from jaxfilters.models.face.misplacement import Misplacement
 from jaxfilters.models.face.multilinear import MultilinearFace, expression_basis, shape
 from jaxfilters.models.face.square_root_prior import SquareRootPrior
 
@@ -40,6 +41,18 @@ class Prior(NamedTuple):
     """Millimetres; 0 where it is not known."""
     past: SquareRootPrior | None = None
     """Information of frames that are no longer adjusted about `parameters`."""
+    misplaced: Misplacement | None = None
+    """Of the offset, in place of `offset_std`, where a detector placed the landmarks."""
+
+    @property
+    def offset_deviations(self) -> Float[Array, "*K3"]:
+        """Standard deviations of the offset of a face as large as the mean one, millimetres."""
+        return jnp.asarray(self.offset_std if self.misplaced is None else self.misplaced.std)
+
+    @property
+    def offset_mean(self) -> Float[Array, "*K3"]:
+        """Of the same."""
+        return jnp.zeros(()) if self.misplaced is None else jnp.asarray(self.misplaced.mean)
 
 
 def posed_shape(face: MultilinearFace, person: Person, expression: Float[Array, " A"]) -> Float[Array, "K 3"]:
@@ -115,15 +128,32 @@ def residuals(
         expressions: In the images. They change its size, too: it would shrink by them if they did not count.
         prior: What is known.
     """
-    known = jnp.asarray(prior.offset_std) > 0
-    std = seen_size(face, person.identity, expressions) * prior.offset_std
-    offset = jnp.where(known, person.offset / jnp.where(known, std, 1.0), 0.0)
+    offset = _of_offset(person, seen_size(face, person.identity, expressions), prior)
     measured = jnp.asarray(prior.eyes_apart_std) > 0
     wrong = eyes_apart(face, person) - prior.eyes_apart
     size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
     before = jnp.zeros(0, offset.dtype) if prior.past is None else past.residuals(prior.past, parameters(person))
     identity = prior.weight * _of_identity(face, person.identity)
     return jnp.concatenate([identity, offset.ravel(), size[None], before])
+
+
+def own_offset(person: Person, prior: Prior) -> Float[Array, "K 3"]:
+    """The part of the offset that is the face's, without what the detector misplaced, millimetres."""
+    if prior.misplaced is None:
+        return person.offset
+    whitening = prior.misplaced.whitening
+    away = jnp.matmul(whitening, (person.offset - prior.offset_mean).ravel(), precision="highest")
+    share = jnp.matmul(whitening.T, away, precision="highest")
+    return jnp.square(jnp.asarray(prior.offset_std)) * share.reshape(person.offset.shape)
+
+
+def _of_offset(person: Person, size: Array, prior: Prior) -> Float[Array, "K 3"]:
+    """In independent standard deviations, in proportion to the size."""
+    if prior.misplaced is not None:
+        away = (person.offset / size - prior.offset_mean).ravel()
+        return jnp.matmul(prior.misplaced.whitening, away, precision="highest").reshape(person.offset.shape)
+    known = jnp.asarray(prior.offset_std) > 0
+    return jnp.where(known, person.offset / jnp.where(known, size * prior.offset_std, 1.0), 0.0)
 
 
 def _of_identity(face: MultilinearFace, identity: Array) -> Array:

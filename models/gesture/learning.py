@@ -1,13 +1,19 @@
 """Models of symbols fitted to strokes, and how well they recognise strokes of people outside of the training set."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxfilters.models.gesture import calibration
+from jaxfilters.models.gesture.calibration import Scores
 from jaxfilters.models.gesture.coded import learn_paths
-from jaxfilters.models.gesture.stroke import Drawn, stacked, to_judge
-from jaxfilters.models.gesture.symbols import Symbols, learn, recognise_all
+from jaxfilters.models.gesture.discriminative import trained_apart
+from jaxfilters.models.gesture.stroke import NUM_POINTS, Drawn, stacked, to_judge
+from jaxfilters.models.gesture.symbols import SHARPNESS, Symbols, learn, recognise_all
 
 EXAMPLES_A_WAY, MOST_WAYS = 40, 20
 """Examples of a symbol for each way to draw it that is looked for, and how many ways at most."""
@@ -15,18 +21,30 @@ NUM_STATES, MIN_VARIANCE = 10, 0.1
 """Of strokes with several pieces or in space."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
+EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
+"""Examples of a symbol from which on models are trained discriminatively, of which fewer do: with 8 examples of each
+no decision changes, and with 20 ways models learn the training strokes by heart."""
+NUM_FOLDS, FEWEST_SCORES = 3, 20
+"""Parts of the strokes that are left out in turn to calibrate, and recognised strokes that this takes."""
 
 
 class LeftOut(NamedTuple):
-    """How strokes of one person were recognised by models that were fitted to those of the others."""
+    """Strokes of one person by models that were fitted to those of the others."""
 
     person: str
-    right: int
-    """Strokes whose best symbol is theirs, whether it beats the threshold model or not."""
-    accepted: int
-    """Strokes whose best symbol beats the threshold model."""
-    right_and_accepted: int
-    total: int
+    scores: Scores
+
+
+class Judged(NamedTuple):
+    """The same with confidences and margins that were fitted to the other people's scores."""
+
+    person: str
+    right: Bool[np.ndarray, " n"]
+    """Strokes whose best symbol is theirs, whether it is accepted or not."""
+    confidence: Float[np.ndarray, " n"]
+    """Of the best symbol."""
+    beyond: Float[np.ndarray, " n"]
+    """Nats a point by which it beats the threshold model beside its margin: it is accepted from 0 on."""
 
 
 def is_path(strokes: Sequence[Drawn]) -> bool:
@@ -48,36 +66,43 @@ def learn_strokes(
     num_variants: int | None = None,
     min_variance: float | None = None,
 ) -> Symbols:
-    """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips, else by `learn`.
+    """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
+
+    Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
+    `discriminative.trained_apart`.
 
     Args:
         strokes: In two dimensions or in three.
         labels: The symbol of each.
         num_states: States of each model; `None` is as many as suit the kind of strokes.
-        num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`.
+        num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`, and at most
+            `MOST_WAYS_APART` of models that are trained discriminatively.
         min_variance: Floor of the variances of features; `None` is what suits the kind of strokes.
 
     Raises:
         ValueError: If there is no stroke, `labels` has another length, or a stroke has no sample or one that is not
             finite.
     """
-    ways = ways_of(labels) if num_variants is None else num_variants
     if is_path(strokes):
         paths = [(np.asarray(pieces[0]), np.full(len(pieces[0]), fingers, int)) for pieces, fingers in strokes]
         return learn_paths(
             paths,
             labels,
             num_states=num_states or PATH_STATES,
-            num_variants=ways,
+            num_variants=ways_of(labels) if num_variants is None else num_variants,
             min_variance=PATH_VARIANCE if min_variance is None else min_variance,
         )
-    return learn(
-        stacked(strokes),
+    features = stacked(strokes)
+    are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
+    most = MOST_WAYS_APART if are_many else MOST_WAYS
+    symbols = learn(
+        features,
         labels,
         num_states=num_states or NUM_STATES,
-        num_variants=ways,
+        num_variants=min(ways_of(labels), most) if num_variants is None else num_variants,
         min_variance=MIN_VARIANCE if min_variance is None else min_variance,
     )
+    return trained_apart(symbols, features, labels) if are_many else symbols
 
 
 def leave_one_out(
@@ -108,24 +133,118 @@ def leave_one_out(
     everybody = sorted(set(people))
     if len(everybody) < 2:
         raise ValueError(f"people must be two or more; got {everybody}.")
-    dimensions = next(np.shape(piece)[1] for pieces, _ in strokes for piece in pieces)
     found = []
     for person in everybody if left_out is None else left_out:
-        shown = _shown(named, who, person, most).tolist()
-        symbols = learn_strokes(
-            [strokes[i] for i in shown], named[shown].tolist(), num_states=num_states, num_variants=num_variants
-        )
-        own = np.flatnonzero(who == person).tolist()
-        judged = recognise_all(symbols, to_judge([strokes[i] for i in own], dimensions))
-        right = np.array(symbols.names)[np.argmax(judged.log_likelihood, axis=0)] == named[own]
-        accepted = np.asarray(judged.label) >= 0
-        found.append(LeftOut(person, int(right.sum()), int(accepted.sum()), int((right & accepted).sum()), len(own)))
+        shown = _shown(named, who, person, most)
+        scores = _scores(strokes, named, shown, np.flatnonzero(who == person), num_states, num_variants)
+        found.append(LeftOut(person, scores))
     return found
 
 
-def accuracy(found: Sequence[LeftOut]) -> float:
+def cross_calibrated(
+    symbols: Symbols,
+    strokes: Sequence[Drawn],
+    labels: Sequence[str],
+    people: Sequence[str],
+    *,
+    num_states: int | None = None,
+    num_variants: int | None = None,
+) -> Symbols:
+    """`calibrated` by `cross_scores` of the strokes that the symbols were fitted to; as they are if these are too few.
+
+    Arguments are those of `leave_one_out`.
+    """
+    if len(strokes) < FEWEST_SCORES:
+        return symbols
+    found = cross_scores(strokes, labels, people, num_states=num_states, num_variants=num_variants)
+    return calibrated(symbols, found)
+
+
+def cross_scores(
+    strokes: Sequence[Drawn],
+    labels: Sequence[str],
+    people: Sequence[str],
+    *,
+    num_states: int | None = None,
+    num_variants: int | None = None,
+) -> Scores:
+    """All strokes by models of others, in `NUM_FOLDS` parts: of people where there are two or more, else of strokes.
+
+    Arguments are those of `leave_one_out`.
+    """
+    named, who = np.asarray(labels), np.unique(np.asarray(people), return_inverse=True)[1]
+    parts = who
+    if not who.max():
+        parts = np.zeros(len(named), int)
+        for name in np.unique(named):
+            parts[named == name] = np.arange(np.sum(named == name))
+    fold = parts % min(NUM_FOLDS, parts.max() + 1)
+    scores = [
+        _scores(strokes, named, np.flatnonzero(fold != i), np.flatnonzero(fold == i), num_states, num_variants)
+        for i in np.unique(fold)
+        if np.any(fold != i)
+    ]
+    return together(scores)
+
+
+def together(scores: Sequence[Scores]) -> Scores:
+    """Those of several sets of strokes, by models of the same symbols."""
+    return Scores(
+        np.concatenate([one.log_likelihood for one in scores], axis=1),
+        np.concatenate([one.lead for one in scores]),
+        np.concatenate([one.truth for one in scores]),
+    )
+
+
+def calibrated(symbols: Symbols, scores: Scores) -> Symbols:
+    """Symbols with the confidences and margins that suit strokes of people outside of the training set.
+
+    They stay as they are where fewer than `FEWEST_SCORES` strokes were recognised.
+    """
+    if np.sum(scores.is_right & np.isfinite(scores.lead)) < FEWEST_SCORES:
+        return symbols
+    found = calibration.fitted(scores)
+    margins = jnp.asarray(found.margins, float)
+    return replace(symbols, sharpness=found.sharpness, lapse=found.lapse, margins=margins)
+
+
+def judged(found: Sequence[LeftOut]) -> list[Judged]:
+    """Every person's strokes, with confidences and margins fitted to those of the other people."""
+    rows = []
+    for one in found:
+        others = [other.scores for other in found if other is not one]
+        known = bool(others) and sum(int(other.is_right.sum()) for other in others) >= FEWEST_SCORES
+        fitted = calibration.fitted(together(others)) if known else None
+        share, lapse = (fitted.sharpness, fitted.lapse) if fitted else (SHARPNESS, 0.0)
+        margins = fitted.margins if fitted else np.zeros(len(one.scores.log_likelihood))
+        confidence = calibration.confidences(one.scores, share, lapse)
+        rows.append(Judged(one.person, one.scores.is_right, confidence, one.scores.lead - margins[one.scores.best]))
+    return rows
+
+
+def accuracy(found: Sequence[Judged | LeftOut]) -> float:
     """Share of all strokes, in percent, whose best symbol is theirs."""
-    return 100 * sum(one.right for one in found) / max(sum(one.total for one in found), 1)
+    right = np.concatenate([one.right if isinstance(one, Judged) else one.scores.is_right for one in found])
+    return 100 * float(right.mean())
+
+
+def _scores(
+    strokes: Sequence[Drawn],
+    labels: np.ndarray,
+    shown: np.ndarray,
+    own: np.ndarray,
+    num_states: int | None,
+    num_variants: int | None,
+) -> Scores:
+    """Of the strokes `own` by models of the strokes `shown`; a symbol that is not among these has `-inf`."""
+    dimensions = next(np.shape(piece)[1] for pieces, _ in strokes for piece in pieces)
+    training = [strokes[i] for i in shown]
+    symbols = learn_strokes(training, labels[shown].tolist(), num_states=num_states, num_variants=num_variants)
+    found = recognise_all(symbols, to_judge([strokes[i] for i in own], dimensions))
+    everything = np.unique(labels)
+    log_likelihood = np.full((len(everything), len(own)), -np.inf)
+    log_likelihood[np.searchsorted(everything, symbols.names)] = NUM_POINTS * np.asarray(found.log_likelihood, float)
+    return Scores(log_likelihood, np.asarray(found.lead, float), np.searchsorted(everything, labels[own]))
 
 
 def _shown(labels: np.ndarray, who: np.ndarray, person: str, most: int | None) -> np.ndarray:

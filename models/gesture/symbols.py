@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,12 @@ class Symbols:
     owner: Int32[Array, "..."]
     """(m,): the symbol that each model is a way to draw, as an index into `names`."""
     names: tuple[str, ...] = field(metadata={"static": True})
+    sharpness: Any = None
+    """Share of a log-likelihood that counts towards confidence, of `calibration.fitted`; `None` is `SHARPNESS`."""
+    lapse: Any = None
+    """Probability that a stroke may be any symbol, of `calibration.fitted`; `None` is 0."""
+    margins: Any = None
+    """(k,): nats a point by which each symbol has to beat the threshold model, of `calibration.fitted`; `None` is 0."""
 
 
 class Recognition(NamedTuple):
@@ -129,7 +135,15 @@ def extended(symbols: Symbols, others: Symbols) -> Symbols:
         )
     models = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), symbols.models, others.models)
     owner = jnp.concatenate([symbols.owner, others.owner + len(symbols.names)])
-    return Symbols(models, owner, symbols.names + others.names)
+    margins = None
+    if symbols.margins is not None or others.margins is not None:
+        zeros = (np.zeros(len(one.names)) if one.margins is None else one.margins for one in (symbols, others))
+        margins = jnp.concatenate([jnp.asarray(own) for own in zeros])
+    # A stroke of one set may be taken for a symbol of the other, of which nothing was measured: the less certain holds.
+    shares = [float(one.sharpness) for one in (symbols, others) if one.sharpness is not None]
+    lapses = [float(one.lapse) for one in (symbols, others) if one.lapse is not None]
+    names = symbols.names + others.names
+    return Symbols(models, owner, names, min(shares, default=None), max(lapses, default=None), margins)
 
 
 def network(symbols: Symbols) -> hmm.Network:
@@ -148,7 +162,7 @@ def recognise(
     *,
     margin: float | Float[Array, ""] = 0.0,
     distance: float | Float[Array, ""] = 0.0,
-    sharpness: float | Float[Array, ""] = SHARPNESS,
+    sharpness: float | Float[Array, ""] | None = None,
 ) -> Recognition:
     """What strokes are, in one pass over all models.
 
@@ -158,10 +172,10 @@ def recognise(
         threshold: What a symbol has to beat, `hmm.threshold_model(network(symbols))`; `None` rejects only strokes whose
             features are not finite or that no symbol can produce.
         lengths: Points of each stroke; `None` is all.
-        margin: Nats a point by which it has to.
+        margin: Nats a point by which it has to, beside the symbol's own margin.
         distance: Nats a point by which it has to beat every other symbol.
         sharpness: Of the confidence: share of a log-likelihood that counts. Neighbouring points say nearly the
-            same, so that all of it would be certain of everything.
+            same, so that all of it would be certain of everything. `None` is that of the symbols.
     """
     leaf = jax.tree.leaves(observations)[0]
     lengths = jnp.full(leaf.shape[-1], leaf.shape[0]) if lengths is None else lengths
@@ -212,7 +226,7 @@ def recognise_all(
 def _judged(symbols, observations, lengths, margin, distance):
     seen = _seen(symbols, observations)
     bar = threshold_log_likelihood(symbols.models, seen, lengths)
-    return _decided(symbols, seen, bar, lengths, margin, distance, SHARPNESS)
+    return _decided(symbols, seen, bar, lengths, margin, distance, None)
 
 
 def _seen(symbols: Symbols, observations: PyTree) -> Float[Array, "m p q n"]:
@@ -233,10 +247,13 @@ def _decided(symbols, seen, bar, lengths, margin, distance, sharpness) -> Recogn
     others = jnp.where(jnp.arange(len(totals))[:, None] == best, -jnp.inf, totals)
     apart = (finite - jnp.max(others, axis=0)) / num_points
     usual = jnp.where(possible, totals - finite, 0.0)
-    accepted = possible & (lead >= margin) & (apart >= distance)
-    return Recognition(
-        jnp.where(accepted, best, -1), jax.nn.softmax(sharpness * usual, axis=0), totals / num_points, lead
-    )
+    own_margin = 0.0 if symbols.margins is None else symbols.margins[best]
+    accepted = possible & (lead >= own_margin + margin) & (apart >= distance)
+    if sharpness is None:
+        sharpness = SHARPNESS if symbols.sharpness is None else symbols.sharpness
+    lapse = 0.0 if symbols.lapse is None else symbols.lapse
+    confidence = (1 - lapse) * jax.nn.softmax(sharpness * usual, axis=0) + lapse / len(symbols.names)
+    return Recognition(jnp.where(accepted, best, -1), confidence, totals / num_points, lead)
 
 
 @partial(jax.jit, static_argnames="max_iterations")

@@ -22,6 +22,9 @@ FOREARM_BEGINS = 0.0
 """Metres below the wrist, in the palm's direction of the forearm, from which a reading is arm rather than hand. Where
 the model itself ends: readings beyond it would draw the palm down the arm, frame by frame."""
 
+FINEST_STRIDE, COARSEST_STRIDE = 0.5, 16.0
+"""Pixels of the frame for one of a window: below the first, readings are only repeated."""
+
 
 class HandImage(NamedTuple):
     """A window of a depth frame, with everything but the hand taken out."""
@@ -35,19 +38,30 @@ class HandImage(NamedTuple):
 
 
 def crop(
-    camera: Pinhole, frame: Float[Array, "rows cols"], center: Float[Array, " 3"], shape: tuple[int, int], stride: int
+    camera: Pinhole,
+    frame: Float[Array, "rows cols"],
+    center: Float[Array, " 3"],
+    shape: tuple[int, int],
+    stride: int | float | Float[Array, ""],
 ) -> tuple[Pinhole, Float[Array, "height width"]]:
-    """The window of `shape` pixels, every `stride`-th of the frame, about the projection of `center` (metres).
+    """The window of `shape` pixels, `stride` pixels of the frame apart, about the projection of `center` (metres).
 
-    Pixels beyond the border of the frame are NaN. `center` must lie in front of the camera.
+    A stride that is no whole number takes the reading nearest to each pixel of the window; it may be traced. Pixels
+    beyond the border of the frame are NaN. `center` must lie in front of the camera.
     """
     rows, cols = shape
     corner = jnp.round(camera.project(center) - 0.5 * stride * jnp.array([cols - 1, rows - 1]))
-    u = corner[0].astype(int) + stride * jnp.arange(cols)
-    v = corner[1].astype(int) + stride * jnp.arange(rows)
+    u = jnp.round(corner[0] + stride * jnp.arange(cols)).astype(int)
+    v = jnp.round(corner[1] + stride * jnp.arange(rows)).astype(int)
     inside = ((v >= 0) & (v < frame.shape[0]))[:, None] & ((u >= 0) & (u < frame.shape[1]))
     pixels = frame.at[v].get(mode="clip").at[:, u].get(mode="clip")
-    return camera.crop(corner, shape, stride), jnp.where(inside, pixels, jnp.nan)
+    window = replace(camera, focal=camera.focal / stride, center=(camera.center - corner) / stride, shape=shape)
+    return window, jnp.where(inside, pixels, jnp.nan)
+
+
+def window_stride(camera: Pinhole, depth: Float[Array, ""], cols: int) -> Float[Array, ""]:
+    """Pixels of the frame from one column of a window to the next, so that a hand at `depth` metres fills `cols`."""
+    return jnp.clip(camera.focal[0] * 2 * REACH / (depth * cols), FINEST_STRIDE, COARSEST_STRIDE)
 
 
 def isolate(

@@ -102,24 +102,36 @@ def register(
 
     `camera` must be the one that `target` was made with.
     """
-    root = prior.root
-    identity = jnp.eye(TANGENT_SIZE, dtype=root.dtype)
 
     def iterate(pose: Array, width: Array) -> tuple[Array, Array]:
-        gradient, information = normal_equations(camera, target, geometry, pose, width, config)
-        excess = limit_excess(pose[7:])
-        beyond = jnp.concatenate([jnp.zeros(6), excess]) / SOFTNESS**2
-        stiffness = jnp.concatenate([jnp.zeros(6), jnp.where(excess != 0, 1.0, 0.0)]) / SOFTNESS**2
-        # In coordinates whitened by the prior the units of metres and radians no longer matter to float32.
-        whitened = solve_triangular(root, local(prior.mean, pose), lower=True)
-        slope = root.T @ (gradient + beyond) + whitened
-        curvature = root.T @ (information + jnp.diag(stiffness)) @ root + identity
-        step = -root @ cho_solve(cho_factor(curvature, lower=True), slope)
-        shortening = jnp.minimum(1.0, jnp.min(LARGEST_STEP / jnp.maximum(jnp.abs(step), 1e-9)))
-        return retract(pose, shortening * step), information
+        return gauss_newton(camera, target, geometry, pose, prior, width, config)
 
     pose, information = jax.lax.scan(iterate, start, jnp.asarray(config.widths))
     return Registration(pose, information[-1])
+
+
+def gauss_newton(
+    camera: Pinhole,
+    target: Target,
+    geometry: HandGeometry,
+    pose: Float[Array, " 22"],
+    prior: PosePrior,
+    width: Float[Array, ""],
+    config: RegistrationConfig,
+) -> tuple[Float[Array, " 22"], Float[Array, "21 21"]]:
+    """The pose after one Gauss-Newton step with robust weights of the given width, and the information before it."""
+    root = prior.root
+    gradient, information = normal_equations(camera, target, geometry, pose, width, config)
+    excess = limit_excess(pose[7:])
+    beyond = jnp.concatenate([jnp.zeros(6), excess]) / SOFTNESS**2
+    stiffness = jnp.concatenate([jnp.zeros(6), jnp.where(excess != 0, 1.0, 0.0)]) / SOFTNESS**2
+    # In coordinates whitened by the prior the units of metres and radians no longer matter to float32.
+    whitened = solve_triangular(root, local(prior.mean, pose), lower=True)
+    slope = root.T @ (gradient + beyond) + whitened
+    curvature = root.T @ (information + jnp.diag(stiffness)) @ root + jnp.eye(TANGENT_SIZE, dtype=root.dtype)
+    step = -root @ cho_solve(cho_factor(curvature, lower=True), slope)
+    shortening = jnp.minimum(1.0, jnp.min(LARGEST_STEP / jnp.maximum(jnp.abs(step), 1e-9)))
+    return retract(pose, shortening * step), information
 
 
 def normal_equations(

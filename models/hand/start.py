@@ -1,23 +1,33 @@
-"""Find a hand without knowing where it was: many hypotheses, each pulled onto the image, the best one kept."""
+"""Find a hand without knowing where it was: many hypotheses of both hands, the likeliest pulled onto the image.
+
+All hypotheses about one place are judged on the same readings, and the forearm is part of the model that is judged.
+Otherwise a hypothesis could declare what it does not explain to be forearm: an open hand is then cheapest as a fist
+turned upside down, whose "arm" are the fingers.
+"""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxfilters.math.lie import quaternion_multiply, quaternion_to_matrix, so3_exp
+from jaxfilters.math.lie import quaternion_multiply, quaternion_normalize, quaternion_to_matrix, so3_exp
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.cost import count_observed
 from jaxfilters.models.hand.motion import per_coordinate
-from jaxfilters.models.hand.observation import REACH, HandLikelihood, hand_image
-from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
+from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, Target, gauss_newton, target_from_image
+from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics
+from jaxfilters.models.rendering.comparison import compare_capsules
+from jaxfilters.models.rendering.geometry import Capsules
 
 PALM_TO_WRIST = 0.055
 """Metres from the middle of the palm to the wrist of an average hand."""
-WRIST_TO_CUT = 0.065
-"""Metres from the middle of the palm beyond which a reading is forearm."""
+SEARCH_RADIUS = 0.16
+"""Metres about the middle of the palm within which readings are explained."""
 GESTURES = np.deg2rad(
     [
         [0.0] * 15,
@@ -27,112 +37,314 @@ GESTURES = np.deg2rad(
 )
 """Joint angles of an open, a relaxed and a closed hand, (3, 15)."""
 NUM_ROLLS = 12
-SCALES = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
-NUM_FINALISTS = 8
+TILTS = np.deg2rad([-45.0, 0.0, 45.0])
+"""Of the fingers towards the camera and away from it."""
+SCALES = (0.85, 0.925, 1.0, 1.075, 1.15)
+STRAIGHT, BENT = np.deg2rad([[0.0, 0.0, 0.0], [45.0, 0.0, 70.0]])
+"""Angles of a finger in two of the variants of a finalist."""
+TURN = 0.25
+"""Radians about the palm's normal, to either side, of two more."""
+BATCH = 14
+"""Hypotheses in one compiled call; the variants of one finalist."""
+NUM_VARIED = (4, 2)
+"""Finalists that are varied, in the first and in the second round."""
+NUM_REGISTERED, NUM_FINALISTS = 56, 6
+"""Hypotheses that are registered with the middle one of the sizes, and of these with every size."""
 REGISTRATION_STRIDE, JUDGING_STRIDE = 4, 2
-"""Every how many pixels of the window one is used."""
+"""Every how many pixels of the window one is used; coarser pixels mistake the back of a hand for its palm."""
+MAX_ERROR = 0.05
+"""Metres that one pixel costs at most."""
+FOREARM_RADIUS = 0.028
+"""Metres, of an average hand."""
+FOREARM_DEPTH = 0.02
+"""Metres from the skin of the forearm to its axis, about."""
+FEWEST_ARM_PIXELS = 12
 SIZE_STD = 0.1
 """Of the logarithm of the size of hands."""
-UNUSUAL_SIZE = 0.002
+UNUSUAL_SIZE = 0.001
 """Metres of cost that a hand one such standard deviation off the average must gain."""
-COARSE = RegistrationConfig(widths=(0.04,) * 6 + (0.02,) * 6)
-FINE = RegistrationConfig(widths=(0.02,) * 3 + (0.01,) * 5)
-
-
-class Sighting(NamedTuple):
-    """What a detector says about a hand in a frame."""
-
-    center: Float[Array, " 3"]
-    """Middle of the palm, metres, camera frame."""
-    forearm: Float[Array, " 3"]
-    """Unit vector from the palm to the forearm; zero where none was observed."""
+COARSE = (0.04,) * 5 + (0.02,) * 3
+FINE = (0.02,) * 3 + (0.01,) * 3
+"""Widths of the robust weight, metres, one for each step."""
+REGISTRATION = RegistrationConfig()
 
 
 class Start(NamedTuple):
-    """The best hypothesis."""
+    """A pose with its hand, and how well they explain an image."""
 
-    pose: Float[Array, " 22"]
-    scale: Float[Array, ""]
+    pose: Float[np.ndarray, " 22"]
+    scale: float
     """Size of the hand relative to the average one."""
-    cost: Float[Array, ""]
-    """Metres; the largest possible where nothing fits."""
+    side: float
+    """+1 for a right hand, -1 for a left one."""
+    cost: float
+    """Metres: mean error over the readings near the hand, at most `MAX_ERROR` and a little more for an unusual size."""
 
 
-def isolate_sighting(
-    camera: Pinhole, observed: Float[Array, "rows cols"], sighting: Sighting
-) -> Float[Array, "rows cols"]:
-    """The readings near the palm, without the forearm; background where they are farther away, else unknown."""
-    points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
-    offset = points - sighting.center
-    outside = jnp.sum(offset**2, axis=-1) > REACH**2
-    arm = offset @ sighting.forearm > WRIST_TO_CUT
-    kept = jnp.where(outside | arm, jnp.nan, observed)
-    return jnp.where(observed > sighting.center[2] + REACH, jnp.inf, kept)
+class Hypotheses(NamedTuple):
+    """Poses of hands; leaves (h, ...)."""
+
+    poses: Float[np.ndarray, "h 22"]
+    scales: Float[np.ndarray, " h"]
+    sides: Float[np.ndarray, " h"]
+
+    def rows(self, index: np.ndarray | slice) -> "Hypotheses":
+        """Some of them."""
+        return Hypotheses(*(leaf[index] for leaf in self))
 
 
-def starting_poses(sighting: Sighting) -> Float[Array, "h 22"]:
-    """Hypotheses: rolls about the optical axis, palm or back to the camera, three gestures.
-
-    With a forearm in view the rolls stay within 50 degrees of it, else they go all the way round.
-    """
-    forearm = sighting.forearm
-    seen = jnp.any(forearm != 0)
-    toward = jnp.where(seen, jnp.arctan2(-forearm[0], jnp.where(seen, forearm[1], 1.0)), 0.0)
-    fan = jnp.linspace(-1.0, 1.0, NUM_ROLLS) * math.radians(50)
-    circle = jnp.arange(NUM_ROLLS) * (2 * math.pi / NUM_ROLLS)
-    rolls = toward + jnp.where(seen, fan, circle)
-
-    def hypothesis(roll: Array, flip: Array, angles: Array) -> Array:
-        rotation = quaternion_multiply(
-            so3_exp(roll * jnp.array([0.0, 0.0, 1.0])), so3_exp(flip * jnp.array([0.0, 1.0, 0.0]))
-        )
-        wrist = sighting.center + PALM_TO_WRIST * quaternion_to_matrix(rotation)[:, 1]
-        return jnp.concatenate([wrist, rotation, angles])
-
-    over_gestures = jax.vmap(hypothesis, in_axes=(None, None, 0))
-    over_flips = jax.vmap(over_gestures, in_axes=(None, 0, None))
-    poses = jax.vmap(over_flips, in_axes=(0, None, None))(
-        rolls, jnp.array([0.0, math.pi]), jnp.asarray(GESTURES, dtype=float)
+def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequence[float]) -> Hypotheses:
+    """Hands about the middle of a palm: rolls about the optical axis, palm or back to the camera, tilts, gestures."""
+    grid = _grid()
+    rotation, wrist, angles = grid
+    poses = np.concatenate([center + scale * wrist, rotation, angles], axis=1).astype(np.float32)
+    count = len(poses)
+    return Hypotheses(
+        np.tile(poses, (len(sides), 1)),
+        np.full(count * len(sides), scale, np.float32),
+        np.repeat(np.asarray(sides, np.float32), count),
     )
-    return poses.reshape(-1, poses.shape[-1])
 
 
-def find_start(
+def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations (h, 4), wrists from the middle of the palm (h, 3) and angles (h, 15)."""
+
+    def rotation(roll: Array, flip: Array, tilt: Array) -> tuple[Array, Array]:
+        axes = jnp.eye(3)
+        turned = quaternion_multiply(so3_exp(roll * axes[2]), so3_exp(flip * axes[1]))
+        turned = quaternion_multiply(turned, so3_exp(tilt * axes[0]))
+        return turned, PALM_TO_WRIST * quaternion_to_matrix(turned)[:, 1]
+
+    rolls = np.arange(NUM_ROLLS) * (2 * math.pi / NUM_ROLLS)
+    grid = np.stack(np.meshgrid(rolls, [0.0, math.pi], TILTS, indexing="ij"), axis=-1).reshape(-1, 3)
+    rotations, wrists = jax.jit(jax.vmap(rotation))(*jnp.asarray(grid.T, jnp.float32))
+    repeat = len(GESTURES)
+    angles = np.tile(GESTURES, (len(grid), 1))
+    return np.repeat(np.asarray(rotations), repeat, axis=0), np.repeat(np.asarray(wrists), repeat, axis=0), angles
+
+
+def find_starts(
     camera: Pinhole,
     observed: Float[Array, "rows cols"],
-    sighting: Sighting,
-    likelihood: HandLikelihood,
-    scales: Float[Array, " s"],
-) -> Start:
-    """The hypothesis and the size of hand, one of `scales`, that explain the image best after registration.
+    center: Float[np.ndarray, " 3"],
+    geometry: HandGeometry,
+    scales: Sequence[float],
+    sides: Sequence[float] = (1.0, -1.0),
+    num_registered: int = NUM_REGISTERED,
+) -> list[Start]:
+    """Poses, sizes and sides of a hand that explain an image after registration, the best first.
 
-    `observed` is a window of `camera`, metres, NaN without a reading; `likelihood` that of the average hand. Every
-    hypothesis is registered on every fourth pixel and judged on every second one: coarser pixels mistake the back of a
-    hand for its palm.
+    Args:
+        camera: Of the window, 128 x 128 pixels that hold a hand about `center`.
+        observed: Metres; `inf` is background, NaN without a reading.
+        center: Middle of the palm, metres, roughly.
+        geometry: The average hand.
+        scales: Sizes to try; the middle one comes first.
+        sides: Hands to try, 1 for right and -1 for left.
+        num_registered: How many of the hypotheses are registered.
+
+    Returns:
+        At most `NUM_FINALISTS` different ones.
     """
-    observed = isolate_sighting(camera, observed, sighting)
-    coarse_camera, coarse = _every(REGISTRATION_STRIDE, camera, observed)
-    target = target_from_image(coarse_camera, coarse)
-    image = hand_image(*_every(JUDGING_STRIDE, camera, observed))
+    image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
+    middle = scales[len(scales) // 2]
+    tried = starting_poses(center, middle, sides)
+    _, costs = _refined(image, tried, ())
+    tried = tried.rows(np.argsort(costs)[:num_registered])
+    tried, costs = _refined(image, tried, COARSE)
+    finalists = _distinct(tried, costs)
+    if len(scales) > 1:
+        repeats = np.tile(np.asarray(scales, np.float32), len(finalists))
+        tried = tried.rows(np.repeat(finalists, len(scales)))._replace(scales=repeats)
+    else:
+        tried = tried.rows(finalists)
+    tried, costs = _sized(*_refined(image, tried, FINE))
+    for count in NUM_VARIED[:1] if num_registered < NUM_REGISTERED else NUM_VARIED:
+        best = tried.rows(_distinct(tried, costs))
+        varied, varied_costs = _sized(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
+        tried = Hypotheses(*(np.concatenate(leaves) for leaves in zip(tried, varied, strict=True)))
+        costs = np.concatenate([costs, varied_costs])
+    return [
+        Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
+        for i in _distinct(tried, costs)
+    ]
+
+
+def _sized(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray]:
+    """Costs with what an unusual size costs more."""
+    return tried, costs + UNUSUAL_SIZE * (np.log(tried.scales) / SIZE_STD) ** 2
+
+
+def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
+    """What registration cannot reach from a finalist.
+
+    One digit straight or bent, all fingers off by one, and the hand of the other side, as it is or turned over.
+    """
+    poses, scales, found_sides = [], [], []
+    turned_over, aside = np.array([0.0, 0.0, 1.0, 0.0]), np.array([math.cos(TURN / 2), 0.0, 0.0, math.sin(TURN / 2)])
+    for pose, scale, side in zip(*finalists, strict=True):
+        variants = []
+        for digit in range(5):
+            for angles in (STRAIGHT, BENT):
+                variant = pose.copy()
+                variant[7 + 3 * digit : 10 + 3 * digit] = angles if digit else 0.5 * angles[::-1]
+                variants.append((variant, side))
+        other = -side if -side in sides else side
+        for turn, to in ((turned_over, other), (np.array([1.0, 0.0, 0.0, 0.0]), other), (aside, side)):
+            variants.append((_turned(pose, float(scale), turn), to))
+        variants.append((_turned(pose, float(scale), aside * [1, -1, -1, -1]), side))
+        for variant, to in variants:
+            poses.append(variant)
+            scales.append(scale)
+            found_sides.append(to)
+    return Hypotheses(np.stack(poses), np.asarray(scales, np.float32), np.asarray(found_sides, np.float32))
+
+
+def _turned(pose: np.ndarray, scale: float, turn: np.ndarray) -> np.ndarray:
+    """The pose turned in its own frame by a quaternion, about the middle of its palm."""
+    before, turned = pose[3:7], _product(pose[3:7], turn)
+    middle = pose[:3] - PALM_TO_WRIST * scale * _second_axis(before)
+    wrist = middle + PALM_TO_WRIST * scale * _second_axis(turned)
+    return np.concatenate([wrist, turned, pose[7:]]).astype(np.float32)
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    vector = p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], vector])
+
+
+def _second_axis(q: np.ndarray) -> np.ndarray:
+    """Where a rotation takes the y axis."""
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
+
+
+def registered(
+    camera: Pinhole,
+    observed: Float[Array, "rows cols"],
+    center: Float[np.ndarray, " 3"],
+    geometry: HandGeometry,
+    start: Start,
+) -> Start:
+    """One pose after the same registration, with its cost, as `find_starts` would judge it."""
+    image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
+    one = Hypotheses(start.pose[None], np.full(1, start.scale, np.float32), np.full(1, start.side, np.float32))
+    found, costs = _refined(image, one, FINE)
+    cost = float(costs[0]) + UNUSUAL_SIZE * (math.log(start.scale) / SIZE_STD) ** 2
+    return start._replace(pose=found.poses[0], cost=cost)
+
+
+def _refined(image: tuple, tried: Hypotheses, widths: tuple[float, ...]) -> tuple[Hypotheses, np.ndarray]:
+    """Hypotheses after a Gauss-Newton step for each of `widths`, and their costs, batch by batch."""
+    steps = np.zeros(max(len(COARSE), len(FINE)), np.float32)
+    steps[: len(widths)] = widths
+    poses, costs = [], []
+    for first in range(0, len(tried.poses), BATCH):
+        part = tried.rows(slice(first, first + BATCH))
+        count = len(part.poses)
+        padded = jax.tree.map(lambda leaf, n=BATCH - count: np.concatenate([leaf, leaf[:1].repeat(n, axis=0)]), part)
+        found, cost = _refine_batch(*image, padded, steps, np.int32(len(widths)))
+        poses.append(np.asarray(found)[:count])
+        costs.append(np.asarray(cost)[:count])
+    return tried._replace(poses=np.concatenate(poses)), np.concatenate(costs)
+
+
+@jax.jit
+def _refine_batch(
+    camera: Pinhole,
+    observed: Float[Array, "rows cols"],
+    center: Float[Array, " 3"],
+    geometry: HandGeometry,
+    batch: Hypotheses,
+    widths: Float[Array, " w"],
+    num_steps: Int[Array, ""],
+) -> tuple[Float[Array, "h 22"], Float[Array, " h"]]:
+    """Registered poses and their costs; without steps, the costs of the poses as they are."""
+    near = _near(camera, observed, center)
+    coarse_camera, coarse = _every(REGISTRATION_STRIDE, camera, near)
+    judging_camera, judged = _every(JUDGING_STRIDE, camera, near)
     root = jnp.diag(per_coordinate(0.06, 0.6, 0.6))
 
-    def pull(pose: Array, scale: Array, config: RegistrationConfig) -> Array:
-        geometry = likelihood.geometry.scaled(scale)
-        return register(coarse_camera, target, geometry, pose, PosePrior(pose, root), config).pose
+    def refine(pose: Array, scale: Array, side: Array) -> tuple[Array, Array]:
+        hand = replace(geometry.scaled(scale), side=side)
+        target = _without_arm(coarse_camera, coarse, pose)
 
-    def judge(pose: Array, scale: Array) -> Array:
-        return likelihood.scaled(scale).cost(pose, image)
+        def step(i: Array, at: Array) -> Array:
+            return gauss_newton(coarse_camera, target, hand, at, PosePrior(pose, root), widths[i], REGISTRATION)[0]
 
-    middle = scales[len(scales) // 2]
-    poses = jax.vmap(lambda pose: pull(pose, middle, COARSE))(starting_poses(sighting))
-    costs = jax.lax.map(lambda pose: judge(pose, middle), poses)
-    finalists = poses[jnp.argsort(costs)[:NUM_FINALISTS]]
-    over_sizes = jax.vmap(lambda pose, size: pull(pose, size, FINE), in_axes=(None, 0))
-    poses = jax.vmap(over_sizes, in_axes=(0, None))(finalists, scales).reshape(-1, finalists.shape[-1])
-    tried = jnp.tile(scales, NUM_FINALISTS)
-    costs = jax.lax.map(lambda inputs: judge(*inputs), (poses, tried))
-    best = jnp.argmin(costs + UNUSUAL_SIZE * (jnp.log(tried) / SIZE_STD) ** 2)
-    return Start(poses[best], tried[best], costs[best])
+        found = jax.lax.fori_loop(0, num_steps, step, pose)
+        return found, explained(judging_camera, judged, forward_kinematics(found, hand), found, scale)
+
+    return jax.vmap(refine)(*batch)
+
+
+def explained(
+    camera: Pinhole,
+    observed: Float[Array, "rows cols"],
+    hand: HandKinematics,
+    pose: Float[Array, " 22"],
+    scale: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Mean error in metres over the readings of an image that a hand and its forearm leave.
+
+    The forearm runs from the wrist to the farthest reading beyond it, along the mean of those readings: bent at the
+    wrist as it may be, and as short as the recording shows it.
+    """
+    wrist, away = pose[:3], quaternion_to_matrix(quaternion_normalize(pose[3:7]))[:, 1]
+    points = camera.rays() * jnp.where(jnp.isfinite(observed), observed + FOREARM_DEPTH, 0.0)[..., None] - wrist
+    beyond = jnp.isfinite(observed) & (points @ away > 0.01)
+    count = jnp.sum(beyond)
+    mean = jnp.sum(jnp.where(beyond[..., None], points, 0.0), axis=(0, 1)) / jnp.maximum(count, 1)
+    direction = jnp.where(count > FEWEST_ARM_PIXELS, mean / jnp.maximum(jnp.linalg.norm(mean), 1e-6), away)
+    radius = FOREARM_RADIUS * scale
+    length = jnp.max(jnp.where(beyond, points @ direction, 0.0)) - radius
+    end = wrist + jnp.where(count > FEWEST_ARM_PIXELS, jnp.maximum(length, 1e-3), 1e-3) * direction
+    inner = jnp.where(length > 0, radius, 0.5 * radius)
+    limbs = Capsules(
+        start=jnp.concatenate([hand.capsules.start, wrist[None]]),
+        end=jnp.concatenate([hand.capsules.end, end[None]]),
+        radius=jnp.concatenate([hand.capsules.radius, inner[None]]),
+    )
+    terms = compare_capsules(camera, limbs, observed, MAX_ERROR)
+    readings = count_observed(observed)
+    missed = MAX_ERROR * (readings - terms.overlap_count)
+    return (terms.absolute_sum + missed) / jnp.maximum(readings, 1)
+
+
+def _near(camera: Pinhole, observed: Float[Array, "rows cols"], center: Float[Array, " 3"]) -> Array:
+    """The readings near the palm; background where they are farther away, else unknown."""
+    points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
+    outside = jnp.sum((points - center) ** 2, axis=-1) > SEARCH_RADIUS**2
+    kept = jnp.where(outside, jnp.nan, observed)
+    return jnp.where(observed > center[2] + SEARCH_RADIUS, jnp.inf, kept)
+
+
+def _without_arm(camera: Pinhole, observed: Float[Array, "rows cols"], pose: Float[Array, " 22"]) -> Target:
+    """The image without what lies beyond the wrist of a pose, which would pull the palm down the arm."""
+    points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
+    along = (points - pose[:3]) @ quaternion_to_matrix(quaternion_normalize(pose[3:7]))[:, 1]
+    arm = jnp.isfinite(observed) & (along > 0.02)
+    return target_from_image(camera, jnp.where(arm, jnp.nan, observed))
+
+
+def _distinct(tried: Hypotheses, costs: Float[np.ndarray, " h"]) -> np.ndarray:
+    """Indices of the cheapest hypotheses of which no two are nearly the same, at most `NUM_FINALISTS`."""
+    kept: list[int] = []
+    for i in np.argsort(costs):
+        pose, side = tried.poses[i], tried.sides[i]
+        if not np.isfinite(costs[i]):
+            continue
+        for j in kept:
+            other = tried.poses[j]
+            turn = 2 * math.acos(min(1.0, abs(float(pose[3:7] @ other[3:7]))))
+            near = np.linalg.norm(pose[:3] - other[:3]) < 0.02 and turn < math.radians(25)
+            if side == tried.sides[j] and near and np.abs(pose[7:] - other[7:]).mean() < math.radians(20):
+                break
+        else:
+            kept.append(int(i))
+        if len(kept) == NUM_FINALISTS:
+            break
+    return np.asarray(kept, int)
 
 
 def _every(stride: int, camera: Pinhole, observed: Array) -> tuple[Pinhole, Array]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Protocol
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
@@ -24,6 +25,9 @@ class HandSurface(Protocol):
     def scaled(self, scale: float | Float[Array, ""]) -> "HandSurface":
         """The same hand with every length multiplied by `scale` (may be traced)."""
 
+    def of_side(self, side: Float[Array, ""]) -> "HandSurface":
+        """The same hand on the right (1) or on the left (-1); may be traced."""
+
     def compare(
         self, camera: Pinhole, pose: Float[Array, " 22"], observed: Float[Array, "rows cols"], max_error: float
     ) -> DepthTerms:
@@ -38,6 +42,9 @@ class CapsuleHand:
 
     def scaled(self, scale: float | Array) -> "CapsuleHand":
         return CapsuleHand(self.geometry.scaled(scale))
+
+    def of_side(self, side: Array) -> "CapsuleHand":
+        return CapsuleHand(replace(self.geometry, side=side))
 
     def compare(self, camera: Pinhole, pose: Array, observed: Array, max_error: float) -> DepthTerms:
         return compare_capsules(camera, forward_kinematics(pose, self.geometry).capsules, observed, max_error)
@@ -54,6 +61,11 @@ class MeshHand:
     def scaled(self, scale: float | Array) -> "MeshHand":
         parts = replace(self.parts, offsets=self.parts.offsets * scale, corners=self.parts.corners * scale)
         return MeshHand(self.geometry.scaled(scale), parts)
+
+    def of_side(self, side: Array) -> "MeshHand":
+        across = jnp.stack([side * self.geometry.side, jnp.ones_like(side), jnp.ones_like(side)])
+        parts = replace(self.parts, normals=self.parts.normals * across, corners=self.parts.corners * across)
+        return MeshHand(replace(self.geometry, side=side), parts)
 
     def compare(self, camera: Pinhole, pose: Array, observed: Array, max_error: float) -> DepthTerms:
         return compare_convex_parts(camera, self.parts, part_transforms(pose, self.geometry), observed, max_error)

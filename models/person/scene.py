@@ -78,3 +78,12 @@ def walkable(polygon: Float[Array, "n 2"], xy: Float[Array, "*batch 2"]) -> Bool
     rise = jnp.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])
     left_of = x < a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / rise
     return jnp.sum(spans & left_of, axis=-1) % 2 == 1
+
+
+def nearest_on_border(polygon: Float[Array, "n 2"], xy: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """The points of the border of a polygon that are nearest to floor points, inside or outside."""
+    corners, edges = polygon, jnp.roll(polygon, -1, axis=0) - polygon
+    along = jnp.sum((xy[..., None, :] - corners) * edges, axis=-1) / jnp.maximum(jnp.sum(edges**2, axis=-1), 1e-12)
+    points = corners + jnp.clip(along, 0.0, 1.0)[..., None] * edges
+    nearest = jnp.argmin(jnp.sum((points - xy[..., None, :]) ** 2, axis=-1), axis=-1)
+    return jnp.take_along_axis(points, nearest[..., None, None], axis=-2)[..., 0, :]

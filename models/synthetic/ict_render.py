@@ -83,6 +83,7 @@ def render_ict(
     weights: Float[Array, " expressions"],
     *,
     gain: Float[ArrayLike, ""] = 1.0,
+    light: Float[ArrayLike, " 3"] = LIGHT,
 ) -> UInt8[Array, "C rows cols"]:
     """What the cameras deliver: `round(gain * image + noise)`, clipped to 0..255.
 
@@ -97,13 +98,15 @@ def render_ict(
         pose: Of the head, millimetres and radians.
         weights: Strengths of the expressions.
         gain: Factor of the light.
+        light: Direction to the light in the world; of any length but 0.
     """
     skin_points = deformed(model, person, weights)
     lips = skin_points[model.landmarks[jnp.asarray(_INNER_LIPS)]]
     vertices = jnp.concatenate([skin_points, *head.eyes, _inside(lips), head.skull])
     world = place(vertices, pose)
-    light = jnp.asarray(LIGHT, world.dtype) / float(np.linalg.norm(LIGHT))
-    toward = jnp.maximum(jnp.sum(_normals(world, head.faces) * light, axis=-1), 0.0)
+    to_light = jnp.asarray(light, world.dtype)
+    toward = jnp.sum(_normals(world, head.faces) * to_light, axis=-1) / jnp.sqrt(jnp.sum(jnp.square(to_light)))
+    toward = jnp.maximum(toward, 0.0)
     attributes = jnp.concatenate([head.place, (AMBIENT + DIRECT * toward)[:, None]], axis=-1)
     clean = jnp.stack(
         [_seen_by(c, rig, world, head.faces, attributes, skin, background[c]) for c in range(rig.num_cameras)]

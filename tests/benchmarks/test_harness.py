@@ -55,6 +55,27 @@ def test_a_scenario_prints_its_table_and_writes_its_numbers(tmp_path, capsys):
     assert (tmp_path / "plot.txt").exists()
 
 
+def test_files_of_runs_become_a_page(tmp_path, capsys):
+    assert main(["two-numbers", "--json", str(tmp_path / "r.json")]) == 0
+    capsys.readouterr()
+    assert main(["--report", str(tmp_path)]) == 0
+    page = capsys.readouterr().out
+    assert "## two-numbers\n\nTwo numbers, quickly.\n\nOn " in page
+    assert "| `frame_ms` | 25 | ms | lower |" in page
+    assert "| `seed_given` | 0 | - | higher |" in page
+
+
+def test_a_page_of_nothing_or_of_other_files_is_refused(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other.json").write_text("[1, 2]")
+    for path, words in (("empty", "found none"), ("other.json", "expected the file of a run"), ("none", "cannot be")):
+        assert main(["--report", str(tmp_path / path)]) == 2
+        assert words in capsys.readouterr().err
+    for arguments in ([], ["two-numbers", "--report", str(tmp_path)]):
+        with pytest.raises(SystemExit, match="2"):
+            main(arguments)
+
+
 def test_help_lists_the_scenarios(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["--help"])

@@ -1,14 +1,18 @@
 """The scenario on heads before one camera: its arithmetic on made tracks."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.benchmarks.scenarios import _mono_runs, head_mono
+from jaxfilters.benchmarks.scenarios import _mono_detected, _mono_runs, head_mono
 from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
+from jaxfilters.models.face.multilinear import shape
+from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
+from jaxfilters.trackers.head.mono.detectors import Seen
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
 from jaxfilters.trackers.io.face_models import default_face_model
 
@@ -109,3 +113,38 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
         np.testing.assert_allclose(run.means, [2.0, 0, 0, 0, 0, 0], atol=1e-9)
         np.testing.assert_allclose(run.landmark_mm, 0, atol=1e-4)
         np.testing.assert_allclose(run.yaw_deg, np.degrees(0.1))
+
+
+def detected(errors, pnp, std, distance=600.0):
+    rows = lambda value: np.broadcast_to(np.asarray(value, float), (4, 6))
+    return _mono_detected.DetectedRun(rows(errors), rows(std), rows(pnp), np.full(4, distance), 0.25)
+
+
+def test_detected_people_stand_beside_solve_pnp():
+    """Two people 6 mm too near and 12 too far: sizes are averaged, the bias is that of signed shares."""
+    runs = [detected([0, 0, -6, 0, 3, 0], np.ones(6), 2.0), detected([0, 0, 12, 0, 4, 0], np.ones(6), 7.0)]
+    metrics = _mono_detected.detected_metrics("modelled", runs)
+    assert metrics["z_error_mm_modelled"].value == pytest.approx(9.0)
+    assert metrics["z_bias_share_modelled"].value == pytest.approx(0.5)
+    assert metrics["yaw_rms_deg_modelled"].value == pytest.approx(np.sqrt(12.5))
+    assert metrics["pnp_yaw_rms_deg_modelled"].value == pytest.approx(1.0)
+    assert metrics["pnp_z_error_mm_modelled"].value == pytest.approx(1.0)
+    assert metrics["coverage2_z_modelled"].value == pytest.approx(50.0)
+    assert metrics["lost_share_modelled"].value == pytest.approx(25.0)
+
+
+def test_solve_pnp_finds_the_mean_face_where_it_is():
+    face = default_face_model().model
+    pose = np.array([20.0, -10.0, 620.0, 0.1, 0.3, -0.2])
+    mean = shape(face, face.identity_mean, face.expression_mean)
+    points = np.asarray(project_shape(_mono_runs.camera(), mean, jnp.asarray(pose))[0][0], float)
+
+    class Detector:
+        errors = None
+
+        def detect(self, image, near):
+            return Seen(points) if image.any() else "no face"
+
+    found = _mono_detected.pnp(face, _mono_runs.camera(), Detector(), np.ones((480, 640), np.uint8))
+    np.testing.assert_allclose(found, pose, atol=0.02)
+    assert np.isnan(_mono_detected.pnp(face, _mono_runs.camera(), Detector(), np.zeros((480, 640), np.uint8))).all()

@@ -103,6 +103,13 @@ EXACT = {
         jnp.eye(1),
     ),
     "student_t": lambda noise: jf.student_t(jf.kalman(PRIOR, F, Q, H, covariance(noise)), 1e6),
+    # Errors that last for a thousandth of a step are white.
+    "correlated_noise": lambda noise: jf.correlated_noise(
+        jf.kalman(PRIOR, F, Q, H, jnp.zeros((1, 1))), jf.GaussMarkov(jnp.array(1e-3), jnp.square(noise)[None])
+    ),
+    "measurement_differencing": lambda noise: jf.measurement_differencing(
+        jf.kalman(PRIOR, F, Q, H, jnp.zeros((1, 1))), jf.GaussMarkov(jnp.array(1e-3), jnp.square(noise)[None])
+    ),
     "robust": lambda noise: jf.robust(extended(noise), 1e-7, jnp.array([[25.0]])),
     # Two modes of one model are that model.
     "imm": lambda noise: jf.imm([extended(noise)] * 2, [[0.9, 0.1], [0.4, 0.6]], [0.3, 0.7]),
@@ -118,6 +125,15 @@ SAMPLED = {
     ),
     "bootstrap": lambda noise: jf.bootstrap(
         sample_prior, sample_transition, log_likelihood_of(noise), num_particles=COUNT, noise=jf.StandardNormal(2)
+    ),
+    "correlated_bootstrap": lambda noise: jf.correlated_bootstrap(
+        sample_prior,
+        sample_transition,
+        observe,
+        jnp.zeros(1),
+        jf.GaussMarkov(jnp.array(1e-3), jnp.square(noise)[None]),
+        num_particles=COUNT,
+        noise=jf.StandardNormal(2),
     ),
     "guided": lambda noise: jf.guided(
         *guided_model(noise), log_transition=log_transition, proposal=jf.proposals.linearized(*linear(noise)), **SIZES

@@ -293,7 +293,7 @@ def face_track(face_model):
     project = jax.vmap(partial(project_shape, nominal()))
     std = np.array([0.5, 0.5, 2.0, 0.01, 0.02, 0.02])
     pose = (poses + rng.normal(0, std, poses.shape)).astype(np.float32)
-    status = np.repeat([0, 1, 2, 4, 2, 3, 2], [2, 13, 5, 1, 9, 3, FRAMES - 33]).astype(np.int32)
+    status = np.repeat([0, 1, 2, 5, 2, 3, 2], [2, 13, 5, 1, 9, 3, FRAMES - 33]).astype(np.int32)
     tracked = (status == 1) | (status == 2)
 
     def known(values, where=tracked):
@@ -308,8 +308,8 @@ def face_track(face_model):
         deformation=known(1e-3 * a),
         shape=known(1e-3 * shapes),
         image_points=known(project(shapes, jnp.asarray(pose))[0]),
-        score=known(0.85 - 0.1 * rng.random(FRAMES), status != 4),
-        effective_sample_size=known(np.full(FRAMES, 300.0), status != 4),
+        score=known(0.85 - 0.1 * rng.random(FRAMES), status != 5),
+        effective_sample_size=known(np.full(FRAMES, 300.0), status != 5),
         status=status,
     )
     return track, HeadTruth(metres * poses, np.asarray(project(shapes, jnp.asarray(poses, jnp.float32))[0]))

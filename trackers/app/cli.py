@@ -68,6 +68,8 @@ def _command_of(options: argparse.Namespace) -> Callable[[argparse.Namespace], s
         ("fit", "noise"): ("fitting.noise", "fit_noise"),
         ("fit", "gestures"): ("gestures.command", "fit_gestures"),
         ("fit", "face-model"): ("fitting.face_model", "fit"),
+        ("fit", "face-detector"): ("fitting.face_detector", "fit_detector"),
+        ("view", None): ("app.viewer", "view"),
     }
     kind = options.source if options.command == "fit" else None
     module, name = modules[options.command, kind]
@@ -106,6 +108,10 @@ def _parser() -> argparse.ArgumentParser:
     add_calibrate(commands, image_size)
     add_fit(commands, seed)
     add_recognise(commands, seed)
+    view = commands.add_parser("view", help="the results of a run as one page for a browser")
+    view.add_argument("folder", type=Path, metavar="DIR", help="folder of the results of any tracker")
+    view.add_argument("--out", type=Path, metavar="FILE.html", help="where to write the page (default: DIR/view.html)")
+    view.add_argument("--no-open", action="store_false", dest="open", help="do not open it in a browser")
     commands.add_parser("bench", add_help=False, help="measure speed and accuracy (bench --help lists scenarios)")
     return parser
 

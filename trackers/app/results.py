@@ -118,7 +118,7 @@ class TrackWriter:
             for first, part in list(self._with_first_frames())[self._saved :]:
                 checkpoint.write_npz(_part_path(self._path, first), part._asdict())
             # The state comes last: rows without it are written again.
-            checkpoint.save(state_path(self._path), state, meta)
+            checkpoint.save(checkpoint.state_path(self._path), state, meta)
         self.frames_saved, self._saved = self.frames, len(self._parts)
 
     def finish(self, report: dict[str, Any], **arrays: np.ndarray) -> None:
@@ -186,7 +186,7 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
     """
     output = OutputFolder(folder)
     try:
-        path = state_path(folder)
+        path = checkpoint.state_path(folder)
         if not overwrite and path.exists() and not (meta := checkpoint.load_meta(path))["complete"]:
             raise CheckpointError(
                 f"{folder} holds an unfinished run of {meta['frames']} frames: continue it with --resume, "
@@ -232,24 +232,12 @@ def resume(folder: Path, run: dict[str, Any], table: TrackTable) -> tuple[TrackW
     """
     output = OutputFolder(folder)
     try:
-        check_same_run(folder, run)
-        state, meta = checkpoint.load(state_path(folder))
+        checkpoint.check_same_run(folder, run)
+        state, meta = checkpoint.load(checkpoint.state_path(folder))
         return TrackWriter(output, run, table, _saved_parts(folder, table, meta["frames"])), state
     except BaseException:
         output.close()
         raise
-
-
-def check_same_run(folder: Path, run: dict[str, Any]) -> None:
-    """Whether the run whose checkpoint lies in `folder` may be continued by another one.
-
-    Raises:
-        CheckpointError: It was of another input, configuration or version, or its checkpoint is damaged.
-    """
-    was = checkpoint.load_meta(state_path(folder)).get("run", {})
-    if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
-        changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
-        raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
 
 
 def versions() -> dict[str, str]:
@@ -264,7 +252,7 @@ def versions() -> dict[str, str]:
 
 def can_resume(folder: Path) -> bool:
     """Whether `folder` holds a checkpoint."""
-    return state_path(folder).exists()
+    return checkpoint.state_path(folder).exists()
 
 
 def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[Any]:
@@ -287,11 +275,6 @@ def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[Any]:
 
 def _checkpoint_folder(folder: Path) -> Path:
     return folder / "checkpoint"
-
-
-def state_path(folder: Path) -> Path:
-    """Where a folder of results has the state of its tracker."""
-    return _checkpoint_folder(folder) / "state.npz"
 
 
 def _part_path(folder: Path, first: int) -> Path:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxfilters.trackers.io.errors import OutputError
 
-STATUS_COLORS = ((0, 200, 255), (110, 220, 90), (84, 92, 255))
+STATUS_COLORS = ((0, 200, 255), (110, 220, 90), (84, 92, 255), (0, 140, 255))
 """Blue, green, red, in the order of `STATUS_NAMES`."""
 _TALLEST_PX = 720
 """Images side by side are shrunk to this height."""

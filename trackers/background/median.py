@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from jaxfilters.trackers.background.difference import Difference
+from jaxfilters.trackers.background.gain import without_gain
 from jaxfilters.trackers.background.temporal_median import temporal_median
 
 SHADOW_PROBABILITY = 0.3
@@ -23,7 +24,7 @@ class MedianBackground:
     The background is the exact median of samples first. From then on it follows by steps of one level towards each
     image (McFarlane & Schofield 1995, approximate median), a tenth as often where there is foreground. A camera that
     was not primed starts with its first image and with probabilities near one half, and is sure after `SAMPLES`
-    samples.
+    samples. Every image is compared in the light of the background, by one factor a channel.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class MedianBackground:
         """As `Background.apply`."""
         if self._sure < 1:
             self._settle(image)
+        image = self._in_same_light(image)
         probability = self.compare(image)
         self._frames += 1
         if self._sure == 1 and self._learn_every and self._frames % self._learn_every == 0:
@@ -97,6 +99,13 @@ class MedianBackground:
             return
         self._difference.set_background(state["background"].copy(), state["noise"].copy())
         self._frames, self._sure = int(state["counts"][0]), float(state["counts"][1])
+
+    def _in_same_light(self, image: np.ndarray) -> np.ndarray:
+        """Exposure and lamps change within a frame, the background by a level in ten frames."""
+        background = self.image
+        if background is None or image.shape != background.shape or image.dtype != np.uint8:
+            return image  # `compare` says what is wrong.
+        return without_gain(image, background)
 
     def _settle(self, image: np.ndarray) -> None:
         """Samples are costly to combine: as often as it matters, when their number has doubled."""

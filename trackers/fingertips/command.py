@@ -20,7 +20,7 @@ from jaxfilters.trackers.fingertips.files import FingertipFiles, read_events
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
 from jaxfilters.trackers.fingertips.input import DemoHand, open_hands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures
-from jaxfilters.trackers.fingertips.session import FingertipSession
+from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.head.common.outcome import finite
@@ -49,7 +49,14 @@ def track(options: argparse.Namespace) -> str:
         KeyboardInterrupt: before anything was tracked.
     """
     symbols = _symbols(options.gestures)
-    source = open_hands(options.video_source, options.mask, fps=options.fps, seed=options.seed)
+    source = open_hands(
+        options.video_source,
+        options.mask,
+        fps=options.fps,
+        seed=options.seed,
+        keypoints=options.keypoints,
+        image_size=options.image_size,
+    )
     files = FingertipFiles(options.out, _identity(source, options), resume=options.resume)
     began = time.perf_counter()
     try:
@@ -62,6 +69,7 @@ def track(options: argparse.Namespace) -> str:
             num_hands=options.hands,
             height=float(source.image_size[1]),
             fps=source.fps,
+            config=dataclasses.replace(USUAL, posture=user.posture),
             recogniser=recogniser_of(symbols),
         )
         followed = _follow(source, user, session, files, options)
@@ -86,7 +94,9 @@ def recogniser_of(file: SymbolsFile) -> Recogniser:
 
     def recognise(stroke: Stroke) -> Recognised:
         if file.dimensions:
-            found = coded.recognise_path(file.symbols, stroke.points, stroke.counts)
+            # Symbols with margins of their own need no common one.
+            margin = coded.MARGIN if file.symbols.margins is None else 0.0
+            found = coded.recognise_path(file.symbols, stroke.points, stroke.counts, margin=margin)
         else:
             found = coded.recognise(file.symbols, stroke.codes, stroke.counts, margin=0.0)
         label = int(found.label)
@@ -200,7 +210,7 @@ def _report(
         "trouble": [trouble] if (trouble := source.trouble()) else [],
         "open_hand": user.has_open_hand,
         "hand": dataclasses.asdict(user.parameters),
-        "mask": options.mask,
+        "mask": None if options.keypoints else options.mask,
         "gestures": str(options.gestures),
         "config": dataclasses.asdict(session.config) | {"posture": session.config.posture._asdict()},
         "versions": versions(),

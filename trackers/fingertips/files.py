@@ -10,13 +10,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from jaxfilters.trackers.app.results import (
-    CHECKPOINT_EVERY_S,
-    OutputFolder,
-    can_resume,
-    check_same_run,
-    state_path,
-)
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, OutputFolder, can_resume
 from jaxfilters.trackers.fingertips.events import Event
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.io import checkpoint
@@ -54,8 +48,8 @@ class FingertipFiles:
         """What `checkpoint` was given before the interruption; None where the run begins anew."""
         try:
             if resume and can_resume(folder):
-                check_same_run(folder, run)
-                self.saved, meta = checkpoint.load(state_path(folder))
+                checkpoint.check_same_run(folder, run)
+                self.saved, meta = checkpoint.load(checkpoint.state_path(folder))
                 self._tips, self._events = (_cut(path, meta["bytes"]) for path in (self.tips, self.events))
             elif self.tips.exists():
                 raise OutputError(f"{self.tips}: holds the tips of another run; choose another --out, or --resume.")
@@ -79,7 +73,7 @@ class FingertipFiles:
         """
         if time.monotonic() - self._saved_at < CHECKPOINT_EVERY_S:
             return
-        path = state_path(self._folder)
+        path = checkpoint.state_path(self._folder)
         sizes = {file.name: file.stat().st_size for file in (self.tips, self.events)}
 
         def save() -> None:

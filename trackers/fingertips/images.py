@@ -1,7 +1,7 @@
 """From images of hands over a desk to what they show of each hand, and what is estimated of the user beforehand."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -10,11 +10,13 @@ import numpy as np
 from jaxfilters.models.fingertip.detection import detect_hands
 from jaxfilters.models.fingertip.first_image import fit_hand_parameters, fit_hand_to_mask
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
+from jaxfilters.models.fingertip.keypoints import KEYPOINT_POSTURE
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold
 from jaxfilters.models.fingertip.skin import fit_skin_model, skin_mask
-from jaxfilters.models.fingertip.thumb import ThumbAngles, calibrated, usual
+from jaxfilters.models.fingertip.thumb import POSTURE, Posture, ThumbAngles, calibrated, usual
 from jaxfilters.trackers.fingertips.events import Event, Recogniser
+from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, hands_of, parameters_of
 from jaxfilters.trackers.fingertips.session import FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
 
@@ -33,6 +35,8 @@ class User(NamedTuple):
     segment: Segment
     has_open_hand: bool
     """Whether an open hand was observed; otherwise the parameters are the usual ones."""
+    posture: Posture = POSTURE
+    """Of people's thumbs and forefingers, as what the images are segmented by shows them."""
 
 
 def track(
@@ -77,7 +81,7 @@ def track(
     return jax.tree.map(lambda *rows: np.concatenate(rows), *reports), session.events
 
 
-def estimate_user(images: Sequence[np.ndarray], mask: str) -> User:
+def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> User:
     """The user's hand and the desk from images in which the hand is open at some time.
 
     Raises:
@@ -88,6 +92,8 @@ def estimate_user(images: Sequence[np.ndarray], mask: str) -> User:
         raise ValueError(f"mask: expected one of {', '.join(kinds)}; got {mask!r}.")
     if not len(images):
         raise ValueError("no image.")
+    if isinstance(images[0], HandKeypoints):
+        return User(*_of_keypoints(images), KEYPOINT_POSTURE)
     usual_user, why = None, ""
     for image in images:
         try:
@@ -106,14 +112,22 @@ def estimate_user(images: Sequence[np.ndarray], mask: str) -> User:
 def angles_of(user: User) -> ThumbAngles:
     """The angles by which thumbs are known: the user's own, or the usual ones where no open hand was visible."""
     if not user.has_open_hand:
-        return usual()
-    return calibrated(np.array([user.parameters.phi_thumb]), np.array([user.parameters.phi_index]))
+        return usual(user.posture)
+    thumb, index = np.array([user.parameters.phi_thumb]), np.array([user.parameters.phi_index])
+    return calibrated(thumb, index, user.posture)
 
 
-def hands_in(image: np.ndarray, user: User, num_hands: int) -> HandObservation:
-    """What an image shows of each hand, (1, hands, ...) as a session wants it."""
+def hands_in(image: np.ndarray | HandKeypoints, user: User, num_hands: int) -> HandObservation:
+    """What an image, or a frame of keypoints, shows of each hand, (1, hands, ...) as a session wants it."""
+    if isinstance(image, HandKeypoints):
+        return hands_of(image, num_hands)
     found = detect_hands(user.segment(image), user.parameters, capacity=num_hands)
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves])[None], *found)
+
+
+def _of_keypoints(frames: Sequence[Any]) -> tuple[HandParameters, Segment, bool]:
+    parameters, is_open = parameters_of(list(frames))
+    return parameters, lambda image: image, is_open
 
 
 def _grey(image: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Where images of hands over a desk come from."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 
 from jaxfilters.models.synthetic.desk_hand import DeskFrame, desk_video
 from jaxfilters.models.synthetic.desk_script import script
+from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, drawn_keypoints, open_keypoints
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.video_input import LiveCamera, open_video
@@ -93,12 +95,26 @@ class LiveHands:
         return self._camera.trouble()
 
 
-def open_hands(place: str | None, mask: str, *, fps: float | None, seed: int) -> Any:
-    """The source of images that a command was given.
+def open_hands(
+    place: str | None,
+    mask: str,
+    *,
+    fps: float | None,
+    seed: int,
+    keypoints: Path | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> Any:
+    """The source of images, or of keypoints, that a command was given.
 
     Raises:
-        InputError: nothing there, nothing that can be read, or a mask that does not go with it.
+        InputError: nothing there, nothing that can be read, or a mask or size that does not go with it.
     """
+    if keypoints is not None:
+        if mask != "infrared":
+            raise InputError(f"--mask {mask}: of no use with --keypoints, which need no mask.")
+        return open_keypoints(keypoints, place, fps=fps, image_size=image_size)
+    if image_size is not None:
+        raise InputError("--image-size: of --keypoints only.")
     if place is None:
         if mask != "infrared":
             raise InputError(f"--mask {mask}: of no use without a video; the synthetic hand is an infrared image.")
@@ -111,8 +127,10 @@ def open_hands(place: str | None, mask: str, *, fps: float | None, seed: int) ->
     return LiveHands(source) if isinstance(source, LiveCamera) else source
 
 
-def shown(image: np.ndarray) -> np.ndarray:
-    """A picture (rows, cols, 3) of an image that is one, or of depths."""
+def shown(image: np.ndarray | HandKeypoints) -> np.ndarray:
+    """A picture (rows, cols, 3) of an image that is one, of depths or of keypoints."""
+    if isinstance(image, HandKeypoints):
+        return drawn_keypoints(image)
     if image.ndim == 3:
         return image
     near = np.isfinite(image) & (image > 0)

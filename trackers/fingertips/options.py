@@ -1,7 +1,9 @@
 """The options of `jaxfilters track fingertips`, apart from what carries them out so that `--help` answers at once."""
 
 import argparse
+from pathlib import Path
 
+from jaxfilters.trackers.app.argument_types import image_size
 from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
 
 
@@ -20,6 +22,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="infrared",
         help="how hands differ from the desk: they are the brightest (infrared, or a dark desk; default), they lie "
         "above it (depth: 16-bit PNGs with camera.json, or .npz), or they have the colour of skin",
+    )
+    parser.add_argument(
+        "--keypoints",
+        type=Path,
+        metavar="FILE",
+        help="of a detector in place of images: folder of OpenPose's *_keypoints.json, or .json or .csv of MediaPipe's "
+        "hand landmarks; VIDEO is then what they are drawn on",
+    )
+    parser.add_argument(
+        "--image-size",
+        type=image_size,
+        metavar="WIDTHxHEIGHT",
+        help="of the images that keypoints without VIDEO are of",
     )
     parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="how many at most (default: %(default)s)")
     parser.add_argument(

@@ -9,6 +9,8 @@ from jaxfilters.trackers.gestures.options import add_fit_gestures
 
 IDENTITIES, EXPRESSIONS, PEOPLE = 15, 5, 200
 """What the model that comes with the package was made with."""
+RENDERED_PEOPLE, RENDERED_IMAGES = 60, 10
+"""What the detectors' errors that come with the package were measured on."""
 
 
 def add_fit(commands: Any, seed: Callable[[str], int]) -> None:
@@ -57,8 +59,32 @@ def add_fit(commands: Any, seed: Callable[[str], int]) -> None:
         metavar="PEOPLE.npz",
         help="a file to write of who the people of DATA are, so that `jaxfilters track head-mono --known` knows them",
     )
+    _add_face_detector(what, seed)
     add_fit_gestures(what, seed)
     _add_noise(what, seed)
+
+
+def _add_face_detector(what: Any, seed: Callable[[str], int]) -> None:
+    detector = what.add_parser("face-detector", help="by how much detectors misplace the landmarks of faces")
+    detector.add_argument(
+        "data", type=Path, metavar="DATA", help="folder with the ICT face model, whose people are rendered"
+    )
+    detector.add_argument("--out", type=Path, required=True, metavar="ERRORS.npz", help="the file to write")
+    detector.add_argument(
+        "--people",
+        type=positive_integer,
+        default=RENDERED_PEOPLE,
+        metavar="N",
+        help="how many to draw (default: %(default)s)",
+    )
+    detector.add_argument(
+        "--images",
+        type=positive_integer,
+        default=RENDERED_IMAGES,
+        metavar="N",
+        help="of each of them, in several poses, lights and expressions (default: %(default)s)",
+    )
+    detector.add_argument("--seed", type=seed, default=0, metavar="SEED", help="of the people (default: %(default)s)")
 
 
 def _add_noise(what: Any, seed: Callable[[str], int]) -> None:

@@ -2,13 +2,25 @@
 
 import argparse
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from jaxfilters.models.gesture.calibration import calibration_error
 from jaxfilters.models.gesture.coded import codes_of, recognise_each
-from jaxfilters.models.gesture.learning import LeftOut, accuracy, learn_strokes, leave_one_out
+from jaxfilters.models.gesture.learning import (
+    Judged,
+    LeftOut,
+    accuracy,
+    calibrated,
+    cross_calibrated,
+    judged,
+    learn_strokes,
+    leave_one_out,
+    together,
+)
 from jaxfilters.models.gesture.stroke import Drawn, to_judge
 from jaxfilters.models.gesture.symbols import Recognition, extended, recognise_all
 from jaxfilters.models.synthetic.strokes import drawn, tracked
@@ -16,12 +28,14 @@ from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
 from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
-from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
+from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes, usable
 
 COLUMNS = ("stroke", "symbol", "confidence", "lead_nats", "label")
 """Of a table: the symbol is empty where a stroke is rejected; the label is what the data call it."""
 _MOST_ROWS, _MOST_WARNINGS = 40, 5
 _SHOWN_TRIALS = 2
+MARGINS = (-0.4, -0.2, 0.0, 0.2, 0.4)
+"""Nats a point, for the table of people left out."""
 
 
 def fit_gestures(options: argparse.Namespace) -> str:
@@ -42,7 +56,8 @@ def fit_gestures(options: argparse.Namespace) -> str:
         before = read_symbols(options.add) if options.add else None
         if before and before.dimensions != examples.dimensions:
             raise InputError(
-                f"--add: {options.add} is of strokes in {before.dimensions} dimensions, DATA in {examples.dimensions}."
+                f"--add: {options.add} has models of {_features(before.dimensions)}, DATA are for models of "
+                f"{_features(examples.dimensions)}."
             )
         states = before.symbols.models.log_initial.shape[-1] if before else options.states
         floor = before.min_variance if before else None
@@ -55,18 +70,24 @@ def fit_gestures(options: argparse.Namespace) -> str:
                 min_variance=floor,
             )
         )
+        lines = []
+        if options.held_out:
+            found = _held_out(examples, options.states, ways)
+            trained = as_input_error(lambda: calibrated(trained, together([one.scores for one in found])))
+            lines = _of_held_out(judged(found))
+        elif options.data:
+            drawings = (examples.strokes, examples.labels, examples.people)
+            trained = as_input_error(lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=ways))
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
         symbols = as_input_error(lambda: extended(before.symbols, trained)) if before else trained
         source = f"{before.source}; {source}" if before else source
         write_symbols(options.out, SymbolsFile(symbols, source, parameters))
         num_models, num_states = symbols.models.log_initial.shape
-        lines = [
+        summary = [
             f"{source}: {len(examples.strokes)} strokes of {len(trained.names)} symbols",
             f"{len(symbols.names)} symbols, {num_models} models of {num_states} states",
         ]
-        if options.held_out:
-            lines += _held_out(examples, options.states, ways)
-    return "\n".join([*lines, f"model in {options.out}"])
+    return "\n".join([*summary, *lines, f"model in {options.out}"])
 
 
 def recognise(options: argparse.Namespace) -> str:
@@ -80,7 +101,7 @@ def recognise(options: argparse.Namespace) -> str:
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
-    strokes = _read(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
+    strokes = _to_recognise(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
     found = as_input_error(lambda: _judged(file, strokes, options.margin))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
@@ -92,21 +113,35 @@ def recognise(options: argparse.Namespace) -> str:
     ]
     if len(rows) > _MOST_ROWS:
         lines.append(f"... and {len(rows) - _MOST_ROWS} more")
-    return "\n".join([*lines, _summary(rows), *([f"table in {options.out}"] if options.out else [])])
+    return "\n".join(
+        [*lines, _summary(strokes, file.symbols.names, found), *([f"table in {options.out}"] if options.out else [])]
+    )
 
 
-def _read(path: Path) -> StrokeSet:
-    strokes = read_strokes(path)
-    for text in strokes.warnings[:_MOST_WARNINGS]:
+def _features(dimensions: int) -> str:
+    if not dimensions:
+        return "direction codes and numbers of fingertips"
+    return f"the shapes of strokes in {dimensions} dimensions ({3 * dimensions + 2} features a point)"
+
+
+def _warned(path: Path, warnings: Sequence[str]) -> None:
+    for text in warnings[:_MOST_WARNINGS]:
         warn(text)
-    if len(strokes.warnings) > _MOST_WARNINGS:
-        warn(f"{path}: {len(strokes.warnings) - _MOST_WARNINGS} more such segments")
+    if len(warnings) > _MOST_WARNINGS:
+        warn(f"{path}: {len(warnings) - _MOST_WARNINGS} more such strokes")
+
+
+def _to_recognise(path: Path) -> StrokeSet:
+    strokes = read_strokes(path)
+    _warned(path, [*strokes.warnings, *(f"{fault}; it is rejected" for fault in strokes.faults if fault)])
     return strokes
 
 
 def _examples(options: argparse.Namespace) -> tuple[StrokeSet, str]:
     if options.data:
-        return _read(options.data), options.data.name
+        examples = usable(read_strokes(options.data))
+        _warned(options.data, examples.warnings)
+        return examples, options.data.name
     return _drawn(WRITERS, TRIALS, options.seed), "symbols drawn by the generator"
 
 
@@ -143,14 +178,18 @@ def _row(names: tuple[str, ...], strokes: StrokeSet, found: Recognition, i: int)
     return strokes.ids[i], *found_symbol, f"{lead:.3f}" if np.isfinite(lead) else "", strokes.labels[i]
 
 
-def _summary(rows: list[tuple[str, ...]]) -> str:
-    rejected = sum(not row[1] for row in rows)
-    summary = f"{len(rows)} strokes, {rejected} rejected"
-    labelled = [row for row in rows if row[4]]
-    if not labelled:
+def _summary(strokes: StrokeSet, names: tuple[str, ...], found: Recognition) -> str:
+    """Of strokes with a label: how many are right as `fit gestures --held-out` counts them."""
+    accepted, labels = np.asarray(found.label) >= 0, np.array(strokes.labels)
+    summary = f"{len(labels)} strokes, {np.sum(~accepted)} rejected"
+    labelled = labels != ""
+    if not labelled.any():
         return summary
-    right = sum(row[1] == row[4] for row in labelled)
-    return f"{summary}; of {len(labelled)} with a label {right} are right, {100 * right / len(labelled):.1f} %"
+    best = np.array(names)[np.argmax(found.log_likelihood, axis=0)]
+    # A stroke without features has no symbol.
+    right = (best == labels)[labelled] & np.isfinite(np.asarray(found.lead))[labelled]
+    share = f"{100 * right.mean():.2f} % right if none is rejected"
+    return f"{summary}; of {labelled.sum()} with a label {share}; {_of_accepted(right, accepted[labelled])}"
 
 
 def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
@@ -162,15 +201,32 @@ def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}.") from None
 
 
-def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[str]:
-    found: list[LeftOut] = as_input_error(
-        lambda: leave_one_out(
-            examples.strokes,
-            examples.labels,
-            examples.people,
-            num_states=states,
-            num_variants=ways,
-        )
+def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[LeftOut]:
+    return as_input_error(
+        lambda: leave_one_out(examples.strokes, examples.labels, examples.people, num_states=states, num_variants=ways)
     )
-    lines = [f"  {one.person}: {100 * one.right / one.total:.1f} % of {one.total}" for one in found]
-    return [f"people left out in turn: {accuracy(found):.2f} % right", *lines]
+
+
+def _of_held_out(found: list[Judged]) -> list[str]:
+    """What `recognise` does with strokes of people whom a model does not know, for several margins."""
+    right, confidence, beyond = (
+        np.concatenate([getattr(one, name) for one in found]) for name in ("right", "confidence", "beyond")
+    )
+    lines = [
+        f"people left out in turn: {accuracy(found):.2f} % right if none is rejected; "
+        f"{_of_accepted(right, beyond >= 0)}; confidence is off by {calibration_error(confidence, right):.3f}",
+        "  --margin  accepted  right of these",
+    ]
+    for margin in MARGINS:
+        accepted = beyond >= margin
+        share = f"{100 * right[accepted].mean():.2f} %" if accepted.any() else "-"
+        lines.append(f"  {margin:8.2f}  {100 * accepted.mean():6.2f} %  {share}")
+    for one in found:
+        own = f"{100 * one.right.mean():.1f} % of {len(one.right)}"
+        lines.append(f"  {one.person}: {own}; {_of_accepted(one.right, one.beyond >= 0)}")
+    return lines
+
+
+def _of_accepted(right: np.ndarray, accepted: np.ndarray) -> str:
+    share = f", {100 * right[accepted].mean():.2f} % of these right" if accepted.any() else ""
+    return f"{100 * accepted.mean():.2f} % accepted{share}"

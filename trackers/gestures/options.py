@@ -54,7 +54,8 @@ def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
         type=finite_number,
         default=0.0,
         metavar="NATS",
-        help="a point by which a symbol has to beat what all of them are made of (default: %(default)s)",
+        help="a point by which a symbol has to beat what all of them are made of, beside its own margin, which `fit "
+        "gestures` measures (default: %(default)s)",
     )
     recognise.add_argument(
         "--seed", type=seed, default=1, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilters.trackers.app.options import config_from_args
+from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
+from jaxfilters.trackers.hand_depth.detect import check_unit
 from jaxfilters.trackers.hand_depth.drawing import write_overlay
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.hand_depth.summary import mean_joint_error, write_summary
@@ -38,6 +40,8 @@ def spec(options: argparse.Namespace) -> RunSpec:
     """
     config = as_input_error(partial(config_from_args, hand_depth.HandDepthConfig, options))
     sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
+    if warning := as_input_error(partial(check_unit, sequence[0])):
+        warn(f"{sequence.name}: {warning}")
     return RunSpec(
         sequence,
         as_input_error(partial(hand_depth.build, sequence.camera, config)),

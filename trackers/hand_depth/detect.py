@@ -1,59 +1,126 @@
-"""Where in a depth frame a hand may be: the nearest object, its palm, and the arm behind it."""
+"""Where in a depth frame a hand may be: surfaces without a jump in depth, and where these are as wide as a palm."""
+
+from typing import NamedTuple
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.start import Sighting
 
-NEAREST, FARTHEST = 0.15, 1.5
+NEAREST, FARTHEST = 0.15, 2.0
 """Metres between which a hand is looked for."""
-OBJECT_DEPTH = 0.25
-"""Metres behind its nearest point that an arm may reach and still be the same object."""
+JUMP = 0.015
+"""Metres of depth between neighbouring pixels that separate two surfaces, at least."""
+STEEPEST = 4.0
+"""Depth over width from pixel to pixel that is still one surface."""
 SMALLEST_AREA = 0.002
 """Square metres of surface below which an object is not a hand."""
-MOST_SPECKS = 20
-"""Smaller things in front of the hand that are looked past."""
-PALM_SEARCH = 0.10
-"""Metres about the nearest points within which the palm is looked for."""
+LARGEST_AREA = 0.8
+"""Square metres above which it is a wall or a floor; a person who reaches out is one surface with the hand."""
+LARGEST_PART = 0.008
+"""Square metres above which another surface is not a finger before the palm."""
+PALM_INSET = (0.018, 0.065)
+"""Metres from the middle of a palm to the outline of the hand; a forearm has less than a body or a desk, too."""
+USUAL_INSET = 0.038
+APART = 0.07
+"""Metres between the middles of two palms that are tried."""
+MOST_SIGHTINGS = 3
+FARTHER = 0.6
+"""Metres behind the nearest of these places within which others are tried."""
+SKIN_TO_MIDDLE = 0.015
+"""Metres from the skin to the middle of the palm."""
 
 
-def nearest_hand(camera: Pinhole, frame: np.ndarray) -> Sighting | None:
-    """Palm and forearm of the nearest object of a hand's size in a frame (rows, cols) in metres; `None` without one.
+FEWEST_NEAR = 50
+"""Readings that may be noise."""
+TOO_NEAR, TOO_FAR = 0.3, 2.0
+"""Metres: no reading beyond the first, or none nearer than the second, is what a wrong unit of length gives."""
 
-    The palm is the point farthest from the object's outline (distance transform) among those near the object's nearest
-    points: a raised hand is nearer than its arm.
+
+def check_unit(frame: np.ndarray) -> str | None:
+    """A warning where all readings of a frame (metres) are too far away for any hand; `None` where they are not.
+
+    Raises:
+        ValueError: all readings are nearer than a depth camera can measure.
     """
-    candidates = np.where((frame > NEAREST) & (frame < FARTHEST), frame, np.inf)
-    for _ in range(MOST_SPECKS):
-        if not np.isfinite(candidates).any():
-            break
-        limit = candidates.min() + OBJECT_DEPTH
-        _, labels = cv2.connectedComponents((candidates < limit).astype(np.uint8))
-        label = labels[np.unravel_index(candidates.argmin(), candidates.shape)]
-        mask = labels == label
-        area = np.sum(candidates[mask] ** 2) / float(np.prod(camera.focal))
-        if area > SMALLEST_AREA:
-            return _sighting(camera, candidates, mask)
-        candidates[mask] = np.inf  # a speck of noise
+    readings = frame[np.isfinite(frame)]
+    if not readings.size:
+        return None
+    near, far = np.sort(readings)[min(FEWEST_NEAR, readings.size - 1)], np.percentile(readings, 99)
+    if far < TOO_NEAR:
+        raise ValueError(f"depth must be in metres: no reading is beyond {far:.3g} m; is the unit off by ten or more?")
+    if near > TOO_FAR:
+        return f"no reading is nearer than {near:.3g} m, where no hand is looked for; is the unit of depth right?"
     return None
 
 
-def _sighting(camera: Pinhole, depth: np.ndarray, mask: np.ndarray) -> Sighting:
+class Sighting(NamedTuple):
+    """Something that may be a hand."""
+
+    center: np.ndarray
+    """(3,) metres, camera frame: the middle of the palm."""
+    frame: np.ndarray
+    """(rows, cols) metres: without other large surfaces, which are `inf` where they are farther away, else NaN."""
+
+
+def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
+    """Places of a palm's width in a frame (rows, cols) in metres, at most `MOST_SIGHTINGS`, the likeliest first.
+
+    Likely is what is near the camera and as wide as a palm (distance transform of its surface).
+    """
+    depth = _without_small_holes(frame)
+    depth = np.where((depth > NEAREST) & (depth < FARTHEST), depth, np.inf).astype(np.float32)
+    surfaces, area = _surfaces(depth, float(camera.focal[0]))
+    labels = np.where((area[surfaces] > SMALLEST_AREA) & (area[surfaces] < LARGEST_AREA), surfaces, 0)
+    inset = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, 5)
+    inset = np.where(labels > 0, inset * np.where(np.isfinite(depth), depth, 0.0) / float(camera.focal[0]), 0.0)
+    peaks = (inset >= cv2.dilate(inset.astype(np.float32), np.ones((5, 5), np.uint8)) - 1e-6) & (inset > PALM_INSET[0])
+    rows, cols = np.nonzero(peaks & (inset < PALM_INSET[1]))
+    if not len(rows):
+        return []
+    z = depth[rows, cols]
     fx, fy = np.asarray(camera.focal)
     cx, cy = np.asarray(camera.center)
-    v, u = np.nonzero(mask)
-    z = depth[v, u]
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
-    tip = points[z <= np.percentile(z, 2)].mean(axis=0)
-    inset = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)[v, u] * z / fx
-    inset[np.linalg.norm(points - tip, axis=-1) > PALM_SEARCH] = 0
-    center = points[inset.argmax()] + [0.0, 0.0, 0.015]  # from the skin to the middle of the palm
-    distance = np.linalg.norm(points - center, axis=-1)
-    arm = points[(distance > 0.11) & (distance < 0.25)]
-    forearm = np.zeros(3)
-    if len(arm) > 0.1 * np.sum(distance < 0.11):
-        forearm = arm.mean(axis=0) - center
-        forearm /= np.linalg.norm(forearm)
-    return Sighting(jnp.asarray(center, jnp.float32), jnp.asarray(forearm, jnp.float32))
+    centers = np.stack([(cols - cx) / fx * z, (rows - cy) / fy * z, z + SKIN_TO_MIDDLE], axis=-1)
+    cost = 3.0 * z + np.abs(np.log(inset[rows, cols] / USUAL_INSET))
+    chosen: list[int] = []
+    for i in np.argsort(cost):
+        if z[i] > z.min() + FARTHER:
+            continue
+        if all(np.linalg.norm(centers[i] - centers[j]) > APART for j in chosen):
+            chosen.append(int(i))
+        if len(chosen) == MOST_SIGHTINGS:
+            break
+    return [_sighting(frame, surfaces, area, centers[i], int(labels[rows[i], cols[i]])) for i in chosen]
+
+
+def _without_small_holes(frame: np.ndarray) -> np.ndarray:
+    """The frame with pixels that have no reading filled from their neighbours, two pixels deep."""
+    filled = np.where(np.isfinite(frame), frame, np.inf).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    near = cv2.dilate(np.where(np.isfinite(filled), filled, 0.0).astype(np.float32), kernel, iterations=2)
+    near = cv2.erode(near, kernel, iterations=2)
+    return np.where(np.isfinite(filled), filled, np.where(near > 0, near, np.inf))
+
+
+def _surfaces(depth: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, cols) int: numbers of the surfaces, 0 between them; and their areas in square metres, that of 0 being 0.
+
+    The farther one of two neighbours across a jump is taken out, so that what is in front keeps its shape.
+    """
+    near = cv2.erode(depth, np.ones((3, 3), np.uint8))
+    finite = np.isfinite(depth)
+    z = np.where(finite, depth, 1.0)
+    with np.errstate(invalid="ignore"):
+        jumps = finite & (depth - near > np.maximum(JUMP, STEEPEST * z / focal))
+    mask = (finite & ~jumps).astype(np.uint8)
+    count, labels = cv2.connectedComponents(mask, connectivity=4)
+    area = np.bincount(labels.ravel(), weights=np.where(mask > 0, (z / focal) ** 2, 0.0).ravel(), minlength=count)
+    return labels, np.where(np.arange(count) > 0, area, 0.0)
+
+
+def _sighting(frame: np.ndarray, surfaces: np.ndarray, area: np.ndarray, center: np.ndarray, label: int) -> Sighting:
+    # Small surfaces stay: fingers before the palm are separated from it by a jump.
+    other = (surfaces != label) & ((surfaces == 0) | (area[surfaces] > LARGEST_PART)) & np.isfinite(frame)
+    behind = np.where(frame > center[2], np.inf, np.nan)
+    return Sighting(center.astype(np.float32), np.where(other, behind, frame).astype(np.float32))

@@ -16,7 +16,9 @@ def add_tracker_options(parser: argparse.ArgumentParser) -> None:
     """Options that are None unless given, so that the defaults stand in one place, `HandDepthConfig`."""
     parser.add_argument("--filter", choices=("rbpf", "pf"), help="Rao-Blackwellized (default) or plain particle filter")
     parser.add_argument("--particles", type=int, dest="num_particles", metavar="N", help="number of particles")
-    parser.add_argument("--stride", type=int, metavar="PIXELS", help="compare every PIXELS-th row and column")
+    parser.add_argument(
+        "--stride", type=int, metavar="PIXELS", help="compare every PIXELS-th row and column (default: by distance)"
+    )
     parser.add_argument(
         "--scale", type=float, metavar="FACTOR", help="size of the hand, 1 = average adult (default: fitted)"
     )
@@ -33,5 +35,7 @@ def add_tracker_options(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "background", "unknown"),
         help="what pixels without a reading are (default: auto, background if more than half of the first frame)",
     )
-    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
+    parser.add_argument(
+        "--hand", choices=("right", "left", "auto"), help="which hand (default: auto, by what the depth shows)"
+    )
     add_seed(parser)

@@ -1,163 +1,62 @@
 """Hand pose from a depth camera: a particle filter on the pose, its velocity integrated out, guided by registration.
 
-The filter is `rao_blackwell_shared` on the 22-number hand with `HandMotion`; its likelihood renders every particle
-(Kajihara and Tanaka, with the union cost); its proposal looks at the image first (`guided`, `registration`).
+`filtering` holds the filter, `search` what finds the hand and doubts the track.
 """
 
 import math
+import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import chain, islice
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from jaxfilters import weights
-from jaxfilters._struct import pytree_dataclass
-from jaxfilters.filter import Filter
-from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.math.lie import quaternion_mean
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
-from jaxfilters.models.hand.motion import HandMotion, per_coordinate
-from jaxfilters.models.hand.observation import (
-    REACH,
-    HandImage,
-    HandLikelihood,
-    crop,
-    hand_image,
-    isolate,
-    union,
-)
-from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
-from jaxfilters.models.hand.skeleton import (
-    TANGENT_SIZE,
-    HandGeometry,
-    forward_kinematics,
-    hand_center,
-    hand_geometry,
-    local,
-    mirrored,
-    open_palm,
-    retract,
-)
-from jaxfilters.models.hand.start import SCALES, Sighting, Start, find_start
+from jaxfilters.models.hand.observation import HandLikelihood, union
+from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
-from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guided_rao_blackwell
-from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
-from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.trackers.hand_depth.detect import nearest_hand
+from jaxfilters.trackers.hand_depth.config import HandDepthConfig
+from jaxfilters.trackers.hand_depth.detect import check_unit
+from jaxfilters.trackers.hand_depth.filtering import (
+    FEWEST_PIXELS,
+    FRAME_INTERVAL,
+    LOST_COST,
+    MAX_ERROR,
+    PATIENCE,
+    SIGMA,
+    Setup,
+    TrackState,
+    build_filter,
+    filled,
+    look,
+    particles_of,
+    placed,
+    pose_moments,
+    standard_deviations,
+)
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
+from jaxfilters.trackers.hand_depth.search import race, search
 from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
-SEARCHING, TRACKING, LOST = range(3)
-
-
-@dataclass(frozen=True)
-class HandDepthConfig:
-    """Options of the tracker."""
-
-    filter: str = "rbpf"
-    """`rbpf` carries the velocity of each particle in a Kalman filter, `pf` has none."""
-    num_particles: int = 512
-    stride: int | None = None
-    """Every how many pixels one is compared; `None` chooses for a hand at 0.6 m to fill the window."""
-    seed: int = 0
-    hand: str = "right"
-    scale: float | None = None
-    """Size of the hand relative to the average adult's; `None` fits it to the first frame."""
-    guide: bool = True
-    """Draw particles around what registration finds; otherwise from the motion model alone."""
-    missing: str = "auto"
-    """Pixels without a reading: `background`, `unknown`, or `auto`, background if they are half of the first frame."""
-    surface: str = "capsules"
-    """What particles are rendered as: `capsules`, or the triangle `mesh`, three times slower."""
-
-    def __post_init__(self) -> None:
-        choices = {
-            "filter": ("rbpf", "pf"),
-            "hand": ("right", "left"),
-            "surface": ("capsules", "mesh"),
-            "missing": ("auto", "background", "unknown"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
-        if self.num_particles < 1:
-            raise ValueError(f"num_particles must be at least 1; got {self.num_particles}.")
-        if self.stride is not None and self.stride < 1:
-            raise ValueError(f"stride must be at least 1; got {self.stride}.")
-        if self.scale is not None and not 0.5 <= self.scale <= 2:
-            raise ValueError(f"scale must be between 0.5 and 2 (1 is the average adult); got {self.scale}.")
-
-
-WINDOW = (128, 128)
-REGISTRATION_STRIDE = 4
-"""Of the pixels of the window: a thousand residuals fix 21 numbers."""
-MAX_ERROR = 0.1
-"""c_max of the paper, metres."""
-SIGMA = 3e-4
-"""Scale of the cost, metres: of a mean over thousands of pixels, far below that of one pixel."""
-TEMPERED_SHARE = 0.02
-FEWEST_PIXELS = 50
-"""Hand pixels in the window below which nothing is there."""
-LOST_COST = 0.07
-"""Metres: of the best pose above which the hand counts as not there; 0.1 is no overlap at all."""
-PATIENCE = 5
-"""Frames in a row without the hand before it is searched anew."""
-FRAME_INTERVAL = 1 / 30
-"""Seconds before the first frame."""
-
-MOTION = HandMotion(
-    per_coordinate(0.008, 0.064, math.radians(12)) ** 2 * 30,
-    per_coordinate(0.04, 0.2, math.radians(24)) ** 2 * 30,
-    per_coordinate(0.0, 0.0, 1 / 0.3),
-)
-"""A real hand: a joint may move 35 mm from one frame to the next; joint velocities are damped over 0.3 s."""
-START_STD = per_coordinate(0.005, 0.04, math.radians(5))
-START_VELOCITY_STD = per_coordinate(0.08, 0.3, math.radians(25))
-"""Per second."""
-
-
-class TrackState(NamedTuple):
-    """Everything the next frame needs."""
-
-    ensemble: Any
-    """Of the filter."""
-    scale: Float[Array, ""]
-    """Size of the hand relative to the average one; NaN until it was fitted to a frame."""
-    missing_is_background: Array
-    time: Float[Array, ""]
-    """Of the last frame, seconds."""
-    misses: Array
-    """Frames in a row in which the hand was not visible."""
-    key: Array
-
-
-@pytree_dataclass
-class _Setup:
-    """What one tracker is made of, as data: the compiled functions below take it as an argument."""
-
-    camera: Pinhole
-    likelihood: HandLikelihood
-    """Of the hand of scale 1."""
-    config: HandDepthConfig = field(metadata={"static": True})
-    stride: int = field(metadata={"static": True})
+SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
+SIDES = {"right": 1.0, "left": -1.0}
 
 
 def build(camera: Pinhole, config: HandDepthConfig | None = None) -> Tracker:
     """A hand tracker for the frames of one depth camera."""
     config = config or HandDepthConfig()
-    stride = config.stride or max(1, round(float(camera.focal[0]) * 2 * REACH / 0.6 / WINDOW[1]))
-    geometry = hand_geometry() if config.hand == "right" else mirrored(hand_geometry())
+    geometry = replace(hand_geometry(), side=jnp.asarray(SIDES.get(config.hand, 1.0), dtype=float))
     surface = CapsuleHand(geometry) if config.surface == "capsules" else triangle_hand(geometry)
     likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
-    setup = _Setup(camera, likelihood, config, stride)
+    setup = Setup(camera, likelihood, config, config.stride)
     return Tracker(partial(_start, setup), partial(_advance, setup))
 
 
@@ -176,135 +75,61 @@ def track(
         The track as NumPy arrays, the frame axis first.
 
     Raises:
-        ValueError: There are no frames, or more or fewer than times.
+        ValueError: There are no frames, or more or fewer than times, or their unit cannot be metres.
     """
     config = config or HandDepthConfig()
-    return track_frames(build(camera, config), jax.random.key(config.seed), frames, times_s)
+    source = iter(frames)
+    first = list(islice(source, 1))
+    if first and (warning := check_unit(np.asarray(first[0]))):
+        warnings.warn(warning, stacklevel=2)
+    return track_frames(build(camera, config), jax.random.key(config.seed), chain(first, source), times_s)
 
 
-def _start(setup: _Setup, key: Array, frame: np.ndarray) -> TrackState:
+def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
     """State before the first frame, placed by what that frame shows; searching where it shows no hand."""
     share_missing = float(np.mean(~np.isfinite(frame)))
     background = {"auto": share_missing > 0.5, "background": True, "unknown": False}[setup.config.missing]
     key, place_key = jax.random.split(key)
     scale = jnp.asarray(setup.config.scale or math.nan, dtype=float)
-    nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
+    side = jnp.asarray(SIDES.get(setup.config.hand, math.nan), dtype=float)
     state = TrackState(
-        _placed(setup, place_key, nowhere, scale),
-        scale,
-        jnp.asarray(background),
-        jnp.asarray(-FRAME_INTERVAL, dtype=float),
-        jnp.asarray(PATIENCE, jnp.int32),
-        key,
+        ensemble=None,
+        scale=scale,
+        side=side,
+        doubt=jnp.asarray(False),
+        race_time=jnp.asarray(0.0, dtype=float),
+        missing_is_background=jnp.asarray(background),
+        time=jnp.asarray(-FRAME_INTERVAL, dtype=float),
+        misses=jnp.asarray(PATIENCE, jnp.int32),
+        key=key,
     )
-    return _search(setup, state, frame)
+    nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
+    state = state._replace(ensemble=placed(place_key, setup, nowhere, state))
+    return search(setup, state, frame, 0.0)
 
 
-def _search(setup: _Setup, state: TrackState, frame: np.ndarray) -> TrackState:
-    """Place the ensemble anew where the frame shows a hand, of the known size if any; unchanged where it shows none."""
-    sighting = nearest_hand(setup.camera, np.asarray(frame))
-    if sighting is None:
-        return state
-    scales = jnp.where(jnp.isnan(state.scale), jnp.array(SCALES), state.scale)
-    image = _filled(jnp.asarray(frame), state.missing_is_background)
-    # Stretched fingers look like an arm to the detector, so what it took for one must prove itself.
-    candidates = [
-        _match(setup.camera, setup.likelihood, setup.stride, image, seen, scales)
-        for seen in (sighting, sighting._replace(forearm=jnp.zeros_like(sighting.forearm)))
-    ]
-    found = min(candidates, key=lambda start: float(start.cost))
-    if not found.cost < LOST_COST:
-        return state
-    key, place_key = jax.random.split(state.key)
-    ensemble = _placed(setup, place_key, found.pose, found.scale)
-    return state._replace(ensemble=ensemble, scale=found.scale, misses=jnp.zeros_like(state.misses), key=key)
-
-
-@partial(jax.jit, static_argnames="stride")
-def _match(
-    camera: Pinhole, likelihood: HandLikelihood, stride: int, frame: Array, sighting: Sighting, scales: Array
-) -> Start:
-    """The best start in a window about the sighting; apart from the set-up, so that all filters share its program."""
-    camera, observed = crop(camera, frame, sighting.center, WINDOW, stride)
-    return find_start(camera, observed, sighting, likelihood, scales)
-
-
-@jax.jit
-def _placed(setup: _Setup, key: Array, pose: Array, scale: Array) -> Any:
-    """An ensemble about a pose."""
-    filter = _filter(setup, pose, scale)
-    return filter.init(filter.params, key)
-
-
-def _filter(setup: _Setup, pose: Array, scale: Array) -> Filter:
-    """The filter of a hand of the given scale that starts about `pose`."""
-    likelihood = setup.likelihood.scaled(scale)
-    with_velocity = setup.config.filter == "rbpf"
-    velocity = START_VELOCITY_STD if with_velocity else START_VELOCITY_STD[:0]
-    inner = rao_blackwell_shared(
-        jax.tree_util.Partial(_sample_about, pose),
-        Gaussian(jnp.zeros_like(velocity), jnp.diag(velocity**2)),
-        MOTION.dynamics if with_velocity else MOTION.walk,
-        likelihood.log_likelihood,
-        num_particles=setup.config.num_particles,
-        noise_dim=TANGENT_SIZE,
-        retract=retract,
-        ess_threshold=1.0,
-        temper=AdaptiveTempering(TEMPERED_SHARE),
-    )
-    if not setup.config.guide:
-        return inner
-    return guided_rao_blackwell(inner, jax.tree_util.Partial(_look, likelihood.geometry), local=local, prior_share=0.1)
-
-
-def _sample_about(pose: Array, key: Array) -> Array:
-    return retract(pose, START_STD * jax.random.normal(key, (TANGENT_SIZE,)))
-
-
-def _look(geometry: HandGeometry, particles: Array, log_weights: Array, image: HandImage) -> Guidance:
-    """Register the predicted hand onto the image."""
-    mean, covariance = pose_moments(particles, log_weights)
-    # A thousandth more on the diagonal: few effective particles leave the covariance without full rank.
-    root = jnp.linalg.cholesky(covariance + jnp.diag(1e-3 * jnp.diagonal(covariance) + 1e-10))
-    shape = tuple(size // REGISTRATION_STRIDE for size in WINDOW)
-    camera = image.camera.crop(jnp.zeros(2), shape, REGISTRATION_STRIDE)
-    target = target_from_image(camera, image.observed[::REGISTRATION_STRIDE, ::REGISTRATION_STRIDE])
-    found = register(camera, target, geometry, mean, PosePrior(mean, root), RegistrationConfig())
-    return Guidance(found.pose, found.information)
-
-
-def pose_moments(
-    particles: Float[Array, "22 n"], log_weights: Float[Array, " n"]
-) -> tuple[Float[Array, " 22"], Float[Array, "21 21"]]:
-    """Mean pose on the manifold, and the covariance in its tangent space."""
-    mean = weights.mean(particles, log_weights)
-    mean = jnp.concatenate([mean[:3], quaternion_mean(particles[3:7], log_weights), mean[7:]])
-    offsets = jax.vmap(local, in_axes=(None, -1), out_axes=-1)(mean, particles)
-    return mean, weights.covariance(offsets, log_weights)
-
-
-def _filled(frame: Array, missing_is_background: Array) -> Array:
-    return jnp.where(jnp.isnan(frame) & missing_is_background, jnp.inf, frame)
-
-
-def _advance(setup: _Setup, state: TrackState, frames: np.ndarray, times: np.ndarray) -> tuple[TrackState, HandTrack]:
+def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndarray) -> tuple[TrackState, HandTrack]:
     """Track a chunk of frames; where the hand is gone, search it frame by frame.
 
     The search runs OpenCV on the host, so a chunk in which the hand is lost takes more than one compiled scan.
     """
     pieces, first = [], 0
     while first < len(frames):
-        if int(state.misses) >= PATIENCE:
-            state = _search(setup, state, frames[first])
+        due = float(state.race_time) <= float(times[first])
+        if due and int(state.misses) >= PATIENCE:
+            state = search(setup, state, frames[first], float(times[first]))
             state = state._replace(time=jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float))
+        elif due:
+            state = race(setup, state, frames[first], float(times[first]))
         if int(state.misses) >= PATIENCE:
             pieces.append(_nothing_found())
             first += 1
             continue
-        state, (track, misses) = _scan(setup, state, frames, times, first)
+        state, (track, done) = _scan(setup, state, frames, times, first)
         state = _through_the_host(state)
-        gone = np.flatnonzero((np.asarray(misses) >= PATIENCE) & (np.arange(len(frames)) >= first))
-        end = int(gone[0]) + 1 if len(gone) else len(frames)
+        if int(state.misses) >= PATIENCE:
+            state = state._replace(race_time=jnp.asarray(times[first], dtype=float))
+        end = first + int(np.sum(done))
         pieces.append(jax.tree.map(lambda rows: np.asarray(rows)[first:end], track))  # noqa: B023
         first = end
     return state, HandTrack(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
@@ -319,9 +144,9 @@ def _through_the_host(state: TrackState) -> TrackState:
 
 @jax.jit
 def _scan(
-    setup: _Setup, state: TrackState, frames: Array, times: Array, first: Array
+    setup: Setup, state: TrackState, frames: Array, times: Array, first: Array
 ) -> tuple[TrackState, tuple[HandTrack, Array]]:
-    """Track from frame `first` until the hand has been missed too often; the state stands still from there on."""
+    """Track from frame `first` until the hand was missed too often or a race is due; the state then stands still."""
 
     def skip(state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
         _, track = jax.eval_shape(partial(_step, setup), state, frame, time)
@@ -329,22 +154,23 @@ def _scan(
 
     def body(state: TrackState, inputs: tuple) -> tuple[TrackState, tuple[HandTrack, Array]]:
         frame, time, index = inputs
-        active = (index >= first) & (state.misses < PATIENCE)
+        active = (index >= first) & (state.misses < PATIENCE) & ((index == first) | (time < state.race_time))
         state, track = jax.lax.cond(active, partial(_step, setup), skip, state, frame, time)
-        return state, (track, state.misses)
+        return state, (track, active)
 
     return jax.lax.scan(body, state, (frames, times, jnp.arange(frames.shape[0])))
 
 
 @jax.jit  # traced once for its shapes and its program
-def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
+def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
-    filter = _filter(setup, open_palm(jnp.zeros(3)), state.scale)
+    likelihood = setup.hand(state)
+    filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood)
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
-    expected, _ = pose_moments(*_particles(predicted))
-    image = look(setup.camera, _filled(frame, state.missing_is_background), expected, state.scale, setup.stride)
+    expected, _ = pose_moments(*particles_of(predicted))
+    image = look(setup, state, filled(frame, state.missing_is_background), expected)
 
     def update(ensemble: Any) -> tuple[Any, ParticleInfo]:
         return filter.update(filter.params, update_key, ensemble, image, elapsed)
@@ -355,32 +181,18 @@ def _step(setup: _Setup, state: TrackState, frame: Array, time: Array) -> tuple[
 
     something = image.observed_count >= FEWEST_PIXELS
     ensemble, info = jax.lax.cond(something, update, coast, predicted)
-    pose, covariance = pose_moments(*_particles(ensemble))
-    likelihood = setup.likelihood.scaled(state.scale)
+    pose, covariance = pose_moments(*particles_of(ensemble))
     seen = something & (likelihood.cost(pose, image) < LOST_COST)
     misses = jnp.where(seen, 0, state.misses + 1)
     track = HandTrack(
         pose=pose,
-        pose_std=jnp.sqrt(jnp.diagonal(covariance)),
+        pose_std=standard_deviations(pose, covariance),
         joints=forward_kinematics(pose, likelihood.geometry).joints,
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
-        status=jnp.where(seen, TRACKING, LOST).astype(jnp.int32),
+        status=jnp.where(seen, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
     return state._replace(ensemble=ensemble, time=time, misses=misses, key=key), track
-
-
-def look(camera: Pinhole, frame: Array, expected: Float[Array, " 22"], scale: float | Array, stride: int) -> HandImage:
-    """The window of a frame in which a hand is expected, with everything else taken out."""
-    center = hand_center(expected, scale)
-    center = center.at[2].set(jnp.maximum(center[2], 0.1))  # a lost hand may be predicted behind the camera
-    window, observed = crop(camera, frame, center, WINDOW, stride)
-    return hand_image(window, isolate(window, observed, expected, scale))
-
-
-def _particles(state: RaoBlackwellState | GuidedState) -> tuple[Array, Array]:
-    ensemble = state.ensemble if isinstance(state, GuidedState) else state
-    return ensemble.particles, ensemble.log_weights
 
 
 def _nothing_found() -> HandTrack:

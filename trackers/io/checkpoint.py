@@ -45,6 +45,23 @@ def load_meta(path: Path) -> dict[str, Any]:
     return _read(path)[1]["meta"]
 
 
+def state_path(folder: Path) -> Path:
+    """Where a folder of results has the state of its tracker."""
+    return folder / "checkpoint" / "state.npz"
+
+
+def check_same_run(folder: Path, run: dict[str, Any]) -> None:
+    """Whether the run whose checkpoint lies in `folder` may be continued by another one.
+
+    Raises:
+        CheckpointError: It was of another input, configuration or version, or its checkpoint is damaged.
+    """
+    was = load_meta(state_path(folder)).get("run", {})
+    if different := sorted(key for key in run | was if run.get(key) != was.get(key)):
+        changes = ", ".join(f"{key} was {was.get(key)!r} and is {run.get(key)!r}" for key in different)
+        raise CheckpointError(f"{folder} cannot be resumed: {changes}.")
+
+
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file that `write_npz` wrote.
 

@@ -6,6 +6,10 @@ An `.npz` with the arrays `owner` (m,), the symbol that each model is a way to d
     {"format": "jaxfilters symbols", "version": 1, "names": [...], "emission": "shape" or "codes",
      "settings": {...}, "source": "what it was estimated from", "parameters": {...}}
 
+Where confidences and margins were fitted to strokes of people left out, `margins` (k,) has the nats a point by which
+each symbol has to beat the threshold model, and `settings` hold `sharpness`, the share of a log-likelihood that counts,
+and `lapse`, the probability that a stroke may be any symbol.
+
 States of kind `shape` have `mean` and `variance` (m, Q, 3 d + 2) of the features of strokes in d dimensions, those of
 kind `codes` `log_codes` (m, Q, 17) and `log_counts` (m, Q, 6). `jaxfilters fit gestures` writes such files.
 """
@@ -32,6 +36,8 @@ DEFAULT_FILE = Path(__file__).with_name("gesture_model.npz")
 SHAPE, CODES = "shape", "codes"
 _ARRAYS = {SHAPE: ("mean", "variance"), CODES: ("log_codes", "log_counts")}
 _SETTINGS = {SHAPE: "min_variance", CODES: "pseudo_count"}
+_SOFTNESS = {"sharpness": LARGEST, "lapse": 1.0}
+"""Settings of confidences, and how large they may be."""
 _WANTED = "expected an .npz of `jaxfilters fit gestures`"
 
 
@@ -71,12 +77,14 @@ def write_symbols(path: str | Path, file: SymbolsFile) -> None:
         directions, tips = emission.parts
         kind, values = CODES, (directions.log_probability, tips.log_probability)
         setting = directions.pseudo_count
+    margins = file.symbols.margins
+    softness = {name: float(value) for name in _SOFTNESS if (value := getattr(file.symbols, name)) is not None}
     header = {
         "format": FORMAT,
         "version": VERSION,
         "names": list(file.symbols.names),
         "emission": kind,
-        "settings": {_SETTINGS[kind]: setting},
+        "settings": {_SETTINGS[kind]: setting} | softness,
         "source": file.source,
         "parameters": file.parameters,
     }
@@ -86,6 +94,7 @@ def write_symbols(path: str | Path, file: SymbolsFile) -> None:
         "log_initial": np.asarray(models.log_initial, np.float32),
         "log_transition": np.asarray(models.log_transition, np.float32),
         **{name: np.asarray(value, np.float32) for name, value in zip(_ARRAYS[kind], values, strict=True)},
+        **({} if margins is None else {"margins": np.asarray(margins, np.float32)}),
     }
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -123,7 +132,13 @@ def read_symbols(path: str | Path) -> SymbolsFile:
     models = HiddenMarkovModel(
         jnp.asarray(arrays["log_initial"], float), jnp.asarray(arrays["log_transition"], float), emission
     )
-    symbols = Symbols(models, jnp.asarray(arrays["owner"], jnp.int32), tuple(str(name) for name in names))
+    softness = {name: settings.get(name) if isinstance(settings, dict) else None for name in _SOFTNESS}
+    for name, value in softness.items():
+        if value is not None and not (isinstance(value, int | float) and 0 < value <= _SOFTNESS[name]):
+            raise InputError(f"{path}: {name} must be above 0 and at most {_SOFTNESS[name]:g}; got {shown(value)}.")
+    margins = jnp.asarray(arrays["margins"], float) if "margins" in arrays else None
+    owner = jnp.asarray(arrays["owner"], jnp.int32)
+    symbols = Symbols(models, owner, tuple(str(name) for name in names), **softness, margins=margins)
     return SymbolsFile(symbols, str(header.get("source", "")), header["parameters"])
 
 
@@ -151,8 +166,9 @@ def _check(arrays: dict[str, np.ndarray], kind: str, num_names: int, path: Path)
         "variance": (num_models, num_states, *symbols),
         "log_codes": (num_models, num_states, STILL),
         "log_counts": (num_models, num_states, MOST_TIPS + 1),
+        "margins": (num_names,),
     }
-    for name in needed:
+    for name in (*needed, *(["margins"] if "margins" in arrays else [])):
         if arrays[name].shape != shapes[name] or arrays[name].dtype.kind != ("i" if name == "owner" else "f"):
             raise InputError(
                 f"{path}: {name} must be numbers {shapes[name]}; got {arrays[name].shape} {arrays[name].dtype}."

@@ -73,13 +73,65 @@ def read(path: Path, hand: str, fps: float) -> Detections:
     return readers[path.suffix](path, fps)
 
 
+class HandDetections(NamedTuple):
+    """Any number of hands over time, in any order; pixels or shares of the image."""
+
+    times_s: np.ndarray
+    """(frames,)."""
+    points: np.ndarray
+    """(frames, hands, 21, 2), NaN where nothing was found."""
+    confidence: np.ndarray
+    """(frames, hands, 21), 0 where nothing was found."""
+
+
+def read_hands(path: Path, fps: float) -> HandDetections:
+    """All hands in a folder of OpenPose's files, or in a `.json` or `.csv` of MediaPipe's landmarks.
+
+    A table holds one hand. Hands of several people are hands of one frame.
+
+    Args:
+        path: The folder or file, which exists.
+        fps: Frames per second where there are no times.
+
+    Raises:
+        InputError: the file is damaged or of another form, or shows no hand.
+    """
+    check_rate(fps)
+    if path.is_dir():
+        files, numbers = _openpose_files(path)
+        frames = [[hand for side in ("right", "left") for hand in _openpose_hands(file, side)] for file in files]
+        values = _stacked(frames)
+        found = values[..., 2] > 0
+        times_s, points, confidence = _times_of(numbers, fps), values[..., :2], np.where(found, values[..., 2], 0.0)
+        points = np.where(found[..., None], points, np.nan)
+    elif path.suffix == ".json":
+        named, times_s = _mediapipe_frames(path, fps)
+        values = _stacked([[_mediapipe_hand(hand, name) for hand in _hands_of(frame, name)] for frame, name in named])
+        times_s, points, confidence = _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+    else:
+        single = read(path, "right", fps)
+        times_s, points, confidence = single.times_s, single.points[:, None], single.confidence[:, None]
+    if not (confidence > 0).any():
+        raise InputError(f"{path}: no hand in any of {len(times_s)} frames.")
+    return HandDetections(times_s, points, confidence)
+
+
+def _stacked(frames: list[list[np.ndarray]]) -> np.ndarray:
+    """(frames, hands, 21, 3), NaN where a frame has fewer hands than another."""
+    values = np.full((len(frames), max(map(len, frames), default=0), NUM_KEYPOINTS, 3), np.nan)
+    for i, hands in enumerate(frames):
+        values[i, : len(hands)] = np.reshape(hands, (-1, NUM_KEYPOINTS, 3))
+    return values
+
+
 def looks_normalized(points: np.ndarray) -> bool:
     """Whether coordinates, NaN aside, can only be shares of the image's width and height."""
     observed = points[np.isfinite(points)]
     return bool(observed.size) and float(np.abs(observed).max()) <= _LARGEST_SHARE
 
 
-def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
+def _openpose_files(folder: Path) -> tuple[list[Path], np.ndarray]:
+    """The files of a recording in the order of their frame numbers, and these."""
     files = sorted(folder.glob("*_keypoints.json"))
     if not files:
         raise InputError(f"{folder}: no *_keypoints.json in it, which OpenPose's --write_json writes.")
@@ -92,6 +144,11 @@ def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
         if (same := np.flatnonzero(np.diff(numbers) == 0)).size:
             one, other = files[same[0]].name, files[same[0] + 1].name
             raise InputError(f"{folder}: {one} and {other} have one frame number; a folder must hold one recording.")
+    return files, numbers
+
+
+def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
+    files, numbers = _openpose_files(folder)
     hands = {side: [_openpose_hand(file, side) for file in files] for side in ("right", "left")}
     has_hand = {side: any(numbers.any() for numbers in frames) for side, frames in hands.items()}
     other = "left" if hand == "right" else "right"
@@ -106,6 +163,16 @@ def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
 
 def _openpose_hand(file: Path, side: str) -> np.ndarray:
     """(21, 3): x, y, confidence; zeros without a hand."""
+    hands = _openpose_hands(file, side)
+    if len(hands) > 1:
+        raise InputError(
+            f"{file}: {len(hands)} people with a {side} hand; expected at most one (OpenPose's --number_people_max 1)."
+        )
+    return hands[0] if hands else np.zeros((NUM_KEYPOINTS, 3))
+
+
+def _openpose_hands(file: Path, side: str) -> list[np.ndarray]:
+    """Of all people; each as of `_openpose_hand`."""
     frame = _json(file)
     people = frame.get("people") if isinstance(frame, dict) else None
     if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
@@ -119,33 +186,42 @@ def _openpose_hand(file: Path, side: str) -> np.ndarray:
             raise InputError(f"{file}: {key} must be {3 * NUM_KEYPOINTS} numbers or none; got shape {numbers.shape}.")
         if numbers.any():
             hands.append(numbers.reshape(NUM_KEYPOINTS, 3))
-    if len(hands) > 1:
-        raise InputError(
-            f"{file}: {len(hands)} people with a {side} hand; expected at most one (OpenPose's --number_people_max 1)."
-        )
-    return hands[0] if hands else np.zeros((NUM_KEYPOINTS, 3))
+    return hands
 
 
 def _read_mediapipe(file: Path, fps: float) -> Detections:
+    named, times_s = _mediapipe_frames(file, fps)
+    hands = [_mediapipe_hand(_hand_of(frame, name), name) for frame, name in named]
+    values = np.stack(hands) if hands else np.zeros((0, NUM_KEYPOINTS, 3))
+    return _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+
+
+def _mediapipe_frames(file: Path, fps: float) -> tuple[list[tuple[Any, str]], np.ndarray]:
+    """Every frame with what messages call it, and the times."""
     frames = _json(file)
     if isinstance(frames, dict) and "people" in frames:
         raise InputError(f"{file}: one frame of OpenPose; give the folder that holds it.")
     if not isinstance(frames, list):
         raise InputError(f"{file}: expected a list with 21 landmarks for each frame; got a {type(frames).__name__}.")
-    named = [(frame, f"{file}: frame {i}") for i, frame in enumerate(frames)]
-    hands = [_mediapipe_hand(_hand_of(frame, name), name) for frame, name in named]
-    values = np.stack(hands) if hands else np.zeros((0, NUM_KEYPOINTS, 3))
     times = [frame.get("time_s") if isinstance(frame, dict) else None for frame in frames]
     if len(known := [time for time in times if time is not None]) not in (0, len(frames)):
         raise InputError(f"{file}: time_s must be in every frame or in none; {len(known)} of {len(frames)} have it.")
     times_s = _array(file, "time_s", known) if known else np.arange(len(frames)) / fps
     if times_s.shape != (len(frames),):
         raise InputError(f"{file}: time_s must be one number a frame; got shape {times_s.shape}.")
-    return _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+    return [(frame, f"{file}: frame {i}") for i, frame in enumerate(frames)], times_s
 
 
 def _hand_of(frame: Any, name: str) -> list[Any]:
     """The landmarks of the one hand in a frame, an empty list without a hand."""
+    hands = _hands_of(frame, name)
+    if len(hands) > 1:
+        raise InputError(f"{name}: {len(hands)} hands; expected at most one (MediaPipe's num_hands=1).")
+    return hands[0] if hands else []
+
+
+def _hands_of(frame: Any, name: str) -> list[list[Any]]:
+    """The landmarks of each hand in a frame."""
     while isinstance(frame, dict):
         keys = [key for key in _HANDS if key in frame]
         if not keys:
@@ -155,12 +231,9 @@ def _hand_of(frame: Any, name: str) -> list[Any]:
         return []
     if not isinstance(frame, list):
         raise InputError(f"{name}: expected a list of landmarks; got a {type(frame).__name__}.")
-    is_landmark = isinstance(frame[0], dict) and "x" in frame[0]
-    if is_landmark:
-        return frame
-    if len(frame) > 1:
-        raise InputError(f"{name}: {len(frame)} hands; expected at most one (MediaPipe's num_hands=1).")
-    return _hand_of(frame[0], name)
+    if isinstance(frame[0], dict) and "x" in frame[0]:
+        return [frame]
+    return [hand for one in frame for hand in _hands_of(one, name)]
 
 
 def _mediapipe_hand(landmarks: list[Any], name: str) -> np.ndarray:

@@ -13,6 +13,7 @@ in such a folder in the folder of a person. Files of UNIPEN, InkML and JSON are 
 `stroke_json`.
 """
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,6 +56,8 @@ class StrokeSet(NamedTuple):
     dimensions: int
     warnings: tuple[str, ...] = ()
     """What was left out, a sentence each."""
+    faults: tuple[str, ...] = ()
+    """Of each stroke: why nothing can recognise it and where in the file, empty where something can."""
 
     @property
     def pieces(self) -> int:
@@ -69,15 +72,61 @@ class _Own(NamedTuple):
     fingers: int
     id: str
     words: dict[str, str]
-    warning: str
+    fault: str
 
 
 def read_strokes(path: Path) -> StrokeSet:
     """The strokes of a file or folder.
 
+    A stroke without points, of a single one, without extent or with a coordinate that is NaN has its entry in `faults`.
+
     Raises:
         InputError: an unreadable file, other columns or arrays, coordinates that are no numbers, or no stroke.
     """
+    found = _read(path)
+    if found.faults:
+        return found
+    named = zip(found.strokes, found.ids, strict=True)
+    return found._replace(faults=tuple(_fault(pieces, name, str(path)) for (pieces, _), name in named))
+
+
+def usable(strokes: StrokeSet) -> StrokeSet:
+    """Without the strokes that have a fault, which become warnings.
+
+    Raises:
+        InputError: if a coordinate is NaN, or none of the strokes of a symbol is usable.
+    """
+    broken = next((fault for fault in strokes.faults if fault.endswith(_NOT_A_NUMBER)), "")
+    if broken:
+        raise InputError(f"{broken}.")
+    kept = [i for i, fault in enumerate(strokes.faults) if not fault]
+    if lost := set(strokes.labels) - {strokes.labels[i] for i in kept}:
+        reason = next(fault for fault, label in zip(strokes.faults, strokes.labels, strict=True) if label in lost)
+        raise InputError(f"no usable stroke of {shown(sorted(lost))}: {reason}.")
+    chosen = [tuple(field[i] for i in kept) for field in (strokes.strokes, strokes.ids, strokes.labels, strokes.people)]
+    warnings = (*strokes.warnings, *(f"{fault}; it is left out" for fault in strokes.faults if fault))
+    return StrokeSet(*chosen, strokes.dimensions, warnings, ("",) * len(kept))
+
+
+_NOT_A_NUMBER = "has a coordinate that is no number"
+
+
+def _fault(pieces: Sequence[np.ndarray], name: str, path: str, place: Callable[[int], str] = lambda _: "") -> str:
+    """Why a stroke cannot be recognised; it says the place of the point that is no number, or of the first one."""
+    points = np.concatenate(pieces) if len(pieces) else np.zeros((0, 2))
+    lacks = ~np.isfinite(points).all(axis=1)
+    first = int(np.argmax(lacks)) if len(lacks) else 0
+    where = f"{path}: {place(first)}" if len(points) else f"{path}: "
+    if lacks.any():
+        return f"{where}stroke {shortened(name)} {_NOT_A_NUMBER}"
+    if len(points) < 2:
+        return f"{where}stroke {shortened(name)} holds {'a single point' if len(points) else 'no point'}"
+    if np.all(points == points[0]):
+        return f"{where}stroke {shortened(name)} does not move"
+    return ""
+
+
+def _read(path: Path) -> StrokeSet:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
     if path.is_dir():
@@ -152,7 +201,13 @@ def _of_npz(path: Path) -> StrokeSet:
     first = np.concatenate([[0], np.cumsum(pieces)])
     strokes = tuple((each[a:b], int(n)) for a, b, n in zip(first[:-1], first[1:], fingers, strict=True))
     labels, people = (tuple(str(word) for word in values) for values in words.values())
-    return StrokeSet(strokes, tuple(str(i) for i in range(len(strokes))), labels, people, points.shape[1])
+    ids = tuple(str(i) for i in range(len(strokes)))
+    befores = np.concatenate([[0], np.cumsum(lengths)])[first[:-1]]
+    faults = tuple(
+        _fault(pieces, name, str(path), lambda point, before=before: f"row {before + point}: ")
+        for (pieces, _), name, before in zip(strokes, ids, befores, strict=True)
+    )
+    return StrokeSet(strokes, ids, labels, people, points.shape[1], faults=faults)
 
 
 def _check_parts(counts: np.ndarray, total: int, name: str, path: Path) -> None:
@@ -212,19 +267,17 @@ def _of_table(table: Table, path: Path) -> list[_Own]:
             raise InputError(
                 f"{place}: fingers must be from 0 to {MOST_TIPS}; got {shown(np.unique(counts).tolist())}."
             )
-        lacking = rows[np.isnan(points[rows]).any(axis=1)]
-        warning = f"{path}: line {table.lines[lacking[0]]}: {_no_number(names[rows[0]])}" if len(lacking) else ""
-        own = points[rows[np.argsort(times[rows], kind="stable")]]
+        in_time = rows[np.argsort(times[rows], kind="stable")]
+        own = points[in_time]
+        fault = _fault(
+            [own], str(names[rows[0]]), str(path), lambda point, rows=in_time: f"line {table.lines[rows[point]]}: "
+        )
         words = [
             _word([table.words[name][row] for row in rows], name, place) for name in _WORDS[1:] if name in table.words
         ]
         labels = dict(zip([name for name in _WORDS[1:] if name in table.words], words, strict=True))
-        found.append(_Own(own, voted(counts.astype(int)), str(names[rows[0]]), labels, warning))
+        found.append(_Own(own, voted(counts.astype(int)), str(names[rows[0]]), labels, fault))
     return found
-
-
-def _no_number(stroke: str) -> str:
-    return f"stroke {shortened(str(stroke))} has a coordinate that is no number, and is not recognised as anything"
 
 
 def _joined(found: list[_Own], path: Path) -> StrokeSet:
@@ -239,7 +292,7 @@ def _joined(found: list[_Own], path: Path) -> StrokeSet:
         tuple(own.words.get("label", "") for own in found),
         tuple(own.words.get("person", "") for own in found),
         dimensions.pop(),
-        tuple(own.warning for own in found if own.warning),
+        faults=tuple(own.fault for own in found),
     )
 
 

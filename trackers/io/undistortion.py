@@ -42,3 +42,19 @@ class Undistortion:
         if image.shape[:2] != self.shape:
             raise ValueError(f"image must have {self.shape[0]} rows and {self.shape[1]} columns; got {image.shape}.")
         return image if self.is_identity else cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+
+    def straightened(self, uv: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of the video, without lens distortion."""
+        if self.is_identity:
+            return np.asarray(uv, float)
+        points = np.asarray(uv, float).reshape(-1, 1, 2)
+        return cv2.undistortPoints(points, self.K, self.distortion, P=self.K).reshape(np.shape(uv))
+
+    def distorted(self, uv: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of the video at which pixels without lens distortion appear in it."""
+        if self.is_identity:
+            return np.asarray(uv, float)
+        assert self.K is not None
+        flat = np.asarray(uv, float).reshape(-1, 2)
+        rays = np.linalg.solve(self.K, np.column_stack([flat, np.ones(len(flat))]).T).T
+        return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)[0].reshape(np.shape(uv))

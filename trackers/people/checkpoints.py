@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxfilters.trackers.app.results import check_same_run, state_path
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.people.recorded import Sighting, as_arrays, from_arrays
 
@@ -27,10 +26,10 @@ def save(
     Raises:
         OSError: The disk is full, or the folder gone; the last checkpoint is as it was.
     """
-    state_path(folder).parent.mkdir(exist_ok=True)
+    checkpoint.state_path(folder).parent.mkdir(exist_ok=True)
     checkpoint.write_npz(_part_path(folder, num_parts), as_arrays(added))
     # The state comes last: a part without it is written again.
-    checkpoint.save(state_path(folder), state, {"run": run, "num_parts": num_parts + 1})
+    checkpoint.save(checkpoint.state_path(folder), state, {"run": run, "num_parts": num_parts + 1})
 
 
 def load(folder: Path, run: dict[str, Any]) -> SavedTracks:
@@ -43,8 +42,8 @@ def load(folder: Path, run: dict[str, Any]) -> SavedTracks:
     Raises:
         CheckpointError: The run is another one, or a file is damaged.
     """
-    check_same_run(folder, run)
-    state, meta = checkpoint.load(state_path(folder))
+    checkpoint.check_same_run(folder, run)
+    state, meta = checkpoint.load(checkpoint.state_path(folder))
     parts = [checkpoint.read_arrays(_part_path(folder, i)) for i in range(int(meta["num_parts"]))]
     return SavedTracks(state, [one for part in parts for one in from_arrays(part)], len(parts))
 

@@ -16,13 +16,15 @@ from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.app.video import OverlayVideo, side_by_side
 from jaxfilters.trackers.io.cameras import open_camera
+from jaxfilters.trackers.io.detections import read_detections
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.io.video_input import LiveCamera, continued, open_video, together
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
+from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.drawing import drawn, write_plan
-from jaxfilters.trackers.people.files import TracksWriter, write_mot, write_report
+from jaxfilters.trackers.people.files import TracksWriter, write_coco, write_mot, write_report
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleEstimate, PeopleSession
 from jaxfilters.trackers.people.state import TRACKED, PeopleConfig, PeopleScene
@@ -37,6 +39,8 @@ class Setup(NamedTuple):
     sources: list[Any]
     demo: DemoRoom | None
     """The synthetic room, with its truth; None for real cameras."""
+    detected: list[DetectedForeground]
+    """Foreground from the boxes of a detector, one a camera; empty for background subtraction."""
 
 
 class RunResult(NamedTuple):
@@ -63,7 +67,7 @@ def track(options: argparse.Namespace) -> str:
 
 def _tracked(setup: Setup, options: argparse.Namespace, writer: TracksWriter) -> str:
     began = time.perf_counter()
-    session = as_input_error(lambda: PeopleSession(setup.scene, options.background))
+    session = as_input_error(lambda: PeopleSession(setup.scene, setup.detected or options.background))
     session.prime(
         [
             [undistortion.apply(image) for image in source.sample(PRIMING_IMAGES)]
@@ -77,7 +81,9 @@ def _tracked(setup: Setup, options: argparse.Namespace, writer: TracksWriter) ->
     if not is_live:
         writer.replace(tracks)
     if options.mot:
-        write_mot(options.out / "tracks_mot.txt", setup.scene, tracks)
+        write_mot(options.out / "tracks_mot.txt", setup.scene, setup.undistortions[0], tracks)
+    if options.coco:
+        write_coco(options.out / "tracks_coco.json", setup.scene, setup.undistortions[0], tracks)
     write_plan(options.out / "plan.png", setup.scene, tracks)
     report = _report(setup, options, result, tracks, not is_live, time.perf_counter() - began)
     write_report(options.out / "report.json", report)
@@ -91,6 +97,7 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
         "image_sizes": [list(source.image_size) for source in setup.sources],
         "seed": options.seed,
         "background": options.background,
+        "detections": [str(path) for path in options.detections],
         "version": version("jaxfilters"),
         **{f"config.{name}": value for name, value in json.loads(json.dumps(asdict(setup.scene.config))).items()},
     }
@@ -99,17 +106,22 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
 def _setup(options: argparse.Namespace) -> Setup:
     config = as_input_error(lambda: PeopleConfig(**({"capacity": options.capacity} if options.capacity else {})))
     if not options.sources:
-        if options.camera or options.scene:
-            raise InputError("--camera, --scene: of no use without a video; the synthetic room has its own.")
+        if options.camera or options.scene or options.detections:
+            raise InputError("--camera, --scene, --detections: of no use without a video, as for the synthetic room.")
         room = demo_room(options.seed or 0)
         scene = people_scene(room.cameras, room.floor, furniture=room.furniture, config=config)
-        return Setup(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room)
+        return Setup(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room, [])
     if not options.scene:
         raise InputError("--scene: missing; a scene.json with the floor on which people walk, in metres.")
     if len(options.camera) != len(options.sources):
         raise InputError(
             f"--camera: one camera.json for each source, in their order; got {len(options.camera)} for "
             f"{len(options.sources)} sources. `jaxfilters calibrate` makes them."
+        )
+    if options.detections and len(options.detections) != len(options.sources):
+        raise InputError(
+            f"--detections: one file for each source, in their order; got {len(options.detections)} for "
+            f"{len(options.sources)} sources."
         )
     sources = [open_video(source, fps=options.fps) for source in options.sources]
     files = [
@@ -119,7 +131,12 @@ def _setup(options: argparse.Namespace) -> Setup:
     cameras = [file.camera for file in files]
     furniture = furniture_of(described, cameras)
     scene = as_input_error(lambda: people_scene(cameras, described.floor, furniture=furniture, config=config))
-    return Setup(scene, [file.undistortion for file in files], sources, None)
+    undistortions = [file.undistortion for file in files]
+    detected = [
+        DetectedForeground(read_detections(path), undistortion)
+        for path, undistortion in zip(options.detections, undistortions, strict=False)
+    ]
+    return Setup(scene, undistortions, sources, None, detected)
 
 
 class _DemoSource:
@@ -209,7 +226,7 @@ def _report(
         "interrupted": result.interrupted,
         "trouble": [trouble for source in setup.sources if (trouble := source.trouble())],
         "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
-        "background": options.background,
+        "background": "detections" if setup.detected else options.background,
         "config": {name: getattr(setup.scene.config, name) for name in setup.scene.config.__dataclass_fields__},
         "versions": versions(),
     }
@@ -238,4 +255,5 @@ def _summary(report: dict[str, Any], options: argparse.Namespace) -> str:
         + f"\nresults in {options.out}: tracks.csv, plan.png, report.json"
         + (", overlay.mp4" if options.video else "")
         + (", tracks_mot.txt" if options.mot else "")
+        + (", tracks_coco.json" if options.coco else "")
     )

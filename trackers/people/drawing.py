@@ -1,5 +1,6 @@
 """Pictures of people on a floor: outlines over the images, and the floor plan with everybody's way."""
 
+import itertools
 from pathlib import Path
 
 import cv2
@@ -7,12 +8,14 @@ import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.io.errors import OutputError
-from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.recorded import Sighting, pieces
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, People, PeopleScene
 
 _PLAN_PX = 900
 _MARGIN_PX = 50
 _PAPER, _INK, _FLOOR = (255, 255, 255), (70, 70, 70), (236, 240, 242)
+_NOT_MEASURED = {"hidden", "no_depth"}
+"""Modes of sightings whose distance from the camera is not measured."""
 _UNSURE = (170, 170, 170)
 
 
@@ -49,6 +52,9 @@ def _draw_one(image, center, shape, color, identity):
 def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
     """The floor from above, X to the right and Y up, with cameras and ways; a dot where a person was last.
 
+    Where a person is hidden or the distance from the camera is not measured, the way is thin and faint, in a band of
+    two standard deviations. A way is interrupted where a person was lost and found again.
+
     Raises:
         OutputError: it cannot be written.
     """
@@ -73,14 +79,44 @@ def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]
         cv2.putText(
             plan, f"camera {number}", (at[0] + 10, at[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
         )
-    for identity, track in tracks.items():
-        way = pixels(np.stack([seen.mean[:2] for seen in sorted(track, key=lambda seen: seen.frame)]))
-        cv2.polylines(plan, [way], False, color_of(identity), 2, cv2.LINE_AA)
-        end = tuple(int(v) for v in way[-1])
+    parts = {identity: pieces(track, scene.config.hidden_s) for identity, track in tracks.items()}
+    for identity, some in parts.items():
+        for one in some:
+            _draw_band(plan, one, color_of(identity), pixels)
+    for identity, some in parts.items():
+        for one in some:
+            _draw_way(plan, one, color_of(identity), pixels)
+        end = tuple(int(v) for v in pixels(some[-1][-1].mean[:2])[0])
         cv2.circle(plan, end, 5, color_of(identity), -1, cv2.LINE_AA)
         cv2.putText(plan, str(identity), (end[0] + 7, end[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
     if not cv2.imwrite(str(path), plan):
         raise OutputError(f"cannot write {path}.")
+
+
+def _draw_way(plan, piece, color, pixels):
+    faint = tuple((np.array(color) + np.array(_FLOOR)) // 2)
+    for before, now in itertools.pairwise(piece):
+        ends = pixels(np.stack([before.mean[:2], now.mean[:2]]))
+        measured = not {before.mode, now.mode} & _NOT_MEASURED
+        shade, width = (color, 2) if measured else (tuple(map(int, faint)), 1)
+        cv2.line(plan, *(tuple(map(int, end)) for end in ends), shade, width, cv2.LINE_AA)
+
+
+def _draw_band(plan, piece, color, pixels):
+    """Two standard deviations around the places that are not measured, blended into the plan."""
+    band = np.zeros(plan.shape[:2], np.uint8)
+    turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = 2 * np.stack([np.cos(turns), np.sin(turns)])
+    for before, now in itertools.pairwise(piece):
+        if {before.mode, now.mode} & _NOT_MEASURED:
+            edges = [
+                seen.mean[:2] + (np.linalg.cholesky(seen.covariance[:2, :2] + 1e-9 * np.eye(2)) @ circle).T
+                for seen in (before, now)
+            ]
+            hull = cv2.convexHull(pixels(np.concatenate(edges)).astype(np.int32))
+            cv2.fillConvexPoly(band, hull, 255)
+    tinted = (plan.astype(int) * 5 + np.array(color)) // 6
+    plan[band > 0] = tinted[band > 0]
 
 
 def _draw_grid(plan, low, high, pixels):

@@ -9,16 +9,17 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
     contrasts_of,
     line_of_sight,
     log_likelihood,
-    place_of,
+    observed_place,
     share_seen,
     unexplained_of,
     views_of,
 )
-from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleScene
+from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, CameraFrame, PeopleScene
 
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction a person is searched for, along each axis."""
@@ -34,6 +35,8 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 1.0
 """Inverse square metres: below it a direction counts as not observed at all."""
+MOST_SHIFT_M = 0.2
+"""A reading along a direction in which the score is flat is no farther than this from where the search ended."""
 PASSES = 2
 NEAR_M = 1.5
 """Two who are nearer may be one."""
@@ -79,10 +82,11 @@ def fit_people(
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
     """
-    start = place_of(predicted.mean)
-    prior = _prior(predicted)
+    start = jax.vmap(observed_place, in_axes=(None, 0))(scene, predicted.mean)
+    covariance = _observed_covariance(scene, predicted)
+    prior = jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
-    reach = _reach(predicted, axes)
+    reach = _reach(covariance, axes)
     views = jax.vmap(views_of, in_axes=(None, None, 0, 0, 0))(scene, frames, start, axes, reach)
     order = _nearest_first(scene, views, start, active)
 
@@ -192,7 +196,7 @@ def as_measurement(
         eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
         seen = eigenvalues > LEAST_CURVATURE
         curvature = jnp.where(seen, eigenvalues, 1.0)
-        limit = jnp.linalg.norm(steps)
+        limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_SHIFT_M))
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
         return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen
@@ -200,10 +204,11 @@ def as_measurement(
     return jax.vmap(one)(fit.place, fit.axes, fit.steps, fit.quadratic)
 
 
-def _prior(predicted):
-    pick = jnp.array(PLACE)
-    covariance = predicted.covariance[:, pick[:, None], pick]
-    return jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
+def _observed_covariance(scene, predicted):
+    """Of what the silhouettes show: places and their displacements by the biases."""
+    factors = jax.vmap(bias_factor, in_axes=(None, 0))(scene, predicted.mean)
+    shows = jnp.broadcast_to(jnp.eye(STATE)[jnp.array(PLACE)], (len(factors), 4, STATE)).at[:, :, BIAS].set(factors)
+    return jnp.einsum("kpi,kij,kqj->kpq", shows, predicted.covariance, shows)
 
 
 def _axes(scene, place):
@@ -212,19 +217,12 @@ def _axes(scene, place):
 
 def _steps(scene, places):
     """From the size of a pixel of the camera that sees each person finest."""
-
-    def pixel_m(camera):
-        first, second, third = camera.P[:, :3]
-        focal = jnp.sqrt(jnp.linalg.norm(jnp.cross(first, third)) * jnp.linalg.norm(jnp.cross(second, third)))
-        depth = camera.project(jnp.insert(places[:, :2], 2, 1.0, axis=1))[1]
-        return jnp.where(depth > 0, depth, jnp.inf) / focal
-
-    finest = jnp.min(jnp.stack([pixel_m(camera) for camera in scene.cameras]), axis=0)
+    finest = jnp.min(jnp.stack([pixel_m(camera, places[:, :2]) for camera in scene.cameras]), axis=0)
     return jnp.clip(CURVATURE_PX * finest, LEAST_STEP_M, MOST_STEP_M)[:, None] * jnp.array(STEP_SHARES)
 
 
-def _reach(predicted, axes):
-    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], predicted.covariance[:, :2, :2], axes[:, :2, :2])
+def _reach(covariance, axes):
+    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], covariance[:, :2, :2], axes[:, :2, :2])
     return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.models.person.scene import walkable
+from jaxfilters.models.person.scene import nearest_on_border, walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity
 from jaxfilters.trackers.people.births import Birth
 from jaxfilters.trackers.people.exchange import is_meeting
@@ -13,9 +13,12 @@ from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.state import (
     DORMANT,
     FREE,
+    HEIGHT,
+    NUM_BIASES,
     STATE,
     TENTATIVE,
     TRACKED,
+    WIDTH,
     People,
     PeopleConfig,
     PeopleScene,
@@ -31,6 +34,8 @@ LEAST_SURPLUS = 0.5
 """Mean log likelihood ratio a pixel that two people explain beyond what one of them explains alone."""
 SUPERFLUOUS_COST = 2.0
 """Log odds per second lost by a person who explains less than that."""
+AWAY_SD = 2.0
+"""Standard deviations beyond the border of the floor from which on a person has left it."""
 LOST_SD_M = 1.2
 """A place known no better than this is no place."""
 LIKENESS = 0.3
@@ -54,13 +59,23 @@ def judged(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], l
     log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
     unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)
     sd = jnp.sqrt(jnp.max(jnp.diagonal(people.belief.covariance, axis1=1, axis2=2)[:, :2], axis=-1))
-    away = ~walkable(scene.floor, people.belief.mean[:, :2])
+    away = _is_away(scene, people.belief)
     gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | (sd > LOST_SD_M) | away)
     gone |= (people.mode == TENTATIVE) & (unseen > 0.5)
     mode = jnp.where(gone, jnp.where(people.mode == TRACKED, DORMANT, FREE), people.mode)
     mode = jnp.where((mode == DORMANT) & (unseen > config.memory_s + config.hidden_s), FREE, mode)
     mode = jnp.where((mode == TENTATIVE) & (log_odds > config.confirmed), TRACKED, mode)
     return people._replace(log_odds=log_odds, unseen_s=unseen, mode=mode)
+
+
+def _is_away(scene: PeopleScene, belief: Gaussian) -> Bool[Array, " slots"]:
+    """Who is beyond the border of the floor by more than the place is uncertain in that direction."""
+    xy = belief.mean[:, :2]
+    beyond = xy - nearest_on_border(scene.floor, xy)
+    distance = jnp.linalg.norm(beyond, axis=-1)
+    normal = beyond / jnp.maximum(distance, 1e-6)[:, None]
+    sd = jnp.sqrt(jnp.einsum("ki,kij,kj->k", normal, belief.covariance[:, :2, :2], normal))
+    return ~walkable(scene.floor, xy) & (distance > AWAY_SD * sd)
 
 
 def seniority(people: People) -> Float[Array, " slots"]:
@@ -107,10 +122,9 @@ def admitted(config: PeopleConfig, people: People, found: Birth) -> People:
     free = people.mode == FREE
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
     n = len(free)
-    mean = jnp.concatenate([found.xy, jnp.zeros(2), jnp.array([config.height_m, config.width_m])])
-    sd = jnp.array(
-        [NEWCOMER_SD_M, NEWCOMER_SD_M, config.speed_sd, config.speed_sd, config.height_sd_m, config.width_sd_m]
-    )
+    mean = jnp.zeros(STATE).at[:2].set(found.xy).at[HEIGHT].set(config.height_m).at[WIDTH].set(config.width_m)
+    position, speed = [NEWCOMER_SD_M] * 2, [config.speed_sd] * 2
+    sd = jnp.array([*position, *speed, config.height_sd_m, config.width_sd_m, *[1.0] * NUM_BIASES])
     fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(jnp.diag(sd**2), (n, STATE, STATE)))
     return people._replace(
         belief=chosen(slot, fresh, people.belief),

@@ -31,10 +31,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="background subtraction (default: %(default)s)",
     )
     parser.add_argument(
+        "--detections",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="boxes of any detector (MOT text or COCO .json) in place of background subtraction, one for each source",
+    )
+    parser.add_argument(
         "--capacity", type=positive_integer, metavar="N", help="people at a time, at most (default: 32)"
     )
     add_video_options(parser)
     add_resume(parser)
     parser.add_argument("--mot", action="store_true", help="write tracks_mot.txt as well (MOT challenge)")
+    parser.add_argument("--coco", action="store_true", help="write tracks_coco.json as well (COCO annotations)")
     add_seed(parser)
     add_results_options(parser)

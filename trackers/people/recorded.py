@@ -22,9 +22,9 @@ class Sighting(NamedTuple):
     frame: int
     time_s: float
     mean: np.ndarray
-    """(6,)."""
+    """(9,): X, Y, velocity along X and Y, height, width, metres and metres per second; biases of the silhouette."""
     covariance: np.ndarray
-    """(6, 6)."""
+    """(9, 9)."""
     score: float
     slot: int
     """Where the tracker kept this person: another one after a change of identities."""
@@ -133,19 +133,25 @@ def spreads(centers: np.ndarray, sighting: Sighting) -> tuple[float, float]:
 def smoothed(config: PeopleConfig, tracks: dict[int, list[Sighting]]) -> dict[int, list[Sighting]]:
     """The same tracks, every belief given all frames of its piece (H. Rauch, F. Tung, C. Striebel 1965).
 
-    A gap longer than `hidden_s` seconds ends one piece and begins another, and so does a change of slots.
+    A gap longer than `hidden_s` seconds ends one piece and begins another, and so does a change of slots or a person
+    who was lost and found again.
     """
     return {
-        identity: [seen for piece in _pieces(track, config.hidden_s) for seen in _smoothed(config, piece)]
+        identity: [seen for piece in pieces(track, config.hidden_s) for seen in _smoothed(config, piece)]
         for identity, track in tracks.items()
     }
 
 
-def _pieces(track: list[Sighting], longest_s: float) -> list[list[Sighting]]:
+def pieces(track: list[Sighting], longest_s: float) -> list[list[Sighting]]:
+    """A track cut where nothing ties the places before to those after: parts of it by frame, as `smoothed` has them."""
     ordered = sorted(track, key=lambda seen: seen.frame)
     pairs = enumerate(itertools.pairwise(ordered), 1)
-    cuts = [i for i, (a, b) in pairs if b.time_s - a.time_s > longest_s or b.slot != a.slot]
+    cuts = [i for i, (a, b) in pairs if b.time_s - a.time_s > longest_s or b.slot != a.slot or _is_found_again(a, b)]
     return [ordered[a:b] for a, b in zip([0, *cuts], [*cuts, len(ordered)], strict=True)]
+
+
+def _is_found_again(before: Sighting, now: Sighting) -> bool:
+    return now.mode == "tentative" and before.mode != "tentative"
 
 
 def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
-from jaxfilters.trackers.background.choice import background
+from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, start, step
@@ -118,18 +118,24 @@ class PeopleTracks:
 class PeopleSession:
     """The tracker over images."""
 
-    def __init__(self, scene: PeopleScene, subtraction: str = "median"):
+    def __init__(self, scene: PeopleScene, subtraction: str | Sequence[Background] = "median"):
         """Nobody yet, and backgrounds of which nothing is known: `prime` them with images of a recording.
 
         Args:
             scene: Cameras, floor and furniture.
-            subtraction: `median`, `mog2` or `knn`.
+            subtraction: `median`, `mog2` or `knn`, or one object for each camera that gives the foreground of its
+                images, such as `DetectedForeground`.
 
         Raises:
-            ValueError: if there is no such method.
+            ValueError: if there is no such method, or not one object for each camera.
         """
+        if not isinstance(subtraction, str) and len(subtraction) != len(scene.cameras):
+            raise ValueError(
+                f"subtraction: expected one for each of {len(scene.cameras)} cameras; got {len(subtraction)}."
+            )
         self.tracks = PeopleTracks(scene)
-        self._backgrounds = [background(subtraction) for _ in scene.cameras]
+        by_name = isinstance(subtraction, str)
+        self._backgrounds = [background(subtraction) for _ in scene.cameras] if by_name else list(subtraction)
         self._images = [np.zeros((*camera.shape, 3), np.uint8) for camera in scene.cameras]
         self._outlines: list[Outline] | None = None
         self._estimate: PeopleEstimate | None = None

@@ -10,6 +10,7 @@ from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, standing
 from jaxfilters.models.person.foreground import Window, contrast, log_likelihood_ratio, presence
+from jaxfilters.trackers.people.silhouette_bias import displacement
 from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
 
 MARGIN = 0.3
@@ -35,16 +36,21 @@ class View(NamedTuple):
     """Of the predicted outline, square pixels."""
 
 
-def place_of(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots 4"]:
+def place_of(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots 4"]:
     """X, Y, height and width of what a state looks like: a person who walks is lower than the same one at rest."""
     return mean[..., jnp.array(PLACE)].at[..., 2].multiply(stature(mean))
 
 
-def stature(mean: Float[Array, "*slots 6"]) -> Float[Array, "*slots"]:
+def stature(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots"]:
     """Height as it appears, in heights of a body of which half the frames show a stride, as those behind `presence`."""
     speed = jnp.linalg.norm(mean[..., 2:4], axis=-1)
     stride = (speed - STANDING_M_PER_S) / (WALKING_M_PER_S - STANDING_M_PER_S)
     return 1 + SINK * (0.5 - jnp.clip(stride, 0.0, 1.0))
+
+
+def observed_place(scene: PeopleScene, mean: Float[Array, " 9"]) -> Float[Array, " 4"]:
+    """X, Y, height and width of the silhouette of a state: `place_of` displaced by its biases."""
+    return place_of(mean) + displacement(scene, mean)
 
 
 def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:

@@ -17,11 +17,16 @@ MODE_NAMES = ("free", "tentative", "tracked", "dormant")
 """Slots: unused; a person who may be a mistake; a person; a person who was lost sight of and may come back."""
 APPEARANCE = 48
 """Numbers that describe clothes: histograms of eight bins of three colours, of the upper and the lower half."""
-STATE = 6
-"""X, Y, velocity along X and Y, height, width: metres and metres per second."""
+NUM_BIASES = 3
+STATE = 6 + NUM_BIASES
+"""X, Y, velocity along X and Y, height, width: metres and metres per second; normalised biases of the silhouette."""
 HEIGHT, WIDTH = 4, 5
+BIAS = slice(6, STATE)
 PLACE = (0, 1, HEIGHT, WIDTH)
 """X, Y, height and width in a state: what one image shows."""
+
+
+_MAY_BE_ZERO = ("spread_px", "silhouette_bias_px")
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,12 @@ class PeopleConfig:
     """How many independent looks one silhouette is worth, whatever its size in pixels."""
     silhouette_sd_m: float = 0.05
     """Of what shape and gait add to every coordinate."""
+    silhouette_bias_m: float = 0.04
+    """Standard deviation of what shape, clothes and thresholds displace feet, head and sides for seconds."""
+    silhouette_bias_px: float = 1.25
+    """The same in pixels, of edges and lenses."""
+    silhouette_bias_s: float = 5.0
+    """Time in which these displacements change."""
     spread_px: float = 0.5
     """How far silhouettes reach beyond their edges: an edge that lens, video coder and resampling blur by 0.8 pixels
     crosses a threshold of 30 grey levels that much too far out where the contrast is 100."""
@@ -69,7 +80,7 @@ class PeopleConfig:
 
     def __post_init__(self) -> None:
         for name in [
-            entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity", "spread_px")
+            entry.name for entry in fields(self) if entry.name not in ("grid", "dropped", "capacity", *_MAY_BE_ZERO)
         ]:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and 0 < value < np.inf):
@@ -77,8 +88,9 @@ class PeopleConfig:
         sizes = (self.capacity, *self.grid)
         if len(sizes) != 3 or any(not isinstance(size, int) or size < 1 for size in sizes):
             raise ValueError(f"capacity and grid must be positive integers; got {self.capacity!r}, {self.grid!r}.")
-        if not 0 <= self.spread_px < np.inf:
-            raise ValueError(f"spread_px must be 0 or more pixels; got {self.spread_px!r}.")
+        for name in _MAY_BE_ZERO:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be 0 or more pixels; got {getattr(self, name)!r}.")
         if not self.dropped < 0:
             raise ValueError(f"dropped must be negative log odds; got {self.dropped!r}.")
 

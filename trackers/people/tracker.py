@@ -19,13 +19,16 @@ from jaxfilters.trackers.people.births import birth, cells_of, padded
 from jaxfilters.trackers.people.exchange import identity_switch_correction
 from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.silhouettes import body_of, place_of, stature
+from jaxfilters.trackers.people.silhouette_bias import bias_factor
+from jaxfilters.trackers.people.silhouettes import body_of, observed_place, stature
 from jaxfilters.trackers.people.state import (
+    BIAS,
     HEIGHT,
     PLACE,
     STATE,
     TENTATIVE,
     TRACKED,
+    WIDTH,
     CameraFrame,
     People,
     PeopleConfig,
@@ -37,7 +40,7 @@ from jaxfilters.trackers.people.state import (
 
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""
-NO_DEPTH = 0.03
+NO_DEPTH = 0.05
 """Standard deviation along the line of sight, in distances from the camera, from which on depth is not measured: the
 pair of a desk that hides the feet and a border that hides the head gives as much, either alone gives less."""
 CLEAR = 0.5
@@ -106,11 +109,11 @@ def step(
     F, Q = motion(scene.config, dt)
     predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
     fit = fit_people(scene, predicted, active, lifecycle.seniority(people), frames)
-    belief, nis = _updated(scene.config, predicted, fit)
+    belief, nis = _updated(scene, predicted, fit)
     people = people._replace(belief=chosen(active, belief, people.belief))
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.judged(scene, people, fit, dt, looked)
-    places = place_of(people.belief.mean)
+    places = _observed_places(scene, people)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
@@ -123,18 +126,23 @@ def step(
 @jax.jit
 def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
     """The outlines of everybody in each camera, one row a slot."""
-    bodies = jax.vmap(body_of)(place_of(people.belief.mean))
+    bodies = jax.vmap(body_of)(_observed_places(scene, people))
     return tuple(jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies) for camera in scene.cameras)
 
 
-def _updated(config: PeopleConfig, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:
-    y, H, R, seen = as_measurement(fit, config.silhouette_sd_m)
+def _observed_places(scene: PeopleScene, people: People) -> Array:
+    return jax.vmap(observed_place, in_axes=(None, 0))(scene, people.belief.mean)
+
+
+def _updated(scene: PeopleScene, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:
+    y, H, R, seen = as_measurement(fit, scene.config.silhouette_sd_m)
     in_state = jnp.eye(STATE)[jnp.array(PLACE)]
 
     def one(belief, y, H, R, seen, whole):
-        H = (H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean))
+        biases = H @ bias_factor(scene, belief.mean)
+        H = (H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean)).at[:, BIAS].set(biases)
         after, info = joseph.update(belief, y, H, R, mask=seen)
-        size = jnp.arange(STATE) >= HEIGHT
+        size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
         return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
 
     return jax.vmap(one)(predicted, y, H, R, seen, fit.share_seen > WHOLE)

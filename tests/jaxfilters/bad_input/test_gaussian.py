@@ -67,6 +67,20 @@ def schmidt(constant=None, signature=lambda mean: mean, inner=None, tolerance=1.
     return jf.run(jf.schmidt_kalman(inner, signature, constant, tolerance, **options), KEY, YS)
 
 
+def process(tau=2.0, B=None):
+    return jf.GaussMarkov(jnp.asarray(tau), jnp.ones(1) if B is None else B)
+
+
+def lasting(noise=None, inner=None, ys=YS, **options):
+    inner = extended() if inner is None else inner
+    return jf.run(jf.correlated_noise(inner, process() if noise is None else noise, **options), KEY, ys)
+
+
+def differenced(noise=None, R=0.0 * R, ys=YS, **options):
+    inner = extended(R=R, **options)
+    return jf.run(jf.measurement_differencing(inner, process() if noise is None else noise), KEY, ys)
+
+
 def rts(beliefs=None, inputs=None, filter=None):
     beliefs = jf.Gaussian(jnp.zeros((5, 2)), jnp.stack([jnp.eye(2)] * 5)) if beliefs is None else beliefs
     return jf.smoothing.rts(extended() if filter is None else filter, beliefs, inputs)
@@ -275,11 +289,42 @@ WRAPPERS = {
     "schmidt_kalman, scalar signature": (lambda: schmidt(signature=lambda mean: mean[0]), ("signature", "(d,)", "()")),
     "schmidt_kalman, signature": (lambda: schmidt(signature=3), ("signature", "function", "int")),
     "schmidt_kalman, tolerance": (lambda: schmidt(tolerance=-1.0), ("tolerance", "positive", "-1.0")),
+    "schmidt_kalman, no signature": (lambda: schmidt(signature=None), ("signature", "None", "1.0")),
     "schmidt_kalman, inner": (lambda: schmidt(inner=PRIOR), ("inner", "Filter", "Gaussian")),
     "schmidt_kalman, inner with roots": (
         lambda: schmidt(inner=extended(prior=ROOT_PRIOR, arithmetic=jf.arithmetic.square_root)),
         ("inner", "Gaussian", "GaussianRoot"),
     ),
+    "correlated_noise, inner": (lambda: lasting(inner=robust()), ("inner", "kalman", "Robust")),
+    "correlated_noise, iterations": (lambda: lasting(inner=extended(iterations=3)), ("inner", "iterations=3")),
+    "correlated_noise, noise": (lambda: lasting(R), ("noise", "GaussMarkov", "Array")),
+    "correlated_noise, time constant": (lambda: lasting(process(-2.0)), ("time_constant", "positive", "-2.0")),
+    "correlated_noise, time constants": (lambda: lasting(process([1.0, 2.0])), ("time_constant", "(1,)", "(2,)")),
+    "correlated_noise, matrix of time": (
+        lambda: lasting(process([[-1.0]])),
+        ("time_constant", "positive real parts", "-1"),
+    ),
+    "correlated_noise, variance": (lambda: lasting(process(B=-jnp.ones(1))), ("covariance", "at least 0", "-1.0")),
+    "correlated_noise, covariance": (lambda: lasting(process(B=INDEFINITE)), ("covariance", "semidefinite", "-1")),
+    "correlated_noise, impossible process": (
+        lambda: lasting(process([0.01, 100.0], 0.05 * jnp.eye(2) + 0.95), loading=jnp.ones((1, 2))),
+        ("covariance", "time constants", "negative variance"),
+    ),
+    "correlated_noise, rows": (lambda: lasting(process(B=jnp.ones(2))), ("loading", "(1, 2)", "(2, 2)")),
+    "correlated_noise, loading": (lambda: lasting(loading=jnp.ones((1, 3))), ("loading", "1 columns", "(1, 3)")),
+    "correlated_noise, dt": (lambda: lasting(dt=-1.0), ("dt", "positive", "-1.0")),
+    "correlated_noise, dt of each row": (lambda: lasting(dt=jnp.ones(2)), ("dt", "one number", "(2,)")),
+    "correlated_noise, wide y": (lambda: lasting(ys=jnp.zeros((5, 3))), ("observation y", "(1,)", "(3,)")),
+    "measurement_differencing, white noise": (lambda: differenced(R=R), ("observation noise", "zeros", "1.0")),
+    "measurement_differencing, noise": (
+        lambda: differenced(process(B=jnp.eye(1))),
+        ("noise", "independent", "(1, 1)"),
+    ),
+    "measurement_differencing, sigma points": (
+        lambda: differenced(linearize=jf.linearize.cubature),
+        ("inner", "taylor"),
+    ),
+    "measurement_differencing, wide y": (lambda: differenced(ys=jnp.zeros((5, 3))), ("observation y", "(1,)", "(3,)")),
     "rts, one belief": (lambda: rts(PRIOR), ("beliefs", "time first", "(2,)")),
     "rts, beliefs of another size": (
         lambda: rts(jf.Gaussian(jnp.zeros((5, 3)), jnp.zeros((5, 3, 3)))),

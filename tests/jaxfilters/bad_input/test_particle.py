@@ -54,6 +54,15 @@ def run_bootstrap(prior=prior, move=move, log_likelihood=log_likelihood, ys=YS, 
     return jf.run(jf.bootstrap(prior, move, log_likelihood, noise=noise, **options), KEY, ys)
 
 
+def run_correlated(variance=None, B=None, tau=1.0, ys=YS, observe=lambda x: x, **options):
+    process = jf.GaussMarkov(jnp.array(tau), jnp.ones(1) if B is None else B)
+    variance = jnp.ones(1) if variance is None else variance
+    filter = jf.correlated_bootstrap(
+        prior, move, observe, variance, process, num_particles=8, noise=NORMAL, **options
+    )  # fmt: skip
+    return jf.run(filter, KEY, ys)
+
+
 def log_transition(x_next, x):
     return -jnp.sum((x_next - x) ** 2)
 
@@ -190,6 +199,13 @@ PARTICLE = [
     Case("likelihood no function", lambda: run_bootstrap(log_likelihood=0.0), ("log_likelihood",)),
     Case("noise no function", lambda: run_bootstrap(noise=3), ("noise", "3")),
     Case("noise of one particle", lambda: run_bootstrap(noise=lambda key, n: jnp.zeros(1)), ("noise", "8", "(1,)")),
+    Case("correlated, time", lambda: run_correlated(tau=0.0), ("time_constant", "positive", "0.0")),
+    Case("correlated, rows", lambda: run_correlated(B=jnp.eye(1)), ("process", "independent", "(1, 1)")),
+    Case("correlated, variances", lambda: run_correlated(jnp.ones(2)), ("variance", "(1,)", "(2,)")),
+    Case("correlated, negative", lambda: run_correlated(-jnp.ones(1)), ("variance", "at least 0", "-1.0")),
+    Case("correlated, wide y", lambda: run_correlated(ys=jnp.zeros((3, 2))), ("observation y", "(1,)", "(2,)")),
+    Case("correlated, observe", lambda: run_correlated(observe=lambda x: x[0]), ("observe", "(1, 8)", "(8,)")),
+    Case("correlated, dt", lambda: run_correlated(dt=-1.0), ("dt", "positive", "-1.0")),
     Case("normal of half", lambda: jf.StandardNormal(0.5), ("shape", "0.5")),
     Case("normal negative", lambda: jf.StandardNormal((3, -1)), ("shape", "-1")),
     Case("no particles", lambda: run_bootstrap(num_particles=0), ("num_particles", "0")),

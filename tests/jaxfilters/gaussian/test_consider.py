@@ -115,9 +115,43 @@ def test_the_oldest_view_gives_way(x64):
     assert np.all(infos.is_new)
 
 
+def textbook(H, G, B, P, Q, R, ys):
+    """Schmidt's filter with the bias beside the state, in NumPy: the gain of the bias is zero."""
+    n, k = len(P), len(B)
+    joint, mean = np.block([[P, np.zeros((n, k))], [np.zeros((k, n)), B]]), np.zeros(n + k)
+    C, noise = np.hstack([H, G]), np.diag(np.append(np.diag(Q), np.zeros(k)))
+    for y in ys:
+        joint = joint + noise
+        gain = joint @ C.T @ np.linalg.inv(C @ joint @ C.T + R)
+        gain[n:] = 0
+        left = np.eye(n + k) - gain @ C
+        mean, joint = mean + gain @ (y - C @ mean), left @ joint @ left.T + gain @ R @ gain.T
+    return mean, joint
+
+
+def test_considered_errors_that_rows_share_are_schmidts_nuisances(x64):
+    """Two sensors share one bias and have one each; the biases stay N(0, B), and the errors are those claimed."""
+    H, G = np.array([[1.0], [1.0], [1.0]]), np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    B, P, Q, R = np.diag([0.3, 0.1]), np.eye(1), 1e-4 * np.eye(1), 0.04 * np.eye(3)
+    rng = np.random.default_rng(0)
+    ys = rng.normal(size=(40, 3))
+    inner = jaxfilters.kalman(Gaussian(jnp.zeros(1), jnp.asarray(P)), jnp.eye(1), jnp.asarray(Q), H, jnp.asarray(R))
+    bias = jaxfilters.GaussMarkov(jnp.array(jnp.inf), jnp.asarray(np.diag(B)))
+    filter = schmidt_kalman(
+        jaxfilters.correlated_noise(inner, bias, loading=jnp.asarray(G)), None, jnp.array([False, True, True])
+    )
+    last, (_, infos) = jaxfilters.run(filter, jax.random.key(0), jnp.asarray(ys))
+    mean, covariance = textbook(H, G, B, P, Q, R, ys)
+    np.testing.assert_allclose(last.inner.mean, mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(last.inner.covariance, covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(last.inner.covariance[1:, 1:], B)
+    assert not np.any(infos.is_new)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"tolerance": None}, "signature and tolerance must both be given, or both be None"),
         ({"capacity": 0}, "capacity must be an integer of at least 1; got 0"),
         ({"tolerance": 0.0}, "tolerance must be positive, in the unit of the signature; got 0.0"),
     ],

@@ -1,14 +1,14 @@
 """Registration: its gradient, its convergence on rendered hands, and the search without a start."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.motion import per_coordinate
-from jaxfilters.models.hand.observation import HandLikelihood, union
 from jaxfilters.models.hand.registration import (
     PosePrior,
     RegistrationConfig,
@@ -17,8 +17,7 @@ from jaxfilters.models.hand.registration import (
     target_from_image,
 )
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, local, open_palm, retract
-from jaxfilters.models.hand.start import SCALES, Sighting, find_start
-from jaxfilters.models.hand.surface import CapsuleHand
+from jaxfilters.models.hand.start import SCALES, find_starts
 from jaxfilters.models.rendering.depth import render_capsules
 
 GEOMETRY = hand_geometry()
@@ -109,21 +108,24 @@ def test_nothing_seen_leaves_the_prior():
     np.testing.assert_allclose(found.information, 0, atol=1e-6)
 
 
-@jax.jit
-def search(observed, sighting):
-    likelihood = HandLikelihood(CapsuleHand(GEOMETRY), jnp.asarray(1.0), 0.1, union, gibbs_abs)
-    return find_start(NEAR_CAMERA, observed, sighting, likelihood, jnp.asarray(SCALES))
+def joints(start):
+    geometry = replace(GEOMETRY.scaled(start.scale), side=jnp.asarray(start.side))
+    return np.asarray(forward_kinematics(jnp.asarray(start.pose), geometry).joints)
 
 
 @pytest.mark.system
-def test_a_hand_of_unknown_size_is_found_without_a_start():
-    scale = 0.9
-    truth = open_palm(jnp.array([0.02, 0.09, 0.7])).at[7:].set(jnp.tile(jnp.deg2rad(jnp.array([5.0, 8.0, 12.0])), 5))
-    geometry = GEOMETRY.scaled(scale)
-    observed = render(NEAR_CAMERA, truth, geometry)
-    sighting = Sighting(truth[:3] - jnp.array([0.0, 0.055 * scale, 0.0]), jnp.zeros(3))
-    start = search(observed, sighting)
-    assert abs(float(start.scale) - scale) < 0.051
-    joints = forward_kinematics(start.pose, GEOMETRY.scaled(start.scale)).joints
-    assert 1000 * np.linalg.norm(joints - forward_kinematics(truth, geometry).joints, axis=-1).mean() < 12
-    assert start.cost < 0.02
+@pytest.mark.parametrize(("side", "roll"), [(1.0, 0.4), (-1.0, 2.8)])
+def test_a_hand_of_either_side_and_of_unknown_size_is_found_without_a_start(side, roll):
+    # One of them hangs down, without a forearm in sight: nothing but the fingers says which way it points.
+    scale, turn = 0.9, jnp.array([np.cos(roll / 2), 0.0, 0.0, np.sin(roll / 2)])
+    pose = open_palm(jnp.array([0.02, 0.0, 0.7])).at[3:7].set(turn)
+    pose = pose.at[7:].set(jnp.tile(jnp.deg2rad(jnp.array([5.0, 8.0, 12.0])), 5))
+    truth = forward_kinematics(pose, replace(GEOMETRY.scaled(scale), side=jnp.asarray(side)))
+    observed = jax.jit(render_capsules)(NEAR_CAMERA, truth.capsules)
+    palm = np.asarray(truth.joints)[[0, 5, 17]].mean(axis=0)
+    starts = find_starts(NEAR_CAMERA, observed, palm, GEOMETRY, SCALES)
+    assert starts[0].side == side
+    assert abs(starts[0].scale - scale) < 0.051
+    assert 1000 * np.linalg.norm(joints(starts[0]) - np.asarray(truth.joints), axis=-1).mean() < 12
+    assert starts[0].cost < 0.01
+    assert all(start.cost >= starts[0].cost for start in starts)

@@ -9,7 +9,14 @@ from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import pixel_grid
-from jaxfilters.models.person.scene import mesh_depth, patch_depth, patch_floor_distance, upright_depth, walkable
+from jaxfilters.models.person.scene import (
+    mesh_depth,
+    nearest_on_border,
+    patch_depth,
+    patch_floor_distance,
+    upright_depth,
+    walkable,
+)
 
 SHAPE = (30, 40)
 BOXES = (
@@ -122,3 +129,14 @@ def test_walkable_agrees_with_opencv():
     clear = np.abs(distance) > 1e-3
     found = np.asarray(walkable(jnp.asarray(polygon), jnp.asarray(xy.reshape(50, 10, 2)))).ravel()
     np.testing.assert_array_equal(found[clear], distance[clear] > 0)
+
+
+def test_nearest_point_of_the_border_is_that_of_a_dense_polyline():
+    """The border sampled every millimetre, for points inside and outside of a polygon that is not convex."""
+    polygon = np.array([(0.0, 0), (4, 0), (4, 3), (2, 1), (0, 3)])
+    ends = np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1)
+    border = np.concatenate([np.linspace(a, b, int(1000 * np.linalg.norm(b - a)) + 1) for a, b in ends])
+    xy = np.random.default_rng(0).uniform(-2, 6, (40, 2))
+    found = np.asarray(nearest_on_border(jnp.asarray(polygon), jnp.asarray(xy)))
+    expected = border[np.argmin(np.linalg.norm(xy[:, None] - border, axis=-1), axis=1)]
+    np.testing.assert_allclose(np.linalg.norm(xy - found, axis=1), np.linalg.norm(xy - expected, axis=1), atol=1e-3)

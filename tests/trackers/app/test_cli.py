@@ -11,7 +11,7 @@ from jaxfilters.trackers.app.devices import available_cores, use_all_cores
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.hand_depth import command as hand_command
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
-from jaxfilters.trackers.hand_depth.tracker import HandDepthConfig
+from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.tracker import CHUNK
 
 OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}

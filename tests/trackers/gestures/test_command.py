@@ -47,8 +47,8 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     assert run("fit", "gestures", data, "--out", model, "--states", 6, "--held-out", "person") == 0
     told = capsys.readouterr().out
     assert "vl.csv: 12 strokes of 2 symbols" in told
-    assert "people left out in turn: 100.00 % right" in told
-    assert "Ann: 100.0 % of 6" in told
+    assert "people left out in turn: 100.00 % right if none is rejected; 100.00 % accepted" in told
+    assert "Ann: 100.0 % of 6; 100.00 % accepted, 100.00 % of these right" in told
     five = written(tmp_path / "z.csv", "Z", people=("Ann",), trials=5)
     assert run("fit", "gestures", five, "--out", more, "--add", model) == 0
     assert "3 symbols, 3 models of 6 states" in capsys.readouterr().out
@@ -59,7 +59,8 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     with everything.open("a") as file:
         file.write("dot,,,1,1\nhole,,,nan,1\n")
     assert run("recognise", more, everything, "--out", tmp_path / "out" / "table.csv") == 0
-    assert "14 strokes, 2 rejected; of 12 with a label 12 are right, 100.0 %" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "14 strokes, 2 rejected; of 12 with a label 100.00 % right if none is rejected; 100.00 % accepted" in told
     with (tmp_path / "out" / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["symbol"] for row in rows] == ["Z"] * 4 + ["L"] * 4 + ["V"] * 4 + [""] * 2
@@ -73,7 +74,10 @@ def test_without_data_symbols_are_drawn(tmp_path, capsys, monkeypatch):
     assert run("recognise", "default", "--margin", 0.3) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].split() == list(gesture_command.COLUMNS)
-    assert told[-1] == "24 strokes, 0 rejected; of 24 with a label 24 are right, 100.0 %"
+    assert told[-1] == (
+        "24 strokes, 0 rejected; of 24 with a label 100.00 % right if none is rejected; 100.00 % accepted, "
+        "100.00 % of these right"
+    )
 
 
 @pytest.mark.optimised
@@ -99,7 +103,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, capsys):
     for arguments, word in (
         (("fit", "gestures", nameless, "--out", model), "stroke a has no label"),
         (("fit", "gestures", flat, "--out", model, "--add", model), "new names"),
-        (("fit", "gestures", deep, "--out", model, "--add", model), "2 dimensions, DATA in 3"),
+        (("fit", "gestures", deep, "--out", model, "--add", model), "2 dimensions (8 features a point), DATA are"),
         (("fit", "gestures", tmp_path / "none.csv", "--out", model), "no such file"),
         (("recognise", model, deep), "positions of 2 dimensions"),
         (("recognise", tmp_path / "deep.npz"), "in space"),

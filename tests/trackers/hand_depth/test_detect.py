@@ -1,12 +1,13 @@
-"""Finding the nearest hand in a frame."""
+"""Places in a frame that may be a hand, and units of depth that cannot be."""
 
 import numpy as np
 import pytest
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.hand_depth.detect import nearest_hand
+from jaxfilters.trackers.hand_depth.detect import check_unit, hand_sightings
 
 CAMERA = Pinhole.from_intrinsics((200.0, 200.0), (80.0, 60.0), (120, 160))
+PALM = [10 / 200 * 0.6, -10 / 200 * 0.6, 0.615]
 
 
 def blank():
@@ -18,30 +19,46 @@ def with_palm(frame, row=50, col=90, depth=0.6):
     return frame
 
 
-def test_the_palm_is_the_middle_of_the_nearest_object():
-    frame = with_palm(np.full((120, 160), 2.0, np.float32))
-    sighting = nearest_hand(CAMERA, frame)
-    np.testing.assert_allclose(sighting.center, [10 / 200 * 0.6, -10 / 200 * 0.6, 0.615], atol=0.004)
-    np.testing.assert_array_equal(sighting.forearm, 0)
+def nearest_to(sightings, center):
+    return min(np.linalg.norm(sighting.center - center) for sighting in sightings)
 
 
-def test_an_arm_behind_the_palm_is_seen_as_such():
-    frame = with_palm(blank())
-    for row in range(65, 120):
-        frame[row, 80:100] = 0.6 + 0.002 * (row - 64)
-    sighting = nearest_hand(CAMERA, frame)
-    np.testing.assert_allclose(np.linalg.norm(sighting.forearm), 1, rtol=1e-5)
-    assert sighting.forearm[1] > 0.7
-    assert abs(sighting.forearm[0]) < 0.2
-    assert sighting.forearm[2] > 0
+def test_the_palm_is_the_middle_of_a_surface():
+    sighting = hand_sightings(CAMERA, with_palm(np.full((120, 160), 1.9, np.float32)))[0]
+    np.testing.assert_allclose(sighting.center, PALM, atol=0.006)
+    assert np.isposinf(sighting.frame[0, 0])
+    assert sighting.frame[50, 90] == np.float32(0.6)
 
 
-def test_specks_in_front_are_looked_past():
+def test_a_wall_just_behind_the_hand_is_not_part_of_it():
+    frame = with_palm(np.full((120, 160), 0.64, np.float32))
+    sighting = hand_sightings(CAMERA, frame)[0]
+    np.testing.assert_allclose(sighting.center, PALM, atol=0.006)
+    assert np.isposinf(sighting.frame[30, 60])
+
+
+def test_a_desk_nearer_than_the_hand_does_not_hide_it():
+    frame = with_palm(np.full((120, 160), 1.9, np.float32))
+    frame[80:] = np.linspace(0.5, 0.4, 40)[:, None]
+    assert nearest_to(hand_sightings(CAMERA, frame), PALM) < 0.01
+
+
+def test_small_holes_and_specks_change_nothing():
     frame = with_palm(blank())
     frame[5, 5] = frame[100, 30:32] = 0.3
-    np.testing.assert_allclose(nearest_hand(CAMERA, frame).center[2], 0.615, atol=0.002)
+    frame[40:60:4, 80:100:4] = np.nan
+    np.testing.assert_allclose(hand_sightings(CAMERA, frame)[0].center, PALM, atol=0.006)
 
 
 @pytest.mark.parametrize("value", [np.nan, 2.5, 0.05])
 def test_nothing_within_reach_is_no_hand(value):
-    assert nearest_hand(CAMERA, np.full((120, 160), value, np.float32)) is None
+    assert hand_sightings(CAMERA, np.full((120, 160), value, np.float32)) == []
+
+
+def test_a_unit_that_cannot_be_metres_is_noticed():
+    frame = with_palm(np.full((120, 160), 1.9, np.float32))
+    assert check_unit(frame) is None
+    assert check_unit(blank()) is None
+    assert "is the unit of depth right?" in check_unit(10 * frame)
+    with pytest.raises(ValueError, match=r"depth must be in metres: no reading is beyond 0\.19 m"):
+        check_unit(frame / 10)

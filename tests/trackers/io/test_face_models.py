@@ -5,16 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.models.face.landmarks import NAMES, PEOPLE_SHAPE
 from jaxfilters.models.face.mirroring import PAIRS, mirrored
 from jaxfilters.models.face.multilinear import learn, shape
+from jaxfilters.models.face.person_prior import log_size
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.face_models import (
     FaceModelFile,
     default_face_model,
     load_face_model,
+    people_face_model,
     save_face_model,
+    with_sizes,
 )
 
 
@@ -108,3 +111,26 @@ def test_the_precision_is_that_of_jax(saved):
     assert load_face_model(saved).model.mean.dtype == jnp.zeros(()).dtype
     with jax.enable_x64(True):
         assert load_face_model(saved).model.mean.dtype == jnp.float64
+
+
+@pytest.mark.system
+def test_the_model_for_people_is_about_their_mean_face_and_wider_in_size():
+    file = people_face_model()
+    face, plain = file.model, default_face_model().model
+    mean = shape(face, face.identity_mean, face.expression_mean)
+    np.testing.assert_allclose(mean - mean.mean(axis=0), PEOPLE_SHAPE, atol=1e-4)
+    np.testing.assert_allclose(mirrored(mean), mean, atol=1e-4)
+    slope = jax.grad(lambda identity: log_size(face, identity))(face.identity_mean)
+    variance = [float(slope @ one.identity_covariance @ slope) for one in (face, plain)]
+    assert variance[0] == pytest.approx(variance[1] + 0.03**2, rel=1e-3)
+    assert 0.03**2 < variance[1] < 0.04**2
+
+
+@pytest.mark.system
+def test_only_the_size_varies_more():
+    """What identity is in independent directions but for the size keeps its variance."""
+    face = default_face_model().model
+    slope = np.asarray(jax.grad(lambda identity: log_size(face, identity))(face.identity_mean), float)
+    before, after = (np.asarray(one.identity_covariance, float) for one in (face, with_sizes(face, 0.05)))
+    beside = np.linalg.svd((before @ slope)[None])[2][1:]
+    np.testing.assert_allclose(beside @ after @ beside.T, beside @ before @ beside.T, atol=1e-6 * before.max())

@@ -28,6 +28,7 @@ from jaxfilters.trackers.calibration.command import read_room_points
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.cameras import open_camera, open_intrinsics, read_tsai
 from jaxfilters.trackers.io.depth import open_depth
+from jaxfilters.trackers.io.detections import read_detections
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
 from jaxfilters.trackers.io.errors import CheckpointError, InputError
 from jaxfilters.trackers.io.face_models import DEFAULT_FILE as FACE_MODEL
@@ -267,7 +268,16 @@ def stroke_numbers(path: Path) -> Any:
     return [np.asarray(piece) for pieces, _ in found.strokes for piece in pieces]
 
 
+def box_numbers(path: Path) -> Any:
+    return list(read_detections(path).values())
+
+
 LANDMARK_NAMES = [str(k) for k in range(68)]
+BOXES = "1,-1,10.5,20,30,60,0.9\n2,-1,11,21,30.5,60,-1\n2,7,1,2,3,4,1,0.5,0.6,0\n"
+COCO = {
+    "images": [{"id": 4}, {"id": 9}],
+    "annotations": [{"image_id": i, "bbox": [10, 20.5, 30, 60], "score": 0.9, "category_id": 1} for i in (4, 9)],
+}
 STROKES_NPZ = npz_file(
     points=RNG.normal(size=(9, 2)), length=np.array([3, 2, 4]), label=np.array(["a", "b", "a"]), person=np.full(3, "x")
 )
@@ -347,6 +357,8 @@ FORMATS = {
     "face model": Format(copied(FACE_MODEL), lambda path: load_face_model(path).model),
     "people": Format(people_file, lambda path: read_people([path], default_face_model().model).remembered),
     "symbols": Format(copied(SYMBOLS), lambda path: read_symbols(path).symbols.models.emission),
+    "boxes.txt": Format(text_file("a.txt", BOXES), box_numbers),
+    "boxes.json": Format(json_file("a.json", COCO), box_numbers),
     "keypoints.npz": Format(FEATURES, feature_numbers, may_lack=True),
     "openpose": Format(openpose, lambda path: feature_numbers(path.parent), may_lack=True),
     "mediapipe.json": Format(json_file("a.json", MEDIAPIPE), feature_numbers, may_lack=True),

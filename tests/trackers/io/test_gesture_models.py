@@ -1,6 +1,7 @@
 """Models of symbols and strokes on disk: written and read again, and what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,11 +29,13 @@ def of_codes():
 @pytest.mark.system
 @pytest.mark.parametrize("learnt", [of_shape, of_codes])
 def test_models_are_read_as_they_were_written(learnt, tmp_path):
-    symbols = learnt()
+    symbols = replace(learnt(), sharpness=0.07, lapse=0.01, margins=np.array([0.25, -0.5]))
     write_symbols(tmp_path / "new" / "model.npz", SymbolsFile(symbols, "two lines", {"strokes": 2}))
     read = read_symbols(tmp_path / "new" / "model.npz")
     assert (read.source, read.parameters, read.symbols.names) == ("two lines", {"strokes": 2}, symbols.names)
     assert read.dimensions == (2 if learnt is of_shape else 0)
+    assert (read.symbols.sharpness, read.symbols.lapse) == (0.07, 0.01)
+    np.testing.assert_array_equal(read.symbols.margins, [0.25, -0.5])
     models, again = symbols.models, read.symbols.models
     np.testing.assert_allclose(again.log_transition, models.log_transition, rtol=1e-6)
     codes, counts = np.full(20, 1), np.ones(20, int)
@@ -66,6 +69,10 @@ def test_what_is_no_model_is_refused_with_the_reason(tmp_path):
         ({"mean": np.full_like(mean, np.nan)}, "mean must be finite"),
         ({"variance": -variance}, "positive"),
         ({"owner": owner + 1}, "owner"),
+        ({"header": {"settings": {"min_variance": 0.1, "lapse": 2}}}, "lapse must be above 0 and at most 1"),
+        ({"margins": np.zeros(3, np.float32)}, "margins must be numbers"),
+        ({"margins": np.full(2, np.nan, np.float32)}, "margins must be finite"),
+        ({"header": {"settings": {"min_variance": 0.1, "sharpness": 0}}}, "sharpness must be above 0"),
     ):
         with pytest.raises(InputError, match=word):
             read_symbols(changed(good, bad, **changes))

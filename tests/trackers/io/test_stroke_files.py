@@ -7,7 +7,7 @@ import pytest
 
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.inkml import read_inkml
-from jaxfilters.trackers.io.strokes import read_strokes
+from jaxfilters.trackers.io.strokes import read_strokes, usable
 
 DIFFERENCES = """<trace xml:id="id4525abc">1125 18432,'23'43,"7"-8,3-5,7 -3,6 2,6 8,3 6 T,2 4*T,3 6,3-6 F F</trace>"""
 """The example of differences in the recommendation, under the element `trace`; below, the points of its table."""
@@ -158,8 +158,45 @@ def test_what_are_no_strokes_is_named(tmp_path, entries, message):
         read_strokes(tmp_path / "a.json")
 
 
-def test_a_coordinate_that_is_no_number_is_a_warning_with_its_line(tmp_path):
-    (tmp_path / "a.csv").write_text("stroke,x,y\na,1,2\na,nan,3\nb,0,0\nb,1,1\n")
-    found = read_strokes(tmp_path / "a.csv")
-    (warning,) = found.warnings
-    assert "line 3: stroke a has a coordinate that is no number" in warning
+def test_what_nothing_can_recognise_is_named_with_its_place(tmp_path):
+    table, archive, listed = tmp_path / "a.csv", tmp_path / "a.npz", tmp_path / "a.json"
+    table.write_text("stroke,x,y\na,1,2\na,nan,3\nb,0,0\nb,1,1\nc,4,4\nd,5,5\nd,5,5\n")
+    points = np.array([[1, 2], [np.nan, 3], [0, 0], [1, 1], [4, 4], [5, 5], [5, 5]], float)
+    np.savez(archive, points=points, length=[1, 1, 2, 1, 2, 0], pieces=[2, 1, 1, 1, 1])
+    listed.write_text(
+        '[{"points": [[1, 2]]}, {"pieces": [[[3, 3]], [[3, 3]]]}, {"points": []}, {"points": [[0, 1], [1, 2]]}]'
+    )
+    assert read_strokes(table).faults == (
+        f"{table}: line 3: stroke a has a coordinate that is no number",
+        "",
+        f"{table}: line 6: stroke c holds a single point",
+        f"{table}: line 7: stroke d does not move",
+    )
+    assert read_strokes(archive).faults == (
+        f"{archive}: row 1: stroke 0 has a coordinate that is no number",
+        "",
+        f"{archive}: row 4: stroke 2 holds a single point",
+        f"{archive}: row 5: stroke 3 does not move",
+        f"{archive}: stroke 4 holds no point",
+    )
+    assert read_strokes(listed).faults == (
+        f"{listed}: stroke 0 holds a single point",
+        f"{listed}: stroke 1 does not move",
+        f"{listed}: stroke 2 holds no point",
+        "",
+    )
+
+
+def test_examples_are_usable_or_left_out_with_a_warning_or_refused(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = "stroke,label,x,y\na,V,0,0\na,V,1,1\nb,V,3,3\n"
+    path.write_text(rows)
+    found = usable(read_strokes(path))
+    assert (found.ids, found.labels, found.faults) == (("a",), ("V",), ("",))
+    assert found.warnings == (f"{path}: line 4: stroke b holds a single point; it is left out",)
+    path.write_text(rows + "c,L,2,2\nc,L,2,2\n")
+    with pytest.raises(InputError, match=r"no usable stroke of \['L'\]: .*line 5: stroke c does not move"):
+        usable(read_strokes(path))
+    path.write_text(rows + "c,V,2,nan\nc,V,2,2\n")
+    with pytest.raises(InputError, match="line 5: stroke c has a coordinate that is no number"):
+        usable(read_strokes(path))

@@ -5,7 +5,7 @@ from jaxfilters.trackers.io.errors import CheckpointError
 from jaxfilters.trackers.people.checkpoints import load, save
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.session import PeopleSession
-from jaxfilters.trackers.people.state import PeopleConfig
+from jaxfilters.trackers.people.state import STATE, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
 
@@ -14,7 +14,7 @@ def test_a_checkpoint_of_people_is_read_as_it_was_written(camera, floor, tmp_pat
     scene = people_scene([camera], floor, config=PeopleConfig(capacity=2, cell_m=2.0))
     session, run = PeopleSession(scene), {"seed": 1}
     session.prime([[np.full((*camera.shape, 3), 90 + i, np.uint8) for i in range(3)]])
-    one = Sighting(3, 0.1, np.arange(6.0), np.eye(6), 0.5, 1, "hidden")
+    one = Sighting(3, 0.1, np.arange(float(STATE)), np.eye(STATE), 0.5, 1, "hidden")
     save(tmp_path, run, session.state(), [(7, one)], 0)
     save(tmp_path, run, session.state(), [(8, one._replace(frame=4))], 1)
     saved = load(tmp_path, run)

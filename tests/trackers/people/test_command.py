@@ -35,7 +35,7 @@ def results(recording, tmp_path_factory):
     folder, _ = recording
     out = tmp_path_factory.mktemp("out") / "run"
     places = ["--camera", str(folder / "camera.json"), "--scene", str(folder / "scene.json")]
-    assert main(["track", "people", str(folder / "room.mp4"), *places, "--out", str(out), "--mot"]) == 0
+    assert main(["track", "people", str(folder / "room.mp4"), *places, "--out", str(out), "--mot", "--coco"]) == 0
     return out
 
 
@@ -69,6 +69,28 @@ def test_every_output_can_be_read(results):
     lines = (results / "tracks_mot.txt").read_text().splitlines()
     assert all(len(line.split(",")) == 10 for line in lines)
     assert min(int(line.split(",")[0]) for line in lines) >= 1
+    annotations = json.loads((results / "tracks_coco.json").read_text())["annotations"]
+    rows = [[float(word) for word in line.split(",")] for line in lines]
+    found = [(one["image_id"] + 1, one["track_id"] + 1, *one["bbox"]) for one in annotations]
+    np.testing.assert_allclose(found, [row[:6] for row in rows])
+
+
+@pytest.mark.system
+def test_boxes_of_a_detector_replace_silhouettes(recording, results, tmp_path):
+    """The boxes that the first run wrote are where the people are; so are the tracks of the second run, from them."""
+    folder, room = recording
+    places = ["--camera", str(folder / "camera.json"), "--scene", str(folder / "scene.json")]
+    boxes = ["--detections", str(results / "tracks_mot.txt"), "--no-video"]
+    assert main(["track", "people", str(folder / "room.mp4"), *places, *boxes, "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "report.json").read_text())["background"] == "detections"
+    with (tmp_path / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len({row["id"] for row in rows}) >= 2
+    xy = room.routes.xy
+    errors = [
+        np.linalg.norm(xy[int(row["frame"])] - [float(row["x_m"]), float(row["y_m"])], axis=1).min() for row in rows
+    ]
+    assert np.median(errors) < 0.35
 
 
 @pytest.mark.system

@@ -102,6 +102,16 @@ def test_nobody_is_followed_off_the_floor_or_without_a_place(scene):
     assert judged(scene, off, fit_of(1.0)).mode.tolist()[:2] == [DORMANT, DORMANT]
 
 
+@pytest.mark.system
+@pytest.mark.parametrize(("sd_m", "mode"), [(0.1, DORMANT), (0.2, TRACKED)])
+def test_the_border_of_the_floor_is_crossed_by_two_standard_deviations(scene, sd_m, mode):
+    """The floor ends at Y = 4; a place 0.3 m beyond is off it only where it is known well."""
+    people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0])
+    mean = people.belief.mean.at[0, 1].set(4.3)
+    people = people._replace(belief=Gaussian(mean, people.belief.covariance.at[0, 1, 1].set(sd_m**2)))
+    assert judged(scene, people, fit_of(1.0)).mode[0] == mode
+
+
 def test_time_that_stands_still_changes_nothing_of_the_hidden(scene):
     people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0])
     after = judged(scene, people, fit_of(0.0, share_seen=0.0), dt=0.0)
@@ -166,7 +176,7 @@ def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
     found = Birth(jnp.array([1.5, 2.5]), jnp.array(True))
     after = lifecycle.admitted(CONFIG, people, found)
     assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
-    np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m])
+    np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m, 0, 0, 0])
     assert after.log_odds.tolist() == [8, 0, 8, 0]
     np.testing.assert_allclose(after.appearance[1], 1 / 8)
     np.testing.assert_array_equal(after.belief.mean[2], people.belief.mean[2])

@@ -101,11 +101,11 @@ def test_smoothed_tracks_are_the_batch_solution(x64):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("time", "slot"), [(20.0, 0), (0.1, 1)])
-def test_a_long_gap_and_another_slot_part_a_track(time, slot):
+@pytest.mark.parametrize(("time", "slot", "mode"), [(20.0, 0, "tracked"), (0.1, 1, "tracked"), (0.1, 0, "tentative")])
+def test_a_long_gap_another_slot_and_a_new_start_part_a_track(time, slot, mode):
     here = [
-        Sighting(f, t, np.full(STATE, float(f)), np.eye(STATE), 0.0, at, "tracked")
-        for f, t, at in ((0, 0.0, 0), (1, time, slot))
+        Sighting(f, t, np.full(STATE, float(f)), np.eye(STATE), 0.0, at, kind)
+        for f, t, at, kind in ((0, 0.0, 0, "tracked"), (1, time, slot, mode))
     ]
     for seen, kept in zip(smoothed(CONFIG, {0: here})[0], here, strict=True):
         np.testing.assert_array_equal(seen.mean, kept.mean)

@@ -10,7 +10,7 @@ from jaxfilters.trackers.people.silhouettes import SINK, place_of, stature
 
 
 def moving(speed, height=1.7):
-    return jnp.array([1.0, 2.0, 0.6 * speed, 0.8 * speed, height, 0.45])
+    return jnp.array([1.0, 2.0, 0.6 * speed, 0.8 * speed, height, 0.45, 0.0, 0.0, 0.0])
 
 
 def test_walkers_sink_as_much_over_a_step_as_the_constant_says():

@@ -13,7 +13,7 @@ from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.video import caption, side_by_side
 from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, displayed
 
-HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (190, 190, 190))
+HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (60, 160, 255), (190, 190, 190))
 """Blue, green, red, in the order of `STATUS_WORDS`."""
 AXIS_COLORS = ((84, 92, 255), (110, 220, 90), (255, 150, 70))
 """Of the axes to the image's right, downwards, and out of the face."""

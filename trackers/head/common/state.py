@@ -13,9 +13,9 @@ from jaxfilters.models.face.patches import Patches, Slopes
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 
-HEAD_STATUS = ("initialising", "rigid", "deformable", "lost")
+HEAD_STATUS = ("initialising", "rigid", "deformable", "lost", "doubtful")
 """Words for the integers in `HeadTrack.status`."""
-INITIALISING, RIGID, DEFORMABLE, LOST = range(4)
+INITIALISING, RIGID, DEFORMABLE, LOST, DOUBTFUL = range(5)
 FRAME_S = 1 / 30
 """Seconds: the step of time in which velocities and diffusion are counted."""
 PATIENCE = 10

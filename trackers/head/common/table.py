@@ -9,12 +9,12 @@ from jaxtyping import Array
 
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.trackers.app.results import Columns, TrackTable
-from jaxfilters.trackers.head.common.state import DEFORMABLE, HEAD_STATUS, NUM_MODES, RIGID, HeadTrack
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, HEAD_STATUS, NUM_MODES, RIGID, HeadTrack
 
 STATUS_WORDS = (*HEAD_STATUS, "skipped")
 """Words for the integers in `TimedHeadTrack.status`; skipped: without an image of each camera."""
 SKIPPED = len(HEAD_STATUS)
-TRACKED = (RIGID, DEFORMABLE)
+TRACKED = (RIGID, DEFORMABLE, DOUBTFUL)
 """Statuses in which there is a pose."""
 AXES = ("x_m", "y_m", "z_m", "roll_rad", "yaw_rad", "pitch_rad")
 """Of a pose, in the table and in reports."""

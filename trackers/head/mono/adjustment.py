@@ -247,7 +247,7 @@ def prior_information(face: MultilinearFace, person: Person, prior: Prior) -> Fl
     prior = prior._replace(past=None)
 
     def residuals(y: Array) -> Array:
-        offset = person.offset + prior.offset_std * y[count:].reshape(person.offset.shape)
+        offset = person.offset + prior.offset_deviations * y[count:].reshape(person.offset.shape)
         who = Person(person.identity + std * y[:count], offset)
         return person_prior.residuals(face, who, face.expression_mean[None], prior)
 

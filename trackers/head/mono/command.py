@@ -25,7 +25,7 @@ from jaxfilters.trackers.head.mono.state import MonoOptions
 from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres, mono_table
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
 from jaxfilters.trackers.io.errors import InputError, as_input_error
-from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model
+from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model, people_face_model
 from jaxfilters.trackers.io.landmark_sets import NAMES_68
 from jaxfilters.trackers.io.video_input import LiveCamera
 
@@ -99,7 +99,9 @@ def _tracked(
 
 
 def _model(options: argparse.Namespace) -> FaceModelFile:
-    file = default_face_model() if options.model is None else load_face_model(options.model)
+    if options.model is None:
+        return default_face_model() if options.video_source is None else people_face_model()
+    file = load_face_model(options.model)
     if file.names not in (NAMES, NAMES_68):
         other = next((name for name in NAMES if name not in file.names), "their order")
         raise InputError(

@@ -12,11 +12,16 @@ from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
 from jaxfilters.trackers.head.mono.detectors import MESH_MM, CascadeDetector, Detector, Seen, dense_noise
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, is_symmetric
 from jaxfilters.trackers.head.mono.state import NUM_FRAMES
+from jaxfilters.trackers.io.detector_errors import DetectorErrors
 
 APART_S, STALE_S = 0.2, 5.0
 """Seconds between two detections that count; from which on one does not any more."""
 SAME_PLACE = 3.0
 """Distances between the eyes within which two detections are of one face."""
+
+
+LEAST_NOISE_PX, EYES_APART_MM = 0.5, 62.0
+"""Noise of a detector, at least; distance between the middles of the eyes in people."""
 
 
 class Detections(NamedTuple):
@@ -27,12 +32,14 @@ class Detections(NamedTuple):
     images: UInt8[np.ndarray, "n rows cols"]
     time: float
     """Of the last, seconds."""
-    std_px: float = DETECTED_PX
-    """Standard deviation of each coordinate of the points."""
+    std_px: float | Float[np.ndarray, " K"] = DETECTED_PX
+    """Standard deviation of each coordinate of the points, perhaps for each landmark."""
     dense: Dense | None = None
     """The 68 landmarks, if they are known."""
     iris_px: Float[np.ndarray, "n 2"] | None = None
     """Widths of the irises, if they are visible."""
+    errors: DetectorErrors | None = None
+    """By how much the detector misplaces the points in all images alike, if it does."""
 
 
 class Collector:
@@ -120,9 +127,21 @@ class Collector:
         widths = [one.iris_px for one in self._seen if one.iris_px is not None]
         dense = None if len(many) < NUM_FRAMES else _of_mesh(np.stack(many))
         iris_px = None if len(widths) < NUM_FRAMES else np.stack(widths)
-        found = Detections(points, np.stack(self._images), time, dense=dense, iris_px=iris_px)
+        errors = self._detector.errors
+        std_px = DETECTED_PX if errors is None else noise_px(errors, points)
+        found = Detections(points, np.stack(self._images), time, std_px, dense, iris_px, errors)
         self.clear()
         return found
+
+
+def noise_px(errors: DetectorErrors, points: Float[np.ndarray, "n K 2"]) -> Float[np.ndarray, " K"]:
+    """Standard deviation of the detector's noise for each landmark in several frames of one face, pixels.
+
+    Frames within a few seconds look alike, and a detector is wrong in them alike: all of them tell as much as one.
+    """
+    apart = [np.linalg.norm(np.subtract(*eye_centers(one))) for one in points]
+    px_per_mm = float(np.mean(apart)) / EYES_APART_MM
+    return math.sqrt(len(points)) * np.maximum(px_per_mm * errors.white, LEAST_NOISE_PX)
 
 
 def _of_mesh(points: Float[np.ndarray, "n 68 2"]) -> Dense:

@@ -10,6 +10,7 @@ from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.detect import complete, detect
 from jaxfilters.trackers.head.common.mesh import MeshDetector
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
+from jaxfilters.trackers.io.detector_errors import DetectorErrors, default_detector_errors
 
 MESH_68: tuple[tuple[int, ...], ...] = (
     *((),) * 8,
@@ -51,6 +52,11 @@ class Seen(NamedTuple):
 class Detector(Protocol):
     """Finds a face in an image."""
 
+    @property
+    def errors(self) -> DetectorErrors | None:
+        """How far the ten landmarks lie from the model's; `None` for noise of a pixel alone."""
+        ...
+
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
         ...
@@ -58,6 +64,9 @@ class Detector(Protocol):
 
 class CascadeDetector:
     """By OpenCV's cascades and the corners of eyes, mouth, nostrils and brows."""
+
+    def __init__(self) -> None:
+        self.errors = default_detector_errors()["cascades"]
 
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
@@ -80,6 +89,7 @@ class MeshLandmarks:
             ImportError: without MediaPipe, or with one that has no face mesh of its own.
         """
         self._mesh = MeshDetector(refined=True)
+        self.errors = default_detector_errors()["mediapipe"]
 
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The most evident face, or why there is none; the mesh looks for one face alone, wherever it is."""

@@ -29,6 +29,8 @@ Measured in three dimensions, once identity, offset and expressions are the like
 of people of the ICT face model with recorded speech, .07 mm of the generator's, whose expressions are but two. A person
 must not be adjusted to what no person of the model does, however precisely it is measured.
 """
+FEWEST_SURE = 7
+"""Landmarks that must look as registered, where the model has them, for an estimate beyond doubt: speech hides two."""
 
 
 class Estimate(NamedTuple):

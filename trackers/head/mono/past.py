@@ -11,7 +11,8 @@ from jaxfilters.trackers.head.mono.state import Window
 
 def units(face: MultilinearFace, prior: Prior) -> Float[Array, " d"]:
     """Standard deviations of identity and offset, in which a window counts its information."""
-    return jnp.concatenate([face.identity_std, jnp.full(face.mean.size, prior.offset_std, face.mean.dtype)])
+    offset = prior.offset_deviations * jnp.ones_like(face.mean)
+    return jnp.concatenate([face.identity_std, offset.ravel()])
 
 
 def marginalize_frame(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxfilters.models.face.bundle import Bundle
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
+from jaxfilters.models.face.person_prior import Person, Prior, own_offset, posed_shape
 from jaxfilters.models.face.remembered import Remembered, hypotheses
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.common.state import POSE
@@ -112,7 +112,7 @@ def weighed(
     bundle, info = fitted(unknown, face, rig, state, start, options, STEPS)
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
     gained = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
-    people = Prior(state.prior.weight, state.prior.offset_std)
+    people = Prior(state.prior.weight, state.prior.offset_std, misplaced=state.prior.misplaced)
     before = prior_information(face, bundle.person, people)
     after = known(face, state.prior, bundle.person) + gained
     return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
@@ -129,7 +129,7 @@ def as_remembered(unknown: MultilinearFace, face: MultilinearFace, state: MonoSt
     total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
     unit, count = units(face, state.prior), face.num_identities
     covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
-    offset = state.person.offset + face.mean - unknown.mean
+    offset = own_offset(state.person, state.prior) + face.mean - unknown.mean
     return Remembered(state.person.identity[None], covariance[None], offset[None])
 
 

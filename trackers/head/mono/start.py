@@ -69,7 +69,7 @@ def initialise(
     points: Float[Array, "n K 2"],
     prior: Prior,
     *,
-    detected_px: float = DETECTED_PX,
+    detected_px: Float[ArrayLike, "*K"] = DETECTED_PX,
 ) -> Start:
     """Person and poses from detected landmarks, from heads that look into the camera on the ray of their middle.
 
@@ -78,10 +78,10 @@ def initialise(
         rig: One camera, which is the world.
         points: Landmarks in n frames, pixels.
         prior: What holds the face.
-        detected_px: Standard deviation of each coordinate of the points.
+        detected_px: Standard deviation of each coordinate of the points, perhaps for each landmark.
     """
     n = len(points)
-    person = Person(face.identity_mean, jnp.zeros_like(face.mean))
+    person = Person(face.identity_mean, prior.offset_mean * jnp.ones_like(face.mean))
     expressions = jnp.tile(face.expression_mean, (n, 1))
     mean = posed_shape(face, person, face.expression_mean)
     poses = jax.vmap(lambda uv: _facing(rig, mean, uv))(points)
@@ -99,9 +99,10 @@ def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
     return Start(found, info, projected(face, rig, found))
 
 
-def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, ""]) -> Views:
-    """Landmarks that were all detected equally well, with the standard deviation of each coordinate."""
-    covariance = jnp.square(std_px) * jnp.tile(jnp.eye(2), (*points.shape[:2], 1, 1))
+def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, "*K"]) -> Views:
+    """Landmarks as detected, with the standard deviation of each coordinate, perhaps for each landmark."""
+    variance = jnp.broadcast_to(jnp.square(std_px), points.shape[:2])
+    covariance = variance[..., None, None] * jnp.eye(2)
     return Views(points, covariance, jnp.ones(points.shape[:2], bool))
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import facing
+from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
@@ -19,9 +20,9 @@ from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common.near_mode import spread
 from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
-from jaxfilters.trackers.head.common.state import DEFORMABLE, FRAME_S, LOST, PATIENCE, POSE
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import adjustment
-from jaxfilters.trackers.head.mono.estimate import Estimate, aligned, projected, recalculated
+from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import (
     FEWEST_ANCHORED,
@@ -106,7 +107,8 @@ def _step(
         is_fresh=~missed,
         window=state.window._replace(ages=state.window.ages + 1),
     )
-    return state, _track(system, state, score, info.effective_sample_size, is_adjusted)
+    num_sure = jnp.where(missed, 0.0, estimate.num_anchored)
+    return state, _track(system, state, score, info.effective_sample_size, is_adjusted, num_sure)
 
 
 def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoOptions) -> tuple[Array, Array]:
@@ -201,7 +203,9 @@ def _adjusted(
     return jax.lax.cond(sound, lambda: after, lambda: state), tried & sound
 
 
-def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array) -> MonoTrack:
+def _track(
+    system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, num_sure: Array
+) -> MonoTrack:
     unknown, face, rig, _ = system
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
@@ -209,7 +213,10 @@ def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjust
     M = shape(state.model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
     of_person = adjustment.uncertainty(face, state.window, state.prior, state.person, state.response)
-    variance = jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
+    is_sure = num_sure >= FEWEST_SURE
+    # Landmarks that are followed from frame to frame are wrong together: only those that look as registered count.
+    wider = jnp.where(is_sure, 1.0, jnp.square(NUM_LANDMARKS / jnp.maximum(num_sure, FEWEST_ANCHORED)))
+    variance = wider * jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
     expression = state.modes.expression(face, x[POSE:])
     return MonoTrack(
         pose=known(x[:POSE]),
@@ -223,5 +230,5 @@ def _track(system: System, state: MonoState, score: Array, ess: Array, is_adjust
         offset=known(state.person.offset + face.mean - unknown.mean),
         who=jnp.where(lost, -1, state.who - 1).astype(jnp.int32),
         is_adjusted=is_adjusted,
-        status=jnp.where(lost, LOST, DEFORMABLE).astype(jnp.int32),
+        status=jnp.where(lost, LOST, jnp.where(is_sure, DEFORMABLE, DOUBTFUL)).astype(jnp.int32),
     )

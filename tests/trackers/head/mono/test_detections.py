@@ -91,6 +91,8 @@ def test_old_detections_do_not_count(seen):
 class Mesh:
     """A detector that sees the face where it is told, 68 landmarks and irises with it."""
 
+    errors = None
+
     def __init__(self, dense):
         self.dense = dense
 

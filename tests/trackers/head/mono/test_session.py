@@ -10,7 +10,7 @@ import pytest
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import nominal, project_shape
-from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST, PATIENCE
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, INITIALISING, LOST, PATIENCE
 from jaxfilters.trackers.head.mono.estimate import UNMODELLED_MM
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.start import initialise
@@ -114,7 +114,7 @@ def test_a_lost_face_is_reported_and_found_again(rig, face, talking, detected):
     person = session.person
     snow = np.random.default_rng(1).integers(0, 256, (24, 1, 480, 640), np.uint8)
     lost = process(session, snow, made.times[31] + np.arange(1, 25) / 30)
-    np.testing.assert_array_equal(lost.status[: PATIENCE - 1], DEFORMABLE)
+    np.testing.assert_array_equal(lost.status[: PATIENCE - 1], DOUBTFUL)
     np.testing.assert_array_equal(lost.status[PATIENCE:], LOST)
     assert np.isnan(lost.pose[PATIENCE:]).all()
     # Before it counts as lost, nothing is known better than when it was seen.

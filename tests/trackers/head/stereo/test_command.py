@@ -89,7 +89,7 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
         assert track["model_basis"].shape == (30, 5)
         np.testing.assert_allclose(track["times_s"], np.arange(FRAMES) / 30)
     report = json.loads((out / "report.json").read_text())
-    assert report["status"] == {"initialising": 2, "rigid": 4, "deformable": 12, "lost": 2, "skipped": 0}
+    assert report["status"] == {"initialising": 2, "rigid": 4, "deformable": 12, "lost": 2, "doubtful": 0, "skipped": 0}
     assert report["longest_stretch_frames"] == 8
     assert report["events"] == [{"frame": 2, "what": "registered"}, {"frame": 12, "what": "learnt"}]
     assert report["explained_contribution"] == 0.75

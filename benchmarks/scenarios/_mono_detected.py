@@ -1,0 +1,184 @@
+"""Modelled people from their images alone, beside `solvePnP`.
+
+Nothing is known of a person or of where the landmarks are: the detectors find them, as for a user. The same detections
+go to OpenCV's `solvePnP` with the mean face of the same model, which is the simplest thing that could work. Both are
+judged on the same frames: those in which the detector sees a face and the tracker follows it. The people are none of
+those whom the detectors' errors were measured on (`jaxfilters fit face-detector`).
+"""
+
+import sys
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.recordings import recording_folder
+from jaxfilters.benchmarks.scenarios._mono_real import NUM_FRAMES, PEOPLE, QUICK_NUM_FRAMES, filmed, modelled_face
+from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY
+from jaxfilters.models.face.multilinear import MultilinearFace, shape
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.synthetic.ict_course import read_biwi, read_livelink
+from jaxfilters.models.synthetic.ict_face import read_ict
+from jaxfilters.models.synthetic.ict_sequence import IctSequence
+from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
+from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.io.face_models import people_face_model
+
+SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
+"""Of the metrics, by detector."""
+AXES = {"x": 0, "y": 1, "z": 2, "roll": 3, "yaw": 4, "pitch": 5}
+EVERY = 3
+"""Frames from one in which landmarks are detected for `solvePnP` to the next."""
+PIECE = 30
+"""Frames that are handed over at once."""
+FACING = np.array([0.0, 0.0, 600.0])
+"""Millimetres: where `solvePnP` starts, without a rotation."""
+
+
+class DetectedRun(NamedTuple):
+    """Errors in the frames in which there are a track and a detection; millimetres and degrees."""
+
+    errors: Float[np.ndarray, "n 6"]
+    """Of the tracker."""
+    std: Float[np.ndarray, "n 6"]
+    """That it claims."""
+    pnp_errors: Float[np.ndarray, "n 6"]
+    distance: Float[np.ndarray, " n"]
+    """True depth."""
+    lost_share: float
+    """Of the frames after the start in which the face is not followed."""
+
+
+def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
+    """Errors of both detectors with a model of other people of the same kind, and with that of the package.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
+    model = read_ict(recording_folder("ict_face_model"))
+    turns = read_biwi(recording_folder("biwi_head_rotation"))
+    speech = read_livelink(recording_folder("livelinkface_take"), model.names)
+    faces = {"modelled": modelled_face(seed)}
+    if not quick:
+        faces["modelled_rendered"] = people_face_model().model
+    detectors = available_detectors()
+    runs: dict[str, list[DetectedRun]] = {}
+    for person, stretch in PEOPLE[: 1 if quick else None]:
+        made = filmed(model, turns[stretch], speech, person + seed, QUICK_NUM_FRAMES if quick else NUM_FRAMES)
+        for kind, face in faces.items():
+            for name, detector in detectors.items():
+                one = detected_run(made, face, detector, person + seed)
+                runs.setdefault(f"{kind}{SUFFIXES[name]}", []).append(one)
+                means = {"tracked": one.errors, "solvePnP": one.pnp_errors}
+                told = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
+                sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {told}\n")
+    metrics: dict[str, Metric] = {}
+    for name, of_people in runs.items():
+        metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])
+    return metrics
+
+
+def available_detectors() -> dict[str, Detector]:
+    """Those that can be loaded here; the others are said and left out."""
+    found: dict[str, Detector] = {}
+    for name in SUFFIXES:
+        try:
+            found[name] = DETECTORS[name]()
+        except ImportError as error:
+            sys.stderr.write(f"  left out: detector {name} ({error})\n")
+    return found
+
+
+def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, seed: int) -> DetectedRun:
+    """One person, followed and located frame by frame from the same detector.
+
+    Args:
+        made: The person before one camera.
+        face: Model of ten landmarks.
+        detector: Of the landmarks.
+        seed: Of the particles.
+    """
+    session = MonoSession(made.rig, face, MonoOptions(seed=seed), detector=detector)
+    poses, stds, status, located = [], [], [], []
+    for start, images in made.chunks(PIECE):
+        track = session.process(images, made.times[start : start + len(images)])
+        poses.append(track.pose)
+        stds.append(track.pose_std)
+        status.append(track.status)
+        located += [
+            pnp(face, made.rig, detector, image) if i % EVERY == 0 else np.full(6, np.nan)
+            for i, image in enumerate(images[:, 0], start)
+        ]
+    pose, std = np.concatenate(poses), np.concatenate(stds)
+    return _judged(made, pose, std, np.isin(np.concatenate(status), TRACKED), np.stack(located))
+
+
+def pnp(
+    face: MultilinearFace, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
+) -> Float[np.ndarray, " 6"]:
+    """Pose of the mean face by `solvePnP` from one image, millimetres and radians; NaN without a detection."""
+    found = detector.detect(image, None)
+    if isinstance(found, str):
+        return np.full(6, np.nan)
+    mean = np.asarray(shape(face, face.identity_mean, face.expression_mean), float)
+    start = np.zeros((3, 1)), FACING[:, None].copy()
+    (fx, fy), (cx, cy) = np.asarray(rig.focal[0], float), np.asarray(rig.center[0], float)
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    _, turn, place = cv2.solvePnP(mean, found.points, K, np.zeros(5), *start, useExtrinsicGuess=True)
+    return np.concatenate([place.ravel(), Rotation.from_rotvec(turn.ravel()).as_euler("ZYX")])
+
+
+def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
+    """Errors, coverage of two standard deviations, and those of `solvePnP`, over all people.
+
+    Errors of depth are sizes of each person's mean error: how large a face is stays unknown, whatever is averaged.
+
+    Args:
+        name: Suffix of the metrics.
+        runs: Of all people.
+    """
+    metrics: dict[str, Metric] = {}
+    for prefix, errors in (("", [r.errors for r in runs]), ("pnp_", [r.pnp_errors for r in runs])):
+        every = np.concatenate(errors)
+        metrics |= {
+            f"{prefix}{axis}_rms_deg_{name}": Metric(float(np.sqrt(np.mean(every[:, i] ** 2))), "deg", "lower")
+            for axis, i in AXES.items()
+            if i > 2
+        }
+        depth = np.array([np.mean(one[:, 2]) for one in errors])
+        share = np.array([np.mean(one[:, 2] / run.distance) for one, run in zip(errors, runs, strict=True)])
+        metrics |= {
+            f"{prefix}z_error_mm_{name}": Metric(float(np.mean(np.abs(depth))), "mm", "lower"),
+            f"{prefix}z_bias_share_{name}": Metric(100 * abs(float(np.mean(share))), "%", "lower"),
+        }
+    within = np.concatenate([np.abs(run.errors) <= 2 * run.std for run in runs])
+    metrics |= {
+        f"coverage2_{axis}_{name}": Metric(100 * float(np.mean(within[:, i])), "%", "higher")
+        for axis, i in AXES.items()
+    }
+    lost = float(np.mean([run.lost_share for run in runs]))
+    return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
+
+
+def _judged(
+    made: IctSequence,
+    pose: Float[np.ndarray, "t 6"],
+    std: Float[np.ndarray, "t 6"],
+    is_tracked: Bool[np.ndarray, " t"],
+    located: Float[np.ndarray, "t 6"],
+) -> DetectedRun:
+    rows = np.flatnonzero(is_tracked & np.isfinite(located[:, 0]))
+    begun = int(np.argmax(is_tracked)) if is_tracked.any() else 0
+    errors, beside = (_turned((one[rows] - made.poses[rows]) * DISPLAY) for one in (pose, located))
+    lost = float(np.mean(~is_tracked[begun:]))
+    return DetectedRun(errors, std[rows] * DISPLAY, beside, made.poses[rows, 2], lost)
+
+
+def _turned(errors: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 6"]:
+    """With angles within half a turn."""
+    return np.concatenate([errors[:, :3], (errors[:, 3:] + 180) % 360 - 180], axis=1)

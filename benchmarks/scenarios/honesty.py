@@ -1,0 +1,182 @@
+"""Whether claimed standard deviations are true: all trackers on data with truth, in one table.
+
+For each system and kind of data, and by coordinate: the share of true values within 1, 2 and 3 of the claimed standard
+deviations (68, 95 and 99.7 % are right), with an interval by drawing whole recordings; the autocorrelation of errors
+from frame to frame; the ratio of claims to errors (sharpness, 1 is right); the continuous ranked probability score. Of
+all coordinates together: the normalised error squared with its band for as many frames as the errors are worth, and
+the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is right; `log_score_gain_` is
+what the claim is better than the constant. Last come three filters of the same detected key points, whose errors are
+taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of
+each. Systems whose recordings are missing are named and left out.
+"""
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks, match
+from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios import _keypoint_filters, people_pets
+from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
+from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
+from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
+from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, Contender, MonoRun, follow_all, talking_head
+from jaxfilters.benchmarks.scenarios._pets import load_pets
+from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_capture, track_lengths, true_lengths
+from jaxfilters.models.synthetic.face_sequence import sequence
+from jaxfilters.trackers.head.common.state import HeadOptions
+from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.io.face_models import default_face_model
+from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.state import PeopleConfig
+
+POSE = ("x_mm", "y_mm", "z_mm", "roll_deg", "yaw_deg", "pitch_deg")
+FIRST_HEAD = 500
+"""Seed of the first rendered head; no tracker was made with it, and no other scenario takes it."""
+NUM_HEADS, QUICK_NUM_HEADS = 6, 2
+NUM_FRAMES, QUICK_NUM_FRAMES = 300, 90
+QUICK_PEOPLE_FRAMES = 60
+QUICK_CAPTURE_FRAMES, CAPTURE_FRAMES = 1000, 3000
+QUICK_KEYPOINT_FRAMES = 400
+SETTLED = 30
+"""Frames of key points after which the start is forgotten."""
+
+
+def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
+    """Run all systems, print the table, return its numbers."""
+    judged, metrics = [], {}
+    for name, claims_of in SYSTEMS.items():
+        try:
+            found = claims_of(quick, seed)
+        except RecordingError as error:
+            sys.stderr.write(f"  left out: {name} ({error})\n")
+            continue
+        scores = judge(found)
+        if scores is None:
+            sys.stderr.write(f"  left out: {name} (it claims nothing on this data)\n")
+            continue
+        sys.stderr.write(f"  {name}: within 2 sigma {np.round(100 * scores.coverage[1])} %\n")
+        judged.append((found, scores))
+        metrics |= metrics_of(found, scores)
+        if out is not None:
+            draw_calibration(out, found, scores)
+    sys.stderr.write(f"{table(judged)}\n")
+    return metrics
+
+
+def stereo_claims(quick: bool, seed: int) -> Claims:
+    """Heads before two cameras, rendered, with slow motion."""
+    runs = []
+    for head in _heads(quick, seed):
+        made = sequence(jax.random.key(head), "slow", QUICK_NUM_FRAMES if quick else NUM_FRAMES, head)
+        runs.append(follow(made, {"": HeadOptions(learn=False)})[""])
+    return Claims("head_stereo", "rendered", POSE, [_of_head(run) for run in runs])
+
+
+def mono_claims(quick: bool, seed: int) -> Claims:
+    """Heads before one camera, rendered, who move and speak; the model of faces is that of the package."""
+    contender = Contender(default_face_model().model, MonoOptions(seed=seed))
+    num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
+    runs = [follow_all(talking_head(head, num_frames), {"": contender}, head)[""] for head in _heads(quick, seed)]
+    return Claims("head_mono", "rendered", POSE, [_of_mono(run) for run in runs])
+
+
+def articulated_claims(quick: bool, seed: int) -> Claims:
+    """Lengths of links from motion capture before a virtual camera, at the end of each view."""
+    path = recording_folder("dfki_hand_mocap") / "recording.npz"
+    recordings = []
+    for view in list(VIEWS.values())[: 2 if quick else None]:
+        capture = load_capture(path, QUICK_CAPTURE_FRAMES if quick else CAPTURE_FRAMES, view)
+        lengths, deviations, _ = track_lengths(capture, seed)
+        recordings.append(Recording(1e3 * (lengths - true_lengths(capture))[None], 1e3 * deviations[None]))
+    return Claims("articulated", "dfki", tuple(f"{finger}_mm" for finger in FINGERS), recordings)
+
+
+def people_claims(quick: bool, seed: int) -> Claims:
+    """People on PETS 2009, along and across the line of sight; one recording a person."""
+    del seed
+    pets = load_pets(recording_folder("pets09_s2l1_view001"), PeopleConfig())
+    followed = people_pets.follow_video(pets, QUICK_PEOPLE_FRAMES if quick else None)
+    truth = people_pets.read_truth(pets.folder / "gt_0_399.csv", pets)
+    last = len(followed.tracking_s) - 1
+    truth = FloorTracks(*(rows[truth.frame <= last] for rows in truth))
+    if not len(truth.frame):
+        raise RecordingError(f"the annotations begin after frame {last}, the last one that was tracked.")
+    return Claims(
+        "people", "pets", ("radial_m", "lateral_m"), by_person(truth, followed.tracks, pets.camera.position())
+    )
+
+
+def by_person(truth: FloorTracks, tracks: dict[int, list[Sighting]], camera_m: np.ndarray) -> list[Recording]:
+    """Errors along and across the line of sight of every person who is matched, with their covariances."""
+    sightings = {(one.frame, who): one for who, track in tracks.items() for one in track}
+    keys = list(sightings)
+    places = np.array([sightings[key].mean[:2] for key in keys], float).reshape(-1, 2)
+    found = floor_tracks([frame for frame, _ in keys], [who for _, who in keys], places)
+    pairs = match(truth, found)
+    rows: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for i, j in zip(pairs.truth, pairs.estimate, strict=True):
+        sighting = sightings[int(found.frame[j]), int(found.identity[j])]
+        away = truth.xy_m[i] - np.asarray(camera_m, float)[:2]
+        away = away / np.linalg.norm(away)
+        axes = np.array([away, (-away[1], away[0])])
+        error = axes @ (found.xy_m[j] - truth.xy_m[i])
+        covariance = axes @ np.asarray(sighting.covariance, float)[:2, :2] @ axes.T
+        rows.setdefault(int(truth.identity[i]), []).append((error, covariance))
+    recordings = []
+    for of_person in rows.values():
+        errors, covariances = (np.array(part) for part in zip(*of_person, strict=True))
+        deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        recordings.append(Recording(errors, deviations, covariances))
+    return recordings
+
+
+def keypoint_claims(model: str, quick: bool, seed: int) -> Claims:
+    """Key points that a network detected, filtered with one model of their errors; one recording a joint.
+
+    The joints are of one video, so that intervals over them are too short.
+    """
+    del seed
+    points = _keypoint_filters.load_keypoints(recording_folder("handpose_tracks"))
+    half = len(points.truth) // 2
+    end = half + QUICK_KEYPOINT_FRAMES if quick else None
+    constants = _keypoint_filters.constants_of(Keypoints(points.detected[:half], points.truth[:half]))
+    judged = slice(half, end)
+    found = _keypoint_filters.filtered(
+        _keypoint_filters.filters_of(constants)[model], jnp.asarray(points.detected[judged], jnp.float32)
+    )
+    mean, std = (np.asarray(values, float)[SETTLED:] for values in found)
+    errors = mean - points.truth[judged][SETTLED:]
+    joints = range(0, errors.shape[1], 2)
+    recordings = [Recording(errors[:, i : i + 2], std[:, i : i + 2]) for i in joints]
+    return Claims(f"keypoints_{model}", "nyu", ("x_mm", "y_mm"), recordings)
+
+
+def _heads(quick: bool, seed: int) -> range:
+    return range(FIRST_HEAD + seed, FIRST_HEAD + seed + (QUICK_NUM_HEADS if quick else NUM_HEADS))
+
+
+def _of_head(run: HeadRun) -> Recording:
+    tracked = run.is_tracked[:, None]
+    return Recording(np.where(tracked, run.errors, np.nan), run.deviations)
+
+
+def _of_mono(run: MonoRun) -> Recording:
+    tracked = run.is_tracked[:, None]
+    return Recording(np.where(tracked, run.errors, np.nan), np.asarray(run.track.pose_std, float) * DISPLAY)
+
+
+SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
+    "articulated hand, motion capture": articulated_claims,
+    "people, PETS 2009": people_claims,
+    "head before two cameras, rendered": stereo_claims,
+    "head before one camera, rendered": mono_claims,
+    **{f"key points as {model} noise, NYU": partial(keypoint_claims, model) for model in MODELS},
+}
+"""One function `(quick, seed) -> Claims` for each system and kind of data."""

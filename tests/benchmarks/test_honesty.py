@@ -1,0 +1,82 @@
+"""The table of claims: its arithmetic on errors whose distribution is known."""
+
+import numpy as np
+import pytest
+
+from jaxfilters.benchmarks.harness import main
+from jaxfilters.benchmarks.multi_object import floor_tracks
+from jaxfilters.benchmarks.scenarios import _claims, honesty
+from jaxfilters.benchmarks.scenarios._claims import Claims, Recording
+from jaxfilters.trackers.people.recorded import Sighting
+
+
+def claims_of(scale, phi=0.0, recordings=8, frames=500):
+    """Errors of two coordinates with correlation `phi` in time, true deviations 1 and 2, claims `scale` times them."""
+    rng, made = np.random.default_rng(0), []
+    for _ in range(recordings):
+        e = [rng.normal(size=2)]
+        for _ in range(frames - 1):
+            e.append(phi * e[-1] + np.sqrt(1 - phi**2) * rng.normal(size=2))
+        errors = np.array(e) * (1.0, 2.0)
+        made.append(Recording(errors, np.broadcast_to(scale * np.array([1.0, 2.0]), errors.shape)))
+    return Claims("system", "data", ("a_mm", "b_deg"), made)
+
+
+@pytest.mark.system
+def test_true_claims_have_the_right_numbers():
+    """4000 independent errors: shares within four standard errors (a false alarm has 1e-3 over all 12 numbers)."""
+    scores = _claims.judge(claims_of(1.0))
+    np.testing.assert_allclose(scores.coverage, np.array([0.683, 0.954, 0.997])[:, None] + np.zeros(2), atol=0.03)
+    assert scores.nees_band[0] < scores.nees < scores.nees_band[1]
+    assert scores.effective_frames > 3000
+    np.testing.assert_allclose(scores.sharpness, 1.0, atol=0.05)
+    assert np.all((scores.interval[0] < 0.954) & (scores.interval[1] > 0.954))
+    np.testing.assert_allclose(scores.log_score, scores.log_score_of_constant, atol=2e-3)
+
+
+def test_claims_that_are_too_narrow_show_in_every_number_and_lasting_errors_are_worth_few_frames():
+    scores = _claims.judge(claims_of(0.4, phi=0.97))
+    assert np.all(scores.coverage[1] < 0.7)
+    assert scores.nees > 3 * scores.nees_band[1]
+    np.testing.assert_allclose(scores.autocorrelation, 0.97, atol=0.02)
+    # 4000 frames are worth 4000 * 0.03 / 1.97 = 61.
+    assert 30 < scores.effective_frames < 110
+    assert scores.log_score > scores.log_score_of_constant + 0.5
+
+
+@pytest.mark.system
+def test_metrics_and_the_table_name_system_data_and_coordinates():
+    claims = claims_of(1.0, frames=50)
+    scores = _claims.judge(claims)
+    metrics = _claims.metrics_of(claims, scores)
+    assert {"coverage2_system_data", "nees_system_data", "coverage2_system_data_b_deg"} <= set(metrics)
+    assert metrics["crps_system_data_a_mm"].unit == "mm"
+    assert "a_mm" in _claims.table([(claims, scores)])
+
+
+def test_frames_without_estimate_or_claim_do_not_count():
+    errors = np.array([[1.0], [np.nan], [3.0], [0.0]])
+    deviations = np.array([[1.0], [1.0], [1.0], [0.0]])
+    scores = _claims.judge(Claims("s", "d", ("x_m",), [Recording(errors, deviations)]))
+    np.testing.assert_allclose(scores.coverage[:, 0], [0.5, 0.5, 1.0])
+    assert _claims.judge(Claims("s", "d", ("x_m",), [Recording(np.full((3, 1), np.nan), np.ones((3, 1)))])) is None
+
+
+def test_errors_of_people_are_turned_into_the_line_of_sight():
+    """A camera at the origin: a person at (0, 4), estimated 0.3 too far and 0.2 to the right."""
+    truth = floor_tracks([0], [7], [(0.0, 4.0)])
+    covariance = np.diag([0.01, 0.09, 1.0, 1.0, 1.0, 1.0])
+    sighting = Sighting(0, 0.0, np.array([0.2, 4.3, 0.0, 0.0, 1.7, 0.0]), covariance, 1.0, 0, "tracked")
+    (recording,) = honesty.by_person(truth, {3: [sighting]}, np.zeros(3))
+    np.testing.assert_allclose(recording.errors, [[0.3, -0.2]], atol=1e-12)
+    np.testing.assert_allclose(recording.deviations, [[0.3, 0.1]], atol=1e-12)
+
+
+@pytest.mark.system
+@pytest.mark.data
+def test_a_system_runs_on_its_recording(monkeypatch, capsys):
+    one = {"articulated hand, motion capture": honesty.articulated_claims}
+    monkeypatch.setattr(honesty, "SYSTEMS", one)
+    monkeypatch.setattr(honesty, "QUICK_CAPTURE_FRAMES", 200)
+    assert main(["honesty", "--quick"]) == 0
+    assert "nees_articulated_dfki" in capsys.readouterr().out

@@ -1,0 +1,128 @@
+"""Finding a hand that is not tracked yet, and new starts that compete with a track: frame by frame, on the host."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.observation import crop
+from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
+from jaxfilters.models.hand.start import BATCH, SCALES, Start, find_starts, registered
+from jaxfilters.trackers.hand_depth.detect import NEAREST, hand_sightings
+from jaxfilters.trackers.hand_depth.filtering import (
+    WINDOW,
+    Setup,
+    TrackState,
+    filled,
+    particles_of,
+    placed,
+    pose_moments,
+)
+
+SECOND_CHANCE, RACE_INTERVAL, QUIET_INTERVAL = 0.3, 1.0, 3.0
+"""Seconds from a start to the first race of new starts against the track, between races while it is doubtful, and
+while it is not."""
+NUM_RACING = BATCH
+"""Hypotheses that are registered for a race."""
+BETTER = 0.85
+"""Share of the cost of the track, or of the hand that was asked for, below which another explanation is better."""
+AS_GOOD = 1.1
+"""Share of the cost of the track up to which another explanation puts it in doubt."""
+DIFFERENT = 0.025
+"""Metres between the joints of two explanations, in the mean, from which on they are different."""
+DOUBTFUL_COST = 0.024
+"""Metres, as `Start.cost`, above which a start explains the frame too badly to be believed."""
+WORST_START = 0.032
+"""Metres, likewise, above which nothing is believed to be a hand."""
+
+
+def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
+    """Place the ensemble anew where the frame shows a hand, of the known size if any.
+
+    Where what it shows is no hand, `race_time` says when to look again: not in every frame, since it takes a second.
+    """
+    starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
+    for sighting in hand_sightings(setup.camera, image):
+        window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
+        starts += find_starts(*window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
+    wanted = [start for start in starts if not start.side * float(state.side) < 0]
+    found = min(wanted, key=lambda start: start.cost, default=None)
+    if found is None or not found.cost < WORST_START:
+        pause = SECOND_CHANCE if starts else 0.0
+        return state._replace(race_time=jnp.asarray(time + pause, dtype=float))
+    doubt = found.cost > DOUBTFUL_COST or _is_rivalled(setup, found, starts)
+    return _begun(setup, state, found, time, doubt)
+
+
+def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
+    """Let new starts compete with the track on one frame: the better one goes on, in doubt if they differ in vain.
+
+    They look where the track is. A track that lost the hand altogether is lost by its own cost, and searched for.
+    """
+    pose, _ = pose_moments(*particles_of(state.ensemble))
+    scale, side = float(state.scale), float(state.side)
+    palm = np.asarray(hand_center(pose, 0.6 * scale))
+    if not (np.isfinite(palm).all() and palm[2] > NEAREST):
+        return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
+    image = filled(jnp.asarray(frame), state.missing_is_background)
+    window = _cropped(setup, image, jnp.asarray(palm))
+    average = setup.likelihood.geometry
+    track = registered(*window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
+    sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
+    starts = find_starts(*window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
+    allowed = [start for start in starts if setup.config.hand == "auto" or start.side == side]
+    rival = allowed[0] if allowed else track
+    if rival.cost < BETTER * track.cost:
+        return _begun(setup, state, rival, time, rival.cost > DOUBTFUL_COST or _is_rivalled(setup, rival, starts))
+    doubt = track.cost > DOUBTFUL_COST or _is_rivalled(setup, track, starts)
+    pause = RACE_INTERVAL if doubt else QUIET_INTERVAL
+    return state._replace(doubt=jnp.asarray(doubt), race_time=jnp.asarray(time + pause, dtype=float))
+
+
+def _is_rivalled(setup: Setup, found: Start, starts: list[Start]) -> bool:
+    """Whether a different explanation of the same frame is about as good as the one found."""
+    rivals = [start for start in starts if start.cost < AS_GOOD * found.cost]
+    other_side = any(start.side != found.side and start.cost < found.cost for start in rivals)
+    return other_side or any(_distance(setup.likelihood.geometry, start, found) > DIFFERENT for start in rivals)
+
+
+def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bool) -> TrackState:
+    """The state with an ensemble about a start."""
+    key, place_key = jax.random.split(state.key)
+    state = state._replace(
+        scale=jnp.asarray(found.scale, dtype=float),
+        side=jnp.asarray(found.side, dtype=float),
+        doubt=jnp.asarray(doubt),
+        race_time=jnp.asarray(time + SECOND_CHANCE, dtype=float),
+        misses=jnp.zeros_like(state.misses),
+        key=key,
+    )
+    return state._replace(ensemble=placed(place_key, setup, jnp.asarray(found.pose), state))
+
+
+def _sizes(state: TrackState) -> tuple[float, ...]:
+    scale = float(state.scale)
+    return SCALES if math.isnan(scale) else (scale,)
+
+
+@jax.jit
+def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]:
+    return crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
+
+
+def _distance(average: HandGeometry, one: Start, other: Start) -> float:
+    """Between the joints of two hands, metres, in the mean."""
+    joints = [
+        _joints(jnp.asarray(each.pose), replace(average.scaled(each.scale), side=jnp.asarray(each.side, dtype=float)))
+        for each in (one, other)
+    ]
+    return float(jnp.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+
+
+@jax.jit
+def _joints(pose: Array, geometry: HandGeometry) -> Array:
+    return forward_kinematics(pose, geometry).joints
