@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
-from mkdocs.structure.files import File, Files
+from mkdocs.structure.files import File, Files, InclusionLevel
 
 ROOT = Path(__file__).parents[1]
 FROM_ROOT = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
@@ -21,13 +21,34 @@ def on_files(files: Files, config: Any) -> Files:
             (ROOT / name).read_text().replace("](docs/", "](").replace("](jaxfilters/__init__.pyi", "](api/running.md")
         )
         files.append(File.generated(config, page, content=text))
+    for script in sorted((ROOT / "docs" / "examples").glob("*.py")):
+        files.append(
+            File.generated(
+                config, f"examples/{script.stem}.md", content=_page_of(script), inclusion=InclusionLevel.NOT_IN_NAV
+            )
+        )
     return files
+
+
+def _page_of(script: Path) -> str:
+    """A script in jupytext's percent format as Markdown: its text, its code, then its picture."""
+    parts = []
+    for cell in re.split(r"^# %%", script.read_text(), flags=re.MULTILINE)[1:]:
+        kind, _, body = cell.partition("\n")
+        if "[markdown]" in kind:
+            parts.append(re.sub(r"^# ?", "", body, flags=re.MULTILINE).strip())
+        else:
+            title = f"# {kind.strip()}\n" if kind.strip() else ""
+            parts.append(f"```python\n{title}{body.strip()}\n```")
+    return "\n\n".join([*parts, f"![The picture that the script draws](images/{script.stem}.webp)\n"])
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Let links out of `docs/` lead to the pages of the site that stand for them."""
     up = "../" * page.file.src_uri.count("/")
     pages = FROM_ROOT | {"README.md": "index.md", "jaxfilters/__init__.pyi": "api/running.md"}
+    if page.file.src_uri == "gallery.md":  # scripts are pages of the site
+        markdown = re.sub(r"\]\((examples/\w+)\.py\)", r"](\1.md)", markdown)
     return _LINK.sub(lambda found: f"]({up}{pages[found[1]]}{found[2] or ''})", markdown)
 
 
