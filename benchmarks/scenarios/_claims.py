@@ -129,7 +129,7 @@ def table(judged: list[tuple[Claims, Scores]]) -> str:
 
 
 def _by_coordinate(claims: Claims, scores: Scores) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for i, coordinate in enumerate(claims.coordinates):
         one, two, three = (f"{100 * share:.0f}" for share in scores.coverage[:, i])
         low, high = 100 * scores.interval[:, i]
@@ -153,7 +153,7 @@ def draw_calibration(folder: Path, claims: Claims, scores: Scores) -> None:
 def _claimed(recording: Recording) -> Recording:
     """The frames in which every coordinate has an estimate, a truth and a positive claim."""
     good = np.isfinite(recording.errors).all(axis=1) & (np.nan_to_num(recording.deviations) > 0).all(axis=1)
-    return Recording(*(None if part is None else np.asarray(part, float)[good] for part in recording))
+    return jax.tree.map(lambda part: np.asarray(part, float)[good], recording)
 
 
 def _draws(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

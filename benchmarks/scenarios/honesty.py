@@ -50,7 +50,7 @@ SETTLED = 30
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Run all systems, print the table, return its numbers."""
-    judged, metrics = [], {}
+    judged, metrics = [], dict[str, Metric]()
     for name, claims_of in SYSTEMS.items():
         try:
             found = claims_of(quick, seed)
@@ -109,7 +109,10 @@ def people_claims(quick: bool, seed: int) -> Claims:
     if not len(truth.frame):
         raise RecordingError(f"the annotations begin after frame {last}, the last one that was tracked.")
     return Claims(
-        "people", "pets", ("radial_m", "lateral_m"), by_person(truth, followed.tracks, pets.camera.position())
+        "people",
+        "pets",
+        ("radial_m", "lateral_m"),
+        by_person(truth, followed.tracks, np.asarray(pets.camera.position())),
     )
 
 

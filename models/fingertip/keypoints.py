@@ -5,6 +5,7 @@ finger counts as extended where it is straight and its tip far from the palm.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -67,7 +68,7 @@ def observe_keypoints(points: np.ndarray, confidence: np.ndarray) -> HandObserva
     starts = [points[list(bone)].mean(axis=0) for bone in FIRST_BONES]
     tips = [points[chain[-1]] for chain in FINGERS]
     shown = np.array(is_tip)[:, None]
-    return no_hand()._replace(
+    found: dict[str, Any] = dict(
         tips=np.where(shown, tips, 0.0).astype(np.float32),
         is_tip=is_tip,
         scores=np.where(is_tip, confidence[[chain[-1] for chain in FINGERS]], 0.0).astype(np.float32),
@@ -79,6 +80,7 @@ def observe_keypoints(points: np.ndarray, confidence: np.ndarray) -> HandObserva
         has_axis=np.asarray(True),
         is_hand=np.asarray(True),
     )
+    return no_hand()._replace(**found)
 
 
 def thumb_side(points: np.ndarray) -> int:

@@ -275,7 +275,7 @@ def _refine_batch(
         found = jax.lax.fori_loop(0, num_steps, step, pose)
         return found, explained(judging_camera, judged, forward_kinematics(found, hand), found, scale)
 
-    return jax.vmap(refine)(*batch)
+    return jax.vmap(refine)(*map(jnp.asarray, batch))
 
 
 def explained(

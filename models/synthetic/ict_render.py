@@ -83,7 +83,7 @@ def render_ict(
     weights: Float[Array, " expressions"],
     *,
     gain: Float[ArrayLike, ""] = 1.0,
-    light: Float[ArrayLike, " 3"] = LIGHT,
+    light: Float[ArrayLike, " 3"] | tuple[float, float, float] = LIGHT,
 ) -> UInt8[Array, "C rows cols"]:
     """What the cameras deliver: `round(gain * image + noise)`, clipped to 0..255.
 

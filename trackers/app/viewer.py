@@ -73,15 +73,16 @@ def page_of(folder: Path) -> str:
     videos = _overlays(folder)
     frames = _integers(rows, "frame")
     count = max([*frames, *(first + length - 1 for _, first, length, _ in videos), -1]) + 1
-    data = {
+    times_s = _times(rows, frames, count, videos)
+    data: dict[str, Any] = {
         "title": folder.resolve().name,
-        "times_s": _times(rows, frames, count, videos),
+        "times_s": times_s,
         "pictures": list(_pictures(videos, count)),
         "columns": rows.names,
         "rows": [[frame, *row[1:]] for frame, row in zip(frames, rows.cells, strict=True)],
         "report": _report(folder),
     }
-    data |= _drawn(rows, frames, data["times_s"])
+    data |= _drawn(rows, frames, times_s)
     template = get_data(__package__, "viewer.html")
     assert template is not None, "The package has no viewer.html."
     # Nothing in the data may end the element that holds it.

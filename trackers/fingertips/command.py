@@ -6,6 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -141,8 +142,9 @@ def _follow(
     total = getattr(source, "frames", 0) or None
     try:
         with ProgressLine("tracking", total, done=tally.frames) as line:
-            moments = continued(_moments(source, options.seconds), [source], tally.frames, tally.time_s)
-            for time_s, (image,) in moments:
+            moments = _moments(source, options.seconds)
+            image: Any
+            for time_s, (image,) in continued(moments, [source], tally.frames, tally.time_s):
                 found = session.process(hands_in(image, user, options.hands), np.array([time_s]))
                 report = HandReport(*(field[0] for field in found))
                 events, reported = session.events[reported:], len(session.events)
@@ -152,7 +154,7 @@ def _follow(
                     video = video or OverlayVideo(options.out / name, source.fps, picture.shape)
                     video.write(picture)
                 tally = tally.add(time_s, report, source.truth[-1] if isinstance(source, DemoHand) else None)
-                files.checkpoint(lambda now=tally: {"session": session.saved(), "tally": now})
+                files.checkpoint(partial(_saved, session, tally))
                 ends.append(time.perf_counter())
                 done = tally.frames if total is None else min(tally.frames, total)
                 line.show(done, f"{int(report.num_tips.sum())} fingertips")
@@ -173,6 +175,11 @@ def _follow(
 
 
 _NOTHING: Any = HandReport(*[np.zeros((0, 0), bool)] * len(HandReport._fields))  # type: ignore[arg-type]
+
+
+def _saved(session: FingertipSession, tally: Tally) -> dict[str, Any]:
+    """What the next images need."""
+    return {"session": session.saved(), "tally": tally}
 
 
 def _moments(source: Any, seconds: float | None) -> Iterator[Moment]:

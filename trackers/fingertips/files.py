@@ -150,8 +150,8 @@ def read_events(path: Path) -> list[Event]:
 
 
 def _event(entry: dict[str, Any]) -> Event:
-    head = [entry.pop(name) for name in ("frame", "time_s", "hand", "event", "phase")]
-    return Event(*head, entry)
+    take = entry.pop
+    return Event(take("frame"), take("time_s"), take("hand"), take("event"), take("phase"), entry)
 
 
 def event_entry(event: Event) -> dict[str, Any]:

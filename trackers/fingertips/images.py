@@ -95,6 +95,7 @@ def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> Us
     if isinstance(images[0], HandKeypoints):
         return User(*_of_keypoints(images), KEYPOINT_POSTURE)
     usual_user, why = None, ""
+    image: Any
     for image in images:
         try:
             user = kinds[mask](image)

@@ -80,8 +80,9 @@ class KeypointSource:
         pictures = self._video.images() if self._video else iter(())
         for i, (time_s, picture) in enumerate(zip_longest(self._times_s, pictures)):
             self._images += picture is not None
+            image = None if picture is None else picture[1]
             if time_s is not None:
-                yield float(time_s), self._frame(i, blank if picture is None else picture[1])
+                yield float(time_s), self._frame(i, blank if image is None else image)
 
     def trouble(self) -> str | None:
         """What went wrong with the video, or that it is of another length."""

@@ -68,7 +68,7 @@ def fit_detector(options: argparse.Namespace) -> str:
         OutputError: the file cannot be written.
     """
     model = open_ict(options.data)
-    detectors = {name: kind() for name, kind in DETECTORS.items() if _loads(name)}
+    detectors: dict[str, Detector] = {name: kind() for name, kind in DETECTORS.items() if _loads(name)}
     found: dict[str, list[list[Picture]]] = {name: [] for name in detectors}
     key = jax.random.key(options.seed)
     for person in range(options.people):

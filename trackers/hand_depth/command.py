@@ -12,6 +12,7 @@ from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
+from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.hand_depth.detect import check_unit
 from jaxfilters.trackers.hand_depth.drawing import write_overlay
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
@@ -38,7 +39,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = as_input_error(partial(config_from_args, hand_depth.HandDepthConfig, options))
+    config = as_input_error(partial(config_from_args, HandDepthConfig, options))
     sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
     if warning := as_input_error(partial(check_unit, sequence[0])):
         warn(f"{sequence.name}: {warning}")

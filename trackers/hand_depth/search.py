@@ -47,8 +47,8 @@ def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> T
     """
     starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
     for sighting in hand_sightings(setup.camera, image):
-        window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
-        starts += find_starts(*window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
+        camera, window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
+        starts += find_starts(camera, window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
     wanted = [start for start in starts if not start.side * float(state.side) < 0]
     found = min(wanted, key=lambda start: start.cost, default=None)
     if found is None or not found.cost < WORST_START:
@@ -69,11 +69,11 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     if not (np.isfinite(palm).all() and palm[2] > NEAREST):
         return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
     image = filled(jnp.asarray(frame), state.missing_is_background)
-    window = _cropped(setup, image, jnp.asarray(palm))
+    camera, window = _cropped(setup, image, jnp.asarray(palm))
     average = setup.likelihood.geometry
-    track = registered(*window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
+    track = registered(camera, window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
-    starts = find_starts(*window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
+    starts = find_starts(camera, window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
     allowed = [start for start in starts if setup.config.hand == "auto" or start.side == side]
     rival = allowed[0] if allowed else track
     if rival.cost < BETTER * track.cost:

@@ -79,7 +79,7 @@ def default_detector_errors() -> dict[str, DetectorErrors]:
 
 def _errors(arrays: dict[str, np.ndarray], name: str, path: Path) -> DetectorErrors:
     size = 3 * NUM_LANDMARKS
-    shapes = DetectorErrors((NUM_LANDMARKS, 3), (size, size), (NUM_LANDMARKS,))._asdict()
+    shapes = dict(zip(DetectorErrors._fields, ((NUM_LANDMARKS, 3), (size, size), (NUM_LANDMARKS,)), strict=True))
     for part, shape in shapes.items():
         array = arrays.get(f"{name}_{part}")
         if array is None or array.shape != shape or array.dtype.kind != "f" or not are_finite(array):

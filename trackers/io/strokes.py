@@ -14,6 +14,7 @@ in such a folder in the folder of a person. Files of UNIPEN, InkML and JSON are 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,18 +104,27 @@ def usable(strokes: StrokeSet) -> StrokeSet:
     if lost := set(strokes.labels) - {strokes.labels[i] for i in kept}:
         reason = next(fault for fault, label in zip(strokes.faults, strokes.labels, strict=True) if label in lost)
         raise InputError(f"no usable stroke of {shown(sorted(lost))}: {reason}.")
-    chosen = [tuple(field[i] for i in kept) for field in (strokes.strokes, strokes.ids, strokes.labels, strokes.people)]
+    names = ("strokes", "ids", "labels", "people")
+    chosen = {name: tuple(getattr(strokes, name)[i] for i in kept) for name in names}
     warnings = (*strokes.warnings, *(f"{fault}; it is left out" for fault in strokes.faults if fault))
-    return StrokeSet(*chosen, strokes.dimensions, warnings, ("",) * len(kept))
+    return strokes._replace(**chosen, warnings=warnings, faults=("",) * len(kept))
 
 
 _NOT_A_NUMBER = "has a coordinate that is no number"
 
 
+def _row(before: int, point: int) -> str:
+    return f"row {before + point}: "
+
+
+def _line(lines: np.ndarray, point: int) -> str:
+    return f"line {lines[point]}: "
+
+
 def _fault(pieces: Sequence[np.ndarray], name: str, path: str, place: Callable[[int], str] = lambda _: "") -> str:
     """Why a stroke cannot be recognised; it says the place of the point that is no number, or of the first one."""
     points = np.concatenate(pieces) if len(pieces) else np.zeros((0, 2))
-    lacks = ~np.isfinite(points).all(axis=1)
+    lacks = np.asarray(~np.isfinite(points).all(axis=1))
     first = int(np.argmax(lacks)) if len(lacks) else 0
     where = f"{path}: {place(first)}" if len(points) else f"{path}: "
     if lacks.any():
@@ -204,7 +214,7 @@ def _of_npz(path: Path) -> StrokeSet:
     ids = tuple(str(i) for i in range(len(strokes)))
     befores = np.concatenate([[0], np.cumsum(lengths)])[first[:-1]]
     faults = tuple(
-        _fault(pieces, name, str(path), lambda point, before=before: f"row {before + point}: ")
+        _fault(pieces, name, str(path), partial(_row, before))
         for (pieces, _), name, before in zip(strokes, ids, befores, strict=True)
     )
     return StrokeSet(strokes, ids, labels, people, points.shape[1], faults=faults)
@@ -269,9 +279,7 @@ def _of_table(table: Table, path: Path) -> list[_Own]:
             )
         in_time = rows[np.argsort(times[rows], kind="stable")]
         own = points[in_time]
-        fault = _fault(
-            [own], str(names[rows[0]]), str(path), lambda point, rows=in_time: f"line {table.lines[rows[point]]}: "
-        )
+        fault = _fault([own], str(names[rows[0]]), str(path), partial(_line, table.lines[in_time]))
         words = [
             _word([table.words[name][row] for row in rows], name, place) for name in _WORDS[1:] if name in table.words
         ]

@@ -47,6 +47,8 @@ class Undistortion:
         """Pixels (..., 2) of the video, without lens distortion."""
         if self.is_identity:
             return np.asarray(uv, float)
+        assert self.K is not None
+        assert self.distortion is not None
         points = np.asarray(uv, float).reshape(-1, 1, 2)
         return cv2.undistortPoints(points, self.K, self.distortion, P=self.K).reshape(np.shape(uv))
 

@@ -134,8 +134,9 @@ class PeopleSession:
                 f"subtraction: expected one for each of {len(scene.cameras)} cameras; got {len(subtraction)}."
             )
         self.tracks = PeopleTracks(scene)
-        by_name = isinstance(subtraction, str)
-        self._backgrounds = [background(subtraction) for _ in scene.cameras] if by_name else list(subtraction)
+        self._backgrounds: list[Background] = (
+            [background(subtraction) for _ in scene.cameras] if isinstance(subtraction, str) else list(subtraction)
+        )
         self._images = [np.zeros((*camera.shape, 3), np.uint8) for camera in scene.cameras]
         self._outlines: list[Outline] | None = None
         self._estimate: PeopleEstimate | None = None
