@@ -214,7 +214,7 @@ def _of_npz(path: Path) -> StrokeSet:
     ids = tuple(str(i) for i in range(len(strokes)))
     befores = np.concatenate([[0], np.cumsum(lengths)])[first[:-1]]
     faults = tuple(
-        _fault(pieces, name, str(path), partial(_row, before))
+        _fault(pieces, name, str(path), partial(_row, int(before)))
         for (pieces, _), name, before in zip(strokes, ids, befores, strict=True)
     )
     return StrokeSet(strokes, ids, labels, people, points.shape[1], faults=faults)
