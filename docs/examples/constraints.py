@@ -16,8 +16,7 @@
 # noise of 15 degrees clipping had 5.4 degrees there, and truncation, whose mean is always inside, 7.3.
 #
 # **Result:** the root mean square error is **14.6** degrees with truncation, **16.2** by clipping, **19.9** by the
-# Kalman
-# filter and **40.7** without a filter; **0.90** of the true angles are within 2 sigma of the truncated belief.
+# Kalman filter and **40.7** without a filter; **0.90** of the true angles are within 2 sigma of the truncated belief.
 
 # %%
 import sys
