@@ -16,7 +16,7 @@ in such a folder in the folder of a person. Files of UNIPEN, InkML and JSON are 
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def usable(strokes: StrokeSet) -> StrokeSet:
         reason = next(fault for fault, label in zip(strokes.faults, strokes.labels, strict=True) if label in lost)
         raise InputError(f"no usable stroke of {shown(sorted(lost))}: {reason}.")
     names = ("strokes", "ids", "labels", "people")
-    chosen = {name: tuple(getattr(strokes, name)[i] for i in kept) for name in names}
+    chosen: dict[str, Any] = {name: tuple(getattr(strokes, name)[i] for i in kept) for name in names}
     warnings = (*strokes.warnings, *(f"{fault}; it is left out" for fault in strokes.faults if fault))
     return strokes._replace(**chosen, warnings=warnings, faults=("",) * len(kept))
 
