@@ -96,7 +96,7 @@ FILTERS = {
     "rao_blackwell_shared": lambda of: rao_blackwell(
         partial(jf.rao_blackwell_shared, observe=of(linear_observation, linear_observation_at)), None
     ),
-    "guided": lambda of: jf.guided(
+    "guided": lambda of: jf.guided_rao_blackwell(
         rao_blackwell(jf.rao_blackwell_shared, of(log_likelihood, log_likelihood_at)), of(guide, guide_at)
     ),
     "gaussian_sum": lambda of: jf.gaussian_sum(

@@ -66,7 +66,7 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     pose, _ = pose_moments(*particles_of(state.ensemble))
     scale, side = float(state.scale), float(state.side)
     palm = np.asarray(hand_center(pose, 0.6 * scale))
-    if not (np.isfinite(palm).all() and palm[2] > NEAREST):
+    if int(state.misses) or not (np.isfinite(palm).all() and palm[2] > NEAREST):
         return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
     image = filled(jnp.asarray(frame), state.missing_is_background)
     camera, window = _cropped(setup, image, jnp.asarray(palm))

@@ -41,7 +41,7 @@ def test_track_writes_all_results(npz_file, tmp_path, depth_mm, capsys):
     assert report["frames"] == len(depth_mm)
     assert report["config"]["num_particles"] == 100
     assert report["config"]["seed"] == 5
-    assert report["status"] == {"searching": 1, "tracking": 39, "lost": 0}
+    assert report["status"] == {"searching": 1, "tracking": 39, "lost": 0, "doubtful": 0}
     assert report["mean_joint_error_mm"] is None
     assert report["frames_per_second"] > 0
     captured = capsys.readouterr()
@@ -72,7 +72,7 @@ def test_a_recording_without_a_hand_has_empty_results_and_no_crash(tmp_path, rec
     assert run("track", "hand-depth", tmp_path / "empty.npz", "--out", out) == 0
     assert {file.name for file in out.iterdir()} == OUTPUTS
     report = json.loads((out / "report.json").read_text())
-    assert report["status"] == {"searching": 20, "tracking": 0, "lost": 0}
+    assert report["status"] == {"searching": 20, "tracking": 0, "lost": 0, "doubtful": 0}
     assert report["mean_joint_error_mm"] is None
     assert "20 searching" in capsys.readouterr().out
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 20

@@ -74,7 +74,7 @@ def test_track_writes_all_results(npz, tmp_path, features, capsys):
     report = json.loads((out / "report.json").read_text())
     assert report["frames"] == len(features)
     assert (report["config"]["hypotheses"], report["config"]["seed"]) == (3, 5)
-    assert report["status"] == {"searching": 1, "tracking": len(features) - 1, "lost": 0}
+    assert report["status"] == {"searching": 1, "tracking": len(features) - 1, "lost": 0, "doubtful": 0}
     lengths = np.abs(mean[-1] - features.truth[-1])[layout.lengths]
     assert report["mean_length_error_px"] == pytest.approx(lengths.mean(), abs=1e-3)
     assert report["lengths_within_2_sigma_percent"] == pytest.approx(100 * (lengths <= 1).mean(), abs=0.1)
