@@ -60,10 +60,7 @@ class Redraw(Protocol):
         ...
 
 
-@pytree_dataclass
-class Ancestral:
-    """The given trajectory keeps its past, and the new one is the ancestry of a particle of the last frame."""
-
+class _KeepsPast:
     def parent(
         self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
     ) -> tuple[Array, Array]:
@@ -71,6 +68,8 @@ class Ancestral:
         del point, log_weights, particles, x_next, inputs
         return jnp.zeros((), jnp.int32), jnp.zeros((), bool)
 
+
+class _TracesAncestry:
     def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
         """The ancestry of a particle that is drawn by its weight."""
         del inputs
@@ -78,7 +77,12 @@ class Ancestral:
 
 
 @pytree_dataclass
-class AncestorSampling:
+class Ancestral(_KeepsPast, _TracesAncestry):
+    """The given trajectory keeps its past, and the new one is the ancestry of a particle of the last frame."""
+
+
+@pytree_dataclass
+class AncestorSampling(_TracesAncestry):
     """The given trajectory is joined, frame by frame, to a past that is drawn anew."""
 
     log_transition: LogTransition
@@ -95,24 +99,12 @@ class AncestorSampling:
         impossible = ~jnp.any(joined > -jnp.inf)
         return jnp.where(impossible, 0, _draw_index(joined, point)), impossible
 
-    def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
-        """The ancestry of a particle that is drawn by its weight."""
-        del inputs
-        return _ancestry(key, history)
-
 
 @pytree_dataclass
-class BackwardSampling:
+class BackwardSampling(_KeepsPast):
     """The given trajectory keeps its past, and the new one is drawn backwards through all particles."""
 
     log_transition: LogTransition
-
-    def parent(
-        self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
-    ) -> tuple[Array, Array]:
-        """The given trajectory's own particle."""
-        del point, log_weights, particles, x_next, inputs
-        return jnp.zeros((), jnp.int32), jnp.zeros((), bool)
 
     def trace(self, key: AnyKey, history: History, inputs: PyTree) -> PyTree:
         """One draw by backward sampling."""
