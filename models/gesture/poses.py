@@ -2,14 +2,14 @@
 
 Each frame is turned onto a template by weighted least squares (W. Kabsch, Acta Crystallographica A32, 1976). Points
 weigh by how little they move relative to the others (generalised Procrustes analysis, J. Gower, Psychometrika 40,
-1975): for a hand most counts what the joints of the palm do. Features are where all points are in that body's frame, how they move
-in it, how the body moves in the world and in its own frame, and how it is turned.
+1975): of a hand it is mostly the joints of the palm that count. Features are where all points are in that body's frame,
+how those that move most do so in it, how the body moves in the world and in its own frame, and how it is turned.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 
 RATE_HZ = 20.0
@@ -20,6 +20,8 @@ REACH = 5
 """Frames before and after one that its features depend on."""
 SATURATION = 3.0
 """Root mean square speeds at which speeds begin to saturate: twice as fast is not twice as different."""
+MOVING = 4
+"""One in so many points, those that move most in the body's frame, has its speed among the features."""
 _MOST_FRAMES, _ROUNDS = 3000, 6
 _LEAST_SPREAD = 0.15
 
@@ -31,6 +33,8 @@ class PoseTemplate(NamedTuple):
     """Mean of the points, in the body's frame, in the unit of the data."""
     weights: Float[np.ndarray, " j"]
     """Of points in the alignment, summing to 1."""
+    moving: Int[np.ndarray, " m"]
+    """Points whose speeds are features: those of the smallest weights, the tips of a hand's fingers."""
     size: float
     """Root mean square distance of the points from their centre, in the unit of the data; 1 for a single point."""
     speed: float
@@ -62,7 +66,7 @@ def fit_template(streams: list[Float[np.ndarray, "_ j d"]]) -> PoseTemplate:
     weights, shape = np.full(num_points, 1 / num_points), frames[len(frames) // 2]
     shape = shape - shape.mean(axis=0)
     size = float(np.sqrt(np.mean(np.sum(shape**2, axis=1)))) if num_points > 1 else 1.0
-    template = PoseTemplate(shape, weights, size or 1.0, 1.0, 1.0)
+    template = PoseTemplate(shape, weights, np.arange(num_points), size or 1.0, 1.0, 1.0)
     for _ in range(_ROUNDS):
         local = aligned(template, frames).local
         spread = np.mean(np.sum((local - local.mean(axis=0)) ** 2, axis=2), axis=0) / template.size**2
@@ -71,10 +75,12 @@ def fit_template(streams: list[Float[np.ndarray, "_ j d"]]) -> PoseTemplate:
         shape = local.mean(axis=0)
         shape = shape - weights @ shape
         template = template._replace(shape=shape, weights=weights)
+    moving = np.sort(np.argsort(weights, kind="stable")[: -(-num_points // MOVING)])
+    template = template._replace(moving=moving)
     poses = [aligned(template, stream) for stream in streams if len(stream) > 1]
     speed, bending = (
         float(np.sqrt(np.mean(np.concatenate([np.sum(_speeds(values) ** 2, axis=-1).ravel() for values in own]))))
-        for own in ([pose.centers for pose in poses], [pose.local / template.size for pose in poses])
+        for own in ([pose.centers for pose in poses], [pose.local[:, moving] / template.size for pose in poses])
     )
     if not np.isfinite(speed) or speed <= 0:
         raise ValueError("streams must hold points that move; these rest in all frames.")
@@ -101,12 +107,13 @@ def aligned(template: PoseTemplate, points: Float[np.ndarray, "t j d"]) -> Poses
 def pose_features(template: PoseTemplate, points: Float[np.ndarray, "t j d"]) -> Float[np.ndarray, "t f"]:
     """Features of every frame of a stream at `RATE_HZ`; frame t depends on those within `REACH` of it."""
     poses = aligned(template, points)
-    local = (poses.local / template.size).reshape(len(points), -1)
+    local = poses.local / template.size
+    bending = _speeds(local[:, template.moving]) / template.bending
     velocity = _speeds(poses.centers) / template.speed
     velocity = velocity / np.sqrt(1 + np.sum(velocity**2, axis=1, keepdims=True) / SATURATION**2)
     own = np.einsum("tde,td->te", poses.turns, velocity)
-    turns = poses.turns.reshape(len(points), -1)
-    return np.concatenate([local, _speeds(local) / template.bending, velocity, own, turns], axis=1).astype(np.float32)
+    flat = [values.reshape(len(points), -1) for values in (local, bending, velocity, own, poses.turns)]
+    return np.concatenate(flat, axis=1).astype(np.float32)
 
 
 def resampled(
