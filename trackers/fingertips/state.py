@@ -1,5 +1,6 @@
 """The options of the fingertip tracker, its state between two frames, and its report of each tip."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -64,6 +65,12 @@ class FingertipConfig:
     """Frames of doubt after which fingers are matched in any order."""
     empty_frames: int = 15
     """Frames without a tip after which the hand is forgotten."""
+    angle_sd: float = math.radians(8.0)
+    """Of the direction of a fingertip from the palm, when it comes back, radians."""
+    length_sd: float = 0.35
+    """Of its distance from the palm then, palm radii."""
+    stranger: float = 4.0
+    """Squared distance in these from which on it is a finger of another name, while there are any."""
     axis_frames: int = 10
     """Frames for which the arm's last axis stands in for one that is not visible."""
     posture: Posture = POSTURE
@@ -110,10 +117,22 @@ class Tracks(NamedTuple):
     is_thumb: Bool[Array, " slots"]
 
 
+class Fingers(NamedTuple):
+    """Where the fingers of a hand are about its palm, by their names."""
+
+    angle: Float[Array, " names"]
+    """From the arm's axis, radians."""
+    length: Float[Array, " names"]
+    """From the palm, palm radii."""
+    known: Bool[Array, " names"]
+    """Whether a fingertip had this name yet."""
+
+
 class HandState(NamedTuple):
     """One hand between two frames."""
 
     tracks: Tracks
+    fingers: Fingers
     palm: Float[Array, "2"]
     """Where it was observed last, pixels."""
     palm_velocity: Float[Array, "2"]
@@ -179,6 +198,9 @@ class Method(NamedTuple):
     """`(config, state, beliefs, observed) -> (tip of every slot or -1, whether the order was in doubt)`."""
     may_begin: Callable[..., Array]
     """`(config, tracks, positions, observed) -> which tips without a track may begin one`."""
+    name: Callable[..., tuple[Array, Any]]
+    """`(config, state, tracks, ready, places, observed) -> (identity of every slot, fingers)`: which fingers the tracks
+    are that become fingertips in this frame."""
     report: Callable[..., Array]
     """`(detected, filtered) -> position` that is reported where a tip was detected."""
     thumb: ThumbTest
