@@ -1,4 +1,6 @@
-"""Which finger a track is that becomes a fingertip: a number of its own, or the name of a finger in the same place."""
+"""Which finger a track is that becomes a fingertip: a number of its own, or one of five names by its place."""
+
+import math
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +11,21 @@ from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation
 from jaxfilters.models.fingertip.thumb import base_angle
 from jaxfilters.trackers.fingertips.state import CONFIRMED, Fingers, FingertipConfig, HandState, Tracks
 
-UPDATE_SHARE = 0.05
+ANGLES = tuple(math.radians(angle) for angle in (58.0, 20.0, 0.0, -18.0, -38.0))
+"""Of the tips of thumb, forefinger, middle, ring and little finger about the palm, of people's open hands."""
+LENGTHS = (1.85, 2.5, 2.75, 2.5, 2.1)
+"""Of the same, palm radii from the palm."""
+UPDATE_SHARE = 0.02
 """Of what a frame shows in the place that belongs to a name: a hand changes its posture slowly."""
-_IN_TURN = 1e-2
-"""Cost by which new names are given in the order of the tracks."""
-_MOST, _GATE = 100.0, 400.0
-"""Costs of a pair at most, and of none: every fingertip gets a name."""
+MOST, KEPT = 16.0, 8.0
+"""Squared deviations of a fingertip from the place of a name that count at most, and what another name costs beside."""
+_GATE = 1000.0
+"""Cost of no name: every fingertip gets one."""
 
 
 def no_fingers() -> Fingers:
-    """No name was given yet."""
-    return Fingers(jnp.zeros(MAX_TIPS), jnp.zeros(MAX_TIPS), jnp.zeros(MAX_TIPS, bool))
+    """Of a hand of which nothing was observed yet: people's."""
+    return Fingers(jnp.asarray(ANGLES), jnp.asarray(LENGTHS))
 
 
 def numbered(
@@ -29,9 +35,10 @@ def numbered(
     ready: Bool[Array, " slots"],
     places: Float[Array, "slots 2"],
     observed: HandObservation,
+    side: float | Array,
 ) -> tuple[Int32[Array, " slots"], Fingers]:
     """The next number for each, as if it had never been there."""
-    del config, places, observed
+    del config, places, observed, side
     number = state.next_identity + jnp.cumsum(ready) - 1
     return jnp.where(ready, number, tracks.identity).astype(jnp.int32), state.fingers
 
@@ -43,43 +50,32 @@ def by_place(
     ready: Bool[Array, " slots"],
     places: Float[Array, "slots 2"],
     observed: HandObservation,
+    side: float | Array,
 ) -> tuple[Int32[Array, " slots"], Fingers]:
-    """The name, of five, of the finger that was in this direction and at this distance from the palm.
+    """Thumb 0 to little finger 4, by direction and distance from the palm, in their order about it.
 
-    Directions are relative to those fingers that are there. Where a direction differs from those of all absent fingers,
-    the track gets a name that was not given yet, if there is one. The names outlive the tracks, and the hand's absence.
+    Names are given when a track becomes a fingertip, to all that are there together: in their order, and the others
+    keep theirs unless that is contradicted. Between such frames a name stays with its track, also where fingers cross.
+    The places of the names follow the fingers slowly, and outlive the tracks and the hand's absence.
     """
-    names = jnp.arange(MAX_TIPS)
-    fingers = state.fingers
-    angle = jax.vmap(base_angle, in_axes=(0, None, None))(places, state.palm, state.axis)
+    names, fingers = jnp.arange(MAX_TIPS), state.fingers
+    there = tracks.mode == CONFIRMED
+    angle = jax.vmap(base_angle, in_axes=(0, None, None, None))(places, state.palm, state.axis, side)
     length = jnp.linalg.norm(places - state.palm, axis=1) / jnp.maximum(observed.palm_radius, 1.0)
-    own = tracks.identity[:, None] == names
-    present = own & ((tracks.mode == CONFIRMED) & ~ready)[:, None]
-    turned = jnp.sum(jnp.where(present, _turn(angle[:, None], fingers.angle), 0.0))
-    turned = turned / jnp.maximum(jnp.sum(present), 1)
-    off = _turn(angle[:, None] - turned, fingers.angle) / config.angle_sd
-    cost = off**2 + ((length[:, None] - fingers.length) / config.length_sd) ** 2
-    rank = jnp.cumsum(ready)[:, None] - 1
-    cost = jnp.where(fingers.known, cost, config.stranger + _IN_TURN * (rank - names) ** 2)
-    named = assignment.match_gated(jnp.minimum(cost, _MOST), _GATE, ready, ~jnp.any(present, axis=0)).column
-    identity = jnp.where(ready, named, tracks.identity).astype(jnp.int32)
-    shows = (identity[:, None] == names) & (ready | (tracks.missed == 0) & (tracks.mode == CONFIRMED))[:, None]
-    shows &= observed.is_hand
-    return identity, _updated(fingers, shows, angle, length)
-
-
-def _updated(
-    fingers: Fingers, shows: Bool[Array, "slots names"], angle: Float[Array, " slots"], length: Float[Array, " slots"]
-) -> Fingers:
-    """With the places of this frame, in which each name is shown by one track at most."""
-    there = jnp.any(shows, axis=0)
-    share = jnp.where(fingers.known, UPDATE_SHARE, 1.0) * there
-    direction = jnp.sum(jnp.where(shows, angle[:, None], 0.0), axis=0)
-    distance = jnp.sum(jnp.where(shows, length[:, None], 0.0), axis=0)
-    return Fingers(
-        fingers.angle + share * _turn(direction, fingers.angle),
-        fingers.length + share * (distance - fingers.length),
-        fingers.known | there,
+    off = _turn(angle[:, None], fingers.angle) / config.angle_sd
+    cost = jnp.minimum(off**2 + ((length[:, None] - fingers.length) / config.length_sd) ** 2, MOST)
+    is_other = (tracks.identity >= 0)[:, None] & (tracks.identity[:, None] != names)
+    # The thumb has the greatest angle.
+    order = jnp.argsort(jnp.where(there, -angle, jnp.inf))
+    every = jnp.ones(MAX_TIPS, bool)
+    found = assignment.match_noncrossing_gated((cost + KEPT * is_other)[order], _GATE, there[order], every).column
+    named = jnp.zeros_like(found).at[order].set(found)
+    identity = jnp.where(jnp.any(ready), jnp.where(there, named, -1), tracks.identity).astype(jnp.int32)
+    shows = (identity[:, None] == names) & (there & (tracks.missed == 0) & observed.is_hand)[:, None]
+    share = UPDATE_SHARE * shows
+    turn, longer = _turn(angle[:, None], fingers.angle), length[:, None] - fingers.length
+    return identity, Fingers(
+        fingers.angle + jnp.sum(share * turn, axis=0), fingers.length + jnp.sum(share * longer, axis=0)
     )
 
 

@@ -65,12 +65,10 @@ class FingertipConfig:
     """Frames of doubt after which fingers are matched in any order."""
     empty_frames: int = 15
     """Frames without a tip after which the hand is forgotten."""
-    angle_sd: float = math.radians(8.0)
-    """Of the direction of a fingertip from the palm, when it comes back, radians."""
-    length_sd: float = 0.35
-    """Of its distance from the palm then, palm radii."""
-    stranger: float = 4.0
-    """Squared distance in these from which on it is a finger of another name, while there are any."""
+    angle_sd: float = math.radians(10.0)
+    """Of the direction of a fingertip from the palm, around that of its name, radians."""
+    length_sd: float = 0.5
+    """Of its distance from the palm, palm radii."""
     axis_frames: int = 10
     """Frames for which the arm's last axis stands in for one that is not visible."""
     posture: Posture = POSTURE
@@ -107,7 +105,7 @@ class Tracks(NamedTuple):
     """Mean (slots, 4) and covariance (slots, 4, 4) in the next frame, as in `models.fingertip.motion`."""
     mode: Int32[Array, " slots"]
     identity: Int32[Array, " slots"]
-    """-1 until it is confirmed."""
+    """-1 until it is confirmed; then 0, the thumb, to 4, or in the published way a number of its own."""
     hits: Int32[Array, " slots"]
     """Detections so far."""
     missed: Int32[Array, " slots"]
@@ -124,8 +122,6 @@ class Fingers(NamedTuple):
     """From the arm's axis, radians."""
     length: Float[Array, " names"]
     """From the palm, palm radii."""
-    known: Bool[Array, " names"]
-    """Whether a fingertip had this name yet."""
 
 
 class HandState(NamedTuple):
@@ -199,7 +195,7 @@ class Method(NamedTuple):
     may_begin: Callable[..., Array]
     """`(config, tracks, positions, observed) -> which tips without a track may begin one`."""
     name: Callable[..., tuple[Array, Any]]
-    """`(config, state, tracks, ready, places, observed) -> (identity of every slot, fingers)`: which fingers the tracks
+    """`(config, state, tracks, ready, places, observed, side) -> (identity of every slot, fingers)`: which the tracks
     are that become fingertips in this frame."""
     report: Callable[..., Array]
     """`(detected, filtered) -> position` that is reported where a tip was detected."""

@@ -88,7 +88,7 @@ def step(
     following = jax.vmap(motion.predict, in_axes=(None, 0, None))(moves, corrected, config.drive)
     tracks, ready = lifecycle.continued(config, state.tracks, following, matched)
     places = corrected.mean[:, :2]
-    identity, fingers = method.name(config, placed, tracks, ready, places, observed)
+    identity, fingers = method.name(config, placed, tracks, ready, places, observed, side)
     tracks = tracks._replace(identity=identity)
     seen_twice = ~jnp.any(tip[:, None] == jnp.arange(len(observed.is_tip)), axis=0)
     new = seen_twice & method.may_begin(config, tracks, places, observed)

@@ -178,9 +178,9 @@ def test_a_finger_is_given_up_when_its_prediction_is_too_uncertain():
     assert [int(report.is_observed.sum()) for report in reports[20:]] == [1] * 8
     _, again = play([both] * 3, state)
     np.testing.assert_array_equal(names_from_the_left(again[-1]), names_from_the_left(reports[10]))
-    # A finger that was not there before has a name of its own.
+    # The thumb, which was not there before, is the first.
     _, others = play([shown([INDEX, MIDDLE, THUMB])] * 4, state)
-    assert names_from_the_left(others[-1]) == [2, *names_from_the_left(reports[10])]
+    assert names_from_the_left(others[-1]) == [0, *names_from_the_left(reports[10])]
 
 
 @pytest.mark.system
@@ -215,7 +215,7 @@ def test_a_hand_that_is_gone_is_forgotten_but_not_its_fingers():
     assert int(state.empty) == 0
     assert int(reports[-1].mode) == ABSENT
     _, reports = play([shown([MIDDLE, INDEX])] * 3, state)
-    assert names_from_the_left(reports[-1]) == [0, 1]
+    assert names_from_the_left(reports[-1]) == [1, 2]
 
 
 def test_without_the_arm_nothing_is_learnt_about_the_thumb():
