@@ -2,8 +2,8 @@
 
 `sfinge3d_gestures` of JAXFILTERS_DATA: 13 gestures, poses and movements, in streams at 20 frames a second. Sequences
 are left out in six folds and searched by a model of the others and of the dictionary of single gestures; with
-`--truth FILE.npz`, other sequences in the format of `sequences.npz`, everything in the folder is learnt from and that
-file is searched. `found` is the share of gestures of which more than half is in a detection of its own,
+`--truth FILE.npz`, other sequences in the format of `sequences.npz`, a model of everything in the folder searches that
+file. `found` is the share of gestures of which more than half is in a detection of its own,
 `false_per_minute` what is detected beside them, `jaccard` the mean overlap over gestures and false alarms;
 `latency_s` is the median time from the last frame of a gesture to the last frame that its report needs. The share of a
 frame's posterior that counts and the margins were chosen on the 36 sequences of the folder.
@@ -16,6 +16,7 @@ warping with the 30 that are nearest.
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -50,16 +51,17 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     folder = recording_folder("sfinge3d_gestures")
     if missing := [name for name in ("dictionary.npz", "sequences.npz") if not (folder / name).is_file()]:
         raise RecordingError(f"{folder} holds no {missing[0]}.")
+    key = jax.random.key(seed)
     known, steps = read_streams(folder), QUICK_STEPS if quick else NUM_STEPS
     if truth is None:
         folds = QUICK_FOLDS if quick else FOLDS
-        found = leave_streams_out(known.streams, known.names, num_folds=folds, seed=seed, num_steps=steps)
+        found = leave_streams_out(key, known.streams, known.names, num_folds=folds, num_steps=steps)
         searched = [stream for stream in known.streams if not stream.is_example]
         pairs = [own for own in found if own is not None]
     else:
         other = read_streams(truth)
         searched = list(_renamed(other, known.names))
-        model = learn_streams(known.streams, known.names, seed=seed, num_steps=steps)
+        model = learn_streams(key, known.streams, known.names, num_steps=steps)
         pairs = [spot(model, stream) for stream in searched]
     metrics = _metrics("", [[one.segment for one in own] for own in pairs], searched)
     metrics |= _latency(pairs, searched)

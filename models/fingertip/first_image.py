@@ -87,7 +87,7 @@ def fit_hand_to_mask(mask: np.ndarray, *, threshold: float = 128.0) -> HandParam
 
 
 def fit_partial_hand(mask: np.ndarray) -> tuple[HandParameters, int]:
-    """Thickness of the fingers in a mask of a hand of which not all can be seen, and how many fingers there are.
+    """Thickness of the fingers in a mask of a hand of which not all is in the image, and how many fingers there are.
 
     Angles and side of the thumb stay the usual ones.
 

@@ -48,18 +48,18 @@ class Example(NamedTuple):
 
 
 def train(
-    examples: list[list[Example]], weights: Float[np.ndarray, " n"], num_classes: int, *, seed: int, num_steps: int
+    key: AnyKey, examples: list[list[Example]], weights: Float[np.ndarray, " n"], num_classes: int, *, num_steps: int
 ) -> FrameClassifier:
     """A network that maximises the conditional log-likelihood of classes in random windows.
 
     Args:
+        key: Random key, of windows, dropout, noise and start.
         examples: Of each stream, several that stand for it, distorted in different ways.
         weights: How often each stream is drawn, summing to 1.
         num_classes: Classes of frames are from 0 to this, or `UNLABELLED`.
-        seed: Of windows, dropout, noise and start.
         num_steps: Steps of Adam with decoupled weight decay.
     """
-    rng, key = np.random.default_rng(seed), jax.random.key(seed)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     features = np.concatenate([versions[0].features for versions in examples])
     mean, sd = features.mean(axis=0), features.std(axis=0) + _LEAST_SD
     params = _start(key, features.shape[1], num_classes)

@@ -22,6 +22,7 @@ from jaxfilters.hmm import Segment, SemiMarkovModel
 from jaxfilters.models.gesture import frame_classifier, poses
 from jaxfilters.models.gesture.frame_classifier import UNLABELLED, Example, FrameClassifier
 from jaxfilters.models.gesture.poses import RATE_HZ, PoseTemplate
+from jaxfilters.typing import AnyKey
 
 TEMPER = 0.3
 """Share of a frame's log posterior that counts: neighbouring frames say nearly the same."""
@@ -84,14 +85,18 @@ class Spotted(NamedTuple):
 
 
 def learn_streams(
-    streams: Sequence[Stream], names: tuple[str, ...], *, seed: int = 0, num_steps: int = frame_classifier.NUM_STEPS
+    key: AnyKey,
+    streams: Sequence[Stream],
+    names: tuple[str, ...],
+    *,
+    num_steps: int = frame_classifier.NUM_STEPS,
 ) -> StreamModel:
     """A model of the gestures in annotated streams; whatever is not annotated in them is background.
 
     Args:
+        key: Random key of the training.
         streams: Annotated streams, and perhaps examples of single gestures, which say nothing of the background.
         names: Of the gestures.
-        seed: Of the training.
         num_steps: Of the training.
 
     Raises:
@@ -99,7 +104,8 @@ def learn_streams(
             streams have different numbers of points or dimensions, or points do not move.
     """
     _check(streams, names)
-    rng = np.random.default_rng(seed)
+    distortion_key, training_key = jax.random.split(key)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(distortion_key)))
     first = [_resampled(stream, len(names)) for stream in streams]
     template = poses.fit_template([points for points, _ in first])
     examples = [
@@ -114,7 +120,7 @@ def learn_streams(
     share = EXAMPLE_SHARE if single.any() else 0.0
     for kind, part in ((single, share), (~single, 1 - share)):
         weights[kind] *= part / max(weights[kind].sum(), 1.0)
-    classifier = frame_classifier.train(examples, weights, len(names) + 1, seed=seed, num_steps=num_steps)
+    classifier = frame_classifier.train(training_key, examples, weights, len(names) + 1, num_steps=num_steps)
     return StreamModel(names, template, classifier, _durations(streams, len(names)))
 
 
@@ -148,14 +154,14 @@ def spot(model: StreamModel, stream: Stream) -> list[Spotted]:
 
 
 def leave_streams_out(
+    key: AnyKey,
     streams: Sequence[Stream],
     names: tuple[str, ...],
     *,
     num_folds: int = 6,
-    seed: int = 0,
     num_steps: int = frame_classifier.NUM_STEPS,
 ) -> list[list[Spotted] | None]:
-    """What is found in each stream by a model of others; `None` for examples of single gestures, always learnt from.
+    """What is found in each stream by a model of others; `None` for examples of single gestures, always trained with.
 
     Raises:
         ValueError: If there are fewer than two streams that are no examples, or as for `learn_streams`.
@@ -168,7 +174,7 @@ def leave_streams_out(
     for fold in range(folds):
         left_out = set(whole[fold::folds])
         others = [stream for i, stream in enumerate(streams) if i not in left_out]
-        model = learn_streams(others, names, seed=seed, num_steps=num_steps)
+        model = learn_streams(jax.random.fold_in(key, fold), others, names, num_steps=num_steps)
         for i in left_out:
             found[i] = spot(model, streams[i])
     return found
@@ -177,7 +183,8 @@ def leave_streams_out(
 @jax.jit
 def _spotted(model: SemiMarkovModel, scores: Float[jax.Array, "t q"]) -> Any:
     filter = hmm.semi_markov_spotter(model, scores.shape[1] - 1, patience=PATIENCE)
-    return run(filter, jax.random.key(0), scores, collect=_info)[1]
+    # The filter draws nothing with its key.
+    return run(filter, jnp.zeros(2, jnp.uint32), scores, collect=_info)[1]
 
 
 def _info(state: Any, info: Any) -> Any:
@@ -223,7 +230,7 @@ def _resampled(stream: Stream, background: int, speed: float = 1.0) -> tuple[np.
 
 
 def _distorted(rng: np.random.Generator, stream: Stream, background: int) -> tuple[np.ndarray, np.ndarray]:
-    """As if somebody else had done it: played at another speed, and turned."""
+    """As if another person had done it: played at another speed, and turned."""
     points, classes = _resampled(stream, background, float(rng.uniform(*SPEEDS)))
     if points.shape[2] == 3:
         turn = Rotation.from_rotvec(rng.normal(0, TURN_RAD, 3)).as_matrix()

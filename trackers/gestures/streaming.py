@@ -4,6 +4,8 @@ import argparse
 import csv
 from pathlib import Path
 
+import jax
+
 from jaxfilters.hmm import Segment
 from jaxfilters.models.gesture.poses import RATE_HZ
 from jaxfilters.models.gesture.spotting_score import Score, scored, total
@@ -37,7 +39,7 @@ def fit_streams(options: argparse.Namespace) -> str:
     lines = [_of_data(data, options.data.name)]
     if options.held_out:
         lines += _held_out(data, options.seed)
-    model = as_input_error(lambda: learn_streams(data.streams, data.names, seed=options.seed))
+    model = as_input_error(lambda: learn_streams(jax.random.key(options.seed), data.streams, data.names))
     write_stream_model(options.out, model, options.data.name)
     return "\n".join([*lines, _latency(), f"model in {options.out}"])
 
@@ -87,7 +89,7 @@ def _of_data(data: StreamSet, source: str) -> str:
 
 
 def _held_out(data: StreamSet, seed: int) -> list[str]:
-    found = as_input_error(lambda: leave_streams_out(data.streams, data.names, seed=seed))
+    found = as_input_error(lambda: leave_streams_out(jax.random.key(seed), data.streams, data.names))
     pairs = [(own, stream) for own, stream in zip(found, data.streams, strict=True) if own is not None]
     scores = [scored([one.segment for one in own], stream.segments) for own, stream in pairs]
     return ["streams left out in turn: " + _said(total(scores), _minutes([stream for _, stream in pairs]))]

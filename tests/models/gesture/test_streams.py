@@ -1,5 +1,6 @@
 """Gestures found in streams: what features do not depend on, and that nothing later than a report decides it."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -68,7 +69,7 @@ def test_missing_frames_are_interpolated_and_said():
 @pytest.mark.system
 def test_gestures_are_found_in_a_stream_and_no_later_frame_decides():
     training = [stream(seed, [seed % 2, 0, 1, (seed + 1) % 2]) for seed in range(1, 6)]
-    model = learn_streams(training, NAMES, num_steps=60)
+    model = learn_streams(jax.random.key(0), training, NAMES, num_steps=60)
     other = stream(99, [0, 1, 1, 0, 1])
     found = spot(model, other)
     score = scored([one.segment for one in found], other.segments)
@@ -100,4 +101,4 @@ def test_gestures_are_found_in_a_stream_and_no_later_frame_decides():
 )
 def test_streams_that_teach_nothing_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        learn_streams([change(stream(0, [0, 1]))], NAMES)
+        learn_streams(jax.random.key(0), [change(stream(0, [0, 1]))], NAMES)

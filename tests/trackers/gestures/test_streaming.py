@@ -41,7 +41,7 @@ def written(path, count, seed):
 
 @pytest.mark.system
 def test_gestures_of_a_folder_are_learnt_and_found(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(streams.learn_streams, "__kwdefaults__", {"seed": 0, "num_steps": 40})
+    monkeypatch.setattr(streams.learn_streams, "__kwdefaults__", {"num_steps": 40})
     folder, model, table = written(tmp_path / "data" / "some.npz", 6, 0).parent, tmp_path / "m.npz", tmp_path / "t.csv"
     assert main(["fit", "gestures", str(folder), "--stream", "--out", str(model)]) == 0
     told = capsys.readouterr().out
