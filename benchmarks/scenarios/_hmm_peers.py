@@ -36,7 +36,16 @@ def installed() -> list[str]:
 def dynamax(
     model: HiddenMarkovModel, codes: Int[Array, "n t"], training: Int[Array, "m t"], num_iterations: int
 ) -> Calls:
-    """Recursions of dynamax under `vmap` and `jit`; its expectation-maximisation in one loop, without priors."""
+    """Recursions of dynamax under `vmap` and `jit`; its expectation-maximisation in one loop, without priors.
+
+    Its M-step takes the mode of a Dirichlet distribution, which is NaN where a concentration is exactly 1: without a
+    prior, that of a symbol which no training sequence holds.
+
+    Raises:
+        ValueError: If a symbol is in no training sequence.
+    """
+    if missing := sorted(set(range(model.emission.log_probability.shape[1])) - set(np.unique(training).tolist())):
+        raise ValueError(f"training must hold every symbol, without which dynamax gives NaN; got none of {missing}.")
     inference = import_module("dynamax.hidden_markov_model.inference")
     initial, transition, emission = _probabilities(model)
     log_emission = jnp.log(emission)

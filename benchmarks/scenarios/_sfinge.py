@@ -23,6 +23,7 @@ from jaxfilters import hmm, run
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.hmm import Network, Segment
+from jaxfilters.models.gesture.spotting_score import scored
 from jaxfilters.models.gesture.symbols import trained
 
 FPS = 20.0
@@ -48,16 +49,6 @@ class Streams(NamedTuple):
     sequences: list[Float[np.ndarray, "_ 20 7"]]
     truth: list[list[Segment]]
     """Of every sequence."""
-
-
-class Score(NamedTuple):
-    """How gestures were found."""
-
-    detected: int
-    false_positives: int
-    total: int
-    jaccard: list[float]
-    """Of every gesture and every false positive."""
 
 
 def read_sfinge(folder: Path) -> Streams:
@@ -142,25 +133,6 @@ def _scores(network: Network, features: Float[Array, "t f"]) -> Float[Array, "t 
 def _reported(state: Any, info: Any) -> tuple:
     del state
     return info.reports, info.found
-
-
-def scored(found: list[Segment], truth: list[Segment]) -> Score:
-    """Detections of one sequence beside what was annotated."""
-    served: set[int] = set()
-    jaccard = []
-    for gesture in truth:
-        frames = gesture.end - gesture.start + 1
-        own = {i: _shared(one, gesture) for i, one in enumerate(found) if one.label == gesture.label}
-        served |= set([i for i, shared in own.items() if shared > 0.5 * frames and i not in served][:1])
-        near = {i: shared for i, shared in own.items() if shared > 0}
-        either = frames + sum(found[i].end - found[i].start + 1 - shared for i, shared in near.items())
-        jaccard.append(sum(near.values()) / either)
-    false = len(found) - len(served)
-    return Score(len(served), false, len(truth), jaccard + [0.0] * false)
-
-
-def _shared(a: Segment, b: Segment) -> int:
-    return max(0, min(a.end, b.end) - max(a.start, b.start) + 1)
 
 
 def sfinge_metrics(folder: Path, *, most: int | None = None) -> dict[str, Metric]:

@@ -16,6 +16,8 @@ LEAST_CONTRAST = 30
 """Grey values between a hand and a desk that a threshold can part."""
 LEAST_AREA, MOST_AREA = 0.03, 0.4
 """Of the image, that a hand with its forearm covers."""
+MOST_OF_NEAR = 0.7
+"""Of the image, that a hand covers whose camera is so near that it does not see all of it."""
 WINDOW = 9.0 / 6.5
 """Tip radii from the middle to the side of the template's window."""
 FINGER_SHARE = 0.45
@@ -57,15 +59,8 @@ def fit_hand_to_mask(mask: np.ndarray, *, threshold: float = 128.0) -> HandParam
     Raises:
         ValueError: a mask that is not (rows, cols) of bool, or that shows no open hand.
     """
-    hand = _largest(checked_mask(mask))
-    share = float(hand.mean()) / 255
-    if not LEAST_AREA <= share <= MOST_AREA:
-        raise ValueError(f"mask must hold a hand on {LEAST_AREA:.0%} to {MOST_AREA:.0%} of the image; got {share:.1%}.")
-    radius = _tip_radius(hand)
-    trial = HandParameters(threshold, radius, max(round(WINDOW * radius), math.ceil(radius) + 1))
-    seen = detect_hand(mask, trial)
-    if not seen.has_axis:
-        raise ValueError("mask must show the forearm as far as the border of the image; the hand does not touch it.")
+    trial, seen = _looked_at(mask, threshold, MOST_AREA)
+    radius = trial.tip_radius
     count = int(np.sum(seen.is_tip & seen.has_base))
     if count < MAX_TIPS:
         raise ValueError(f"mask must show an open hand with {MAX_TIPS} fingers spread; found {count} of them.")
@@ -89,6 +84,36 @@ def fit_hand_to_mask(mask: np.ndarray, *, threshold: float = 128.0) -> HandParam
         phi_index=phi_index,
         handedness=handedness,
     )
+
+
+def fit_partial_hand(mask: np.ndarray) -> tuple[HandParameters, int]:
+    """Thickness of the fingers in a mask of a hand of which not all is in the image, and how many fingers there are.
+
+    Angles and side of the thumb stay the usual ones.
+
+    Args:
+        mask: (rows, cols) of bool: which pixels are skin.
+
+    Raises:
+        ValueError: a mask that is not (rows, cols) of bool, that shows no finger, or a hand that is not in contact
+            with the border.
+    """
+    trial, seen = _looked_at(mask, 128.0, MOST_OF_NEAR)
+    return trial, int(np.sum(seen.is_tip & seen.has_base))
+
+
+def _looked_at(mask: np.ndarray, threshold: float, most: float) -> tuple[HandParameters, HandObservation]:
+    """Parameters with the thickness of fingers, and what detection finds with them."""
+    hand = _largest(checked_mask(mask))
+    share = float(hand.mean()) / 255
+    if not LEAST_AREA <= share <= most:
+        raise ValueError(f"mask must hold a hand on {LEAST_AREA:.0%} to {most:.0%} of the image; got {share:.1%}.")
+    radius = _tip_radius(hand)
+    trial = HandParameters(threshold, radius, max(round(WINDOW * radius), math.ceil(radius) + 1))
+    seen = detect_hand(mask, trial)
+    if not seen.has_axis:
+        raise ValueError("mask must show the forearm as far as the border of the image; the hand does not touch it.")
+    return trial, seen
 
 
 def base_angles(hand: HandObservation) -> Float[np.ndarray, " tips"]:

@@ -9,7 +9,13 @@ from jaxfilters.benchmarks.scenarios._hmm_peers import Calls
 
 @pytest.fixture
 def problem(monkeypatch):
-    for name, value in (("NUM_SEQUENCES", 6), ("NUM_TRAINING_SEQUENCES", 4), ("NUM_FRAMES", 9), ("NUM_ITERATIONS", 2)):
+    # With so many frames every symbol occurs, which dynamax needs.
+    for name, value in (
+        ("NUM_SEQUENCES", 32),
+        ("NUM_TRAINING_SEQUENCES", 32),
+        ("NUM_FRAMES", 9),
+        ("NUM_ITERATIONS", 2),
+    ):
         monkeypatch.setattr(hmm, name, value)
     model = hmm.random_model(0)
     codes = hmm.draw(0, model, hmm.NUM_SEQUENCES)
@@ -46,3 +52,9 @@ def test_a_peer_that_is_installed_agrees(problem, name):
     model, codes, *_ = problem
     hmm.check(model, codes, {"ours": hmm.ours(*problem), name: getattr(_hmm_peers, name)(*problem)})
     assert hmm.sum_of_paths(model, codes, jnp.zeros_like(codes)) < 0
+
+
+def test_training_without_one_of_the_symbols_is_refused_for_dynamax(problem):
+    model, codes, training, iterations = problem
+    with pytest.raises(ValueError, match=r"every symbol.*\[16\]"):
+        _hmm_peers.dynamax(model, codes, jnp.minimum(training, 15), iterations)

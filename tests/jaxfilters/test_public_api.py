@@ -220,6 +220,16 @@ def test_a_hidden_markov_model_is_a_filter_too():
 
 
 @pytest.mark.system
+def test_a_hidden_semi_markov_model_is_a_filter_too():
+    emission = jf.hmm.DiagonalGaussian(jnp.array([[0.0], [5.0]]), jnp.ones((2, 1)))
+    model = jf.hmm.semi_markov([0.5, 0.5], np.eye(2)[::-1], [[0.5, 0.5], [0.0, 1.0]], emission)
+    total = jf.log_evidence(jf.hmm.semi_markov_online(model), KEY, YS)
+    np.testing.assert_allclose(total, jf.hmm.semi_markov_log_evidence(model, model.log_likelihoods(YS)), rtol=1e-5)
+    slope = jax.grad(lambda y: jf.hmm.semi_markov_log_evidence(model, model.log_likelihoods(y)))(YS)
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.system
 def test_smoothing_and_fitting_take_any_of_them():
     beliefs, infos = jf.smoothing.filter_and_smooth(extended(jnp.float32(NOISE)), KEY, YS)
     assert beliefs.mean.shape == (len(YS), 2)

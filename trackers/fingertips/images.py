@@ -1,6 +1,8 @@
 """From images of hands over a desk to what they show of each hand, and what is estimated of the user beforehand."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -8,12 +10,12 @@ import jax
 import numpy as np
 
 from jaxfilters.models.fingertip.detection import detect_hands
-from jaxfilters.models.fingertip.first_image import fit_hand_parameters, fit_hand_to_mask
+from jaxfilters.models.fingertip.first_image import fit_hand_parameters, fit_hand_to_mask, fit_partial_hand
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.fingertip.keypoints import KEYPOINT_POSTURE
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold
-from jaxfilters.models.fingertip.skin import fit_skin_model, skin_mask
+from jaxfilters.models.fingertip.skin import SkinModel, fit_skin_model, skin_mask, skin_models
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture, ThumbAngles, calibrated, usual
 from jaxfilters.trackers.fingertips.events import Event, Recogniser
 from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, hands_of, parameters_of
@@ -24,6 +26,12 @@ OPEN_HAND_IMAGES = 60
 """Images in which an open hand is looked for before a recording is followed."""
 USUAL_TIP_RADIUS = 13.0
 """Pixels of an image with 480 rows, of a person who showed no open hand."""
+FEWEST_FINGERS = 3
+"""That a colour has to show at once, if not an open hand, to be that of skin, and for which thickness is measured."""
+CLUSTER_IMAGES = 6
+"""Images whose clusters of colour are tried, where no image shows an open hand in the colour of common skin."""
+LEAST_SHOWN = 0.5
+"""Fingertips an image, on average over these, that the colour of a hand shows."""
 Segment = Callable[[np.ndarray], np.ndarray]
 """`image -> mask` (rows, cols) bool."""
 
@@ -37,6 +45,8 @@ class User(NamedTuple):
     """Whether an open hand was observed; otherwise the parameters are the usual ones."""
     posture: Posture = POSTURE
     """Of people's thumbs and forefingers, as what the images are segmented by shows them."""
+    num_fingers: int = 0
+    """Fingers found without an open hand, by which images are compared."""
 
 
 def track(
@@ -87,27 +97,55 @@ def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> Us
     Raises:
         ValueError: an unknown mask, no images, or none in which a hand differs from the desk.
     """
-    kinds = {"infrared": _by_brightness, "depth": _by_height, "colour": _by_colour}
+    kinds = {"infrared": _by_brightness, "depth": _by_height, "colour": _by_skin}
     if mask not in kinds:
         raise ValueError(f"mask: expected one of {', '.join(kinds)}; got {mask!r}.")
     if not len(images):
         raise ValueError("no image.")
     if isinstance(images[0], HandKeypoints):
         return User(*_of_keypoints(images), KEYPOINT_POSTURE)
-    usual_user, why = None, ""
-    image: Any
+    user, why = _best_user(kinds[mask], images)
+    if user is not None and user.has_open_hand:
+        return user
+    if mask == "colour":
+        user = _consistent(user, images[:: max(1, len(images) // CLUSTER_IMAGES)])
+    if user is None:
+        raise ValueError(f"no image in which a hand differs from the desk; {why}")
+    return user
+
+
+def _best_user(estimate: Callable[[Any], User], images: Sequence[Any]) -> tuple[User | None, str]:
+    """The user of the first image with an open hand, else of that with most fingers, and what the last fault was."""
+    best, why = None, "no colour shows a finger in most of them."
     for image in images:
         try:
-            user = kinds[mask](image)
+            user = estimate(image)
         except ValueError as error:
-            why = str(error)
+            why = f"of the last one: {error}"
             continue
         if user.has_open_hand:
-            return user
-        usual_user = usual_user or user
-    if usual_user is None:
-        raise ValueError(f"no image in which a hand differs from the desk; of the last one: {why}")
-    return usual_user
+            return user, ""
+        if best is None or user.num_fingers > best.num_fingers:
+            best = user
+    return best, why
+
+
+def _consistent(by_skin: User | None, images: Sequence[Any]) -> User | None:
+    """By the colour that shows most fingers over several images, a cluster's or that of common skin, if any does.
+
+    A desk in the colour of skin may look like fingers between those of a hand, but not in every image.
+    """
+    users = [] if by_skin is None else [by_skin]
+    for image in images:
+        with suppress(ValueError):
+            users.append(_by_clusters(image))
+    shown = [np.mean([_num_tips(user, image) for image in images]) for user in users]
+    best = int(np.argmax(shown)) if users else 0
+    return users[best] if users and shown[best] >= LEAST_SHOWN else None
+
+
+def _num_tips(user: User, image: np.ndarray) -> int:
+    return int(detect_hands(user.segment(image), user.parameters, capacity=1)[0].is_tip.sum())
 
 
 def angles_of(user: User) -> ThumbAngles:
@@ -149,16 +187,41 @@ def _by_height(image: np.ndarray) -> User:
     return _of_mask(lambda image: depth_mask(image, desk), image)
 
 
-def _by_colour(image: np.ndarray) -> User:
-    model = fit_skin_model(image)
-    return _of_mask(lambda image: skin_mask(image, model), image)
+def _by_skin(image: np.ndarray) -> User:
+    return _of_colour([fit_skin_model(image)], image)
+
+
+def _by_clusters(image: np.ndarray) -> User:
+    return _of_colour(skin_models(image), image)
+
+
+def _of_colour(models: Iterable[SkinModel], image: np.ndarray) -> User:
+    """By the model that finds an open hand, or most fingers."""
+    best: User | None = None
+    for model in models:
+        user = _of_mask(partial(_skin_of, model), image)
+        if user.has_open_hand:
+            return user
+        best = user if best is None or user.num_fingers > best.num_fingers else best
+    if best is None:
+        raise ValueError("no colour in it parts a hand from the desk.")
+    return best
+
+
+def _skin_of(model: SkinModel, image: np.ndarray) -> np.ndarray:
+    return skin_mask(image, model)
 
 
 def _of_mask(segment: Segment, image: np.ndarray) -> User:
-    try:
-        return User(fit_hand_to_mask(segment(image)), segment, True)
-    except ValueError:
-        return User(_usual(image.shape[0]), segment, False)
+    mask = segment(image)
+    with suppress(ValueError):
+        return User(fit_hand_to_mask(mask), segment, True)
+    parameters, fingers = _usual(image.shape[0]), 0
+    with suppress(ValueError):
+        measured, fingers = fit_partial_hand(mask)
+        # One finger may be thick for many reasons.
+        parameters = measured if fingers >= FEWEST_FINGERS else parameters
+    return User(parameters, segment, False, num_fingers=fingers)
 
 
 def _usual(rows: int, threshold: float = 128.0) -> HandParameters:

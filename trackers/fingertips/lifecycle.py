@@ -70,9 +70,8 @@ def continued(
     tracks: Tracks,
     following: Gaussian,
     matched: Bool[Array, " slots"],
-    first: Int32[Array, ""],
-) -> tuple[Tracks, Int32[Array, ""]]:
-    """Tracks after a frame, and the next identity; `following` are their beliefs in the next frame.
+) -> tuple[Tracks, Bool[Array, " slots"]]:
+    """Tracks after a frame, and which became fingertips; `following` are their beliefs in the next frame.
 
     A fingertip coasts while its next prediction is certain enough; what is not one yet ends with its first miss.
     """
@@ -84,8 +83,7 @@ def continued(
     # A hand has five fingers: newcomers wait until one of those that are coasting is given up.
     room = MAX_TIPS - jnp.sum(mode == CONFIRMED)
     ready &= jnp.cumsum(ready) <= room
-    number = first + jnp.cumsum(ready) - 1
-    identity = jnp.where(ready, number, jnp.where(mode == FREE, -1, tracks.identity))
+    identity = jnp.where(mode == FREE, -1, tracks.identity)
     return (
         tracks._replace(
             belief=following,
@@ -95,7 +93,7 @@ def continued(
             missed=jnp.where(matched, 0, tracks.missed + 1).astype(jnp.int32),
             is_thumb=tracks.is_thumb & (mode != FREE),
         ),
-        (first + jnp.sum(ready)).astype(jnp.int32),
+        ready,
     )
 
 

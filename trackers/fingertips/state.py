@@ -1,5 +1,6 @@
 """The options of the fingertip tracker, its state between two frames, and its report of each tip."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -64,6 +65,10 @@ class FingertipConfig:
     """Frames of doubt after which fingers are matched in any order."""
     empty_frames: int = 15
     """Frames without a tip after which the hand is forgotten."""
+    angle_sd: float = math.radians(10.0)
+    """Of the direction of a fingertip from the palm, around that of its name, radians."""
+    length_sd: float = 0.5
+    """Of its distance from the palm, palm radii."""
     axis_frames: int = 10
     """Frames for which the arm's last axis stands in for one that is not visible."""
     posture: Posture = POSTURE
@@ -100,7 +105,7 @@ class Tracks(NamedTuple):
     """Mean (slots, 4) and covariance (slots, 4, 4) in the next frame, as in `models.fingertip.motion`."""
     mode: Int32[Array, " slots"]
     identity: Int32[Array, " slots"]
-    """-1 until it is confirmed."""
+    """-1 until it is confirmed; then 0, the thumb, to 4, or in the published way a number of its own."""
     hits: Int32[Array, " slots"]
     """Detections so far."""
     missed: Int32[Array, " slots"]
@@ -110,10 +115,20 @@ class Tracks(NamedTuple):
     is_thumb: Bool[Array, " slots"]
 
 
+class Fingers(NamedTuple):
+    """Where the fingers of a hand are about its palm, by their names."""
+
+    angle: Float[Array, " names"]
+    """From the arm's axis, radians."""
+    length: Float[Array, " names"]
+    """From the palm, palm radii."""
+
+
 class HandState(NamedTuple):
     """One hand between two frames."""
 
     tracks: Tracks
+    fingers: Fingers
     palm: Float[Array, "2"]
     """Where it was observed last, pixels."""
     palm_velocity: Float[Array, "2"]
@@ -179,6 +194,9 @@ class Method(NamedTuple):
     """`(config, state, beliefs, observed) -> (tip of every slot or -1, whether the order was in doubt)`."""
     may_begin: Callable[..., Array]
     """`(config, tracks, positions, observed) -> which tips without a track may begin one`."""
+    name: Callable[..., tuple[Array, Any]]
+    """`(config, state, tracks, ready, places, observed, side) -> (identity of every slot, fingers)`: which the tracks
+    are that become fingertips in this frame."""
     report: Callable[..., Array]
     """`(detected, filtered) -> position` that is reported where a tip was detected."""
     thumb: ThumbTest

@@ -14,7 +14,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.fingertip import motion
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles, base_angle
-from jaxfilters.trackers.fingertips import lifecycle
+from jaxfilters.trackers.fingertips import lifecycle, naming
 from jaxfilters.trackers.fingertips.association import likeliest, nearest_in_order
 from jaxfilters.trackers.fingertips.state import (
     ABSENT,
@@ -31,8 +31,12 @@ from jaxfilters.trackers.fingertips.state import (
 )
 from jaxfilters.trackers.fingertips.thumbs import MEAN_SCORE, POSTERIOR
 
-MODERN = Method(lifecycle.carried, likeliest, lifecycle.away_from_others, lifecycle.filtered, POSTERIOR)
-PUBLISHED = Method(lifecycle.no_hint, nearest_in_order, lifecycle.anywhere, lifecycle.detected, MEAN_SCORE)
+MODERN = Method(
+    lifecycle.carried, likeliest, lifecycle.away_from_others, naming.by_place, lifecycle.filtered, POSTERIOR
+)
+PUBLISHED = Method(
+    lifecycle.no_hint, nearest_in_order, lifecycle.anywhere, naming.numbered, lifecycle.detected, MEAN_SCORE
+)
 PUBLISHED_CONFIG = FingertipConfig(lost=300.0)
 """The published constants."""
 
@@ -42,6 +46,7 @@ def start(config: FingertipConfig, angles: ThumbAngles, *, method: Method = MODE
     never = jnp.asarray(NEVER, jnp.int32)
     return HandState(
         no_tracks(config, method.thumb.start(config, angles)),
+        naming.no_fingers(),
         palm=jnp.zeros(2),
         palm_velocity=jnp.zeros(2),
         unseen=never,
@@ -81,9 +86,10 @@ def step(
     matched = tip >= 0
     corrected, _ = jax.vmap(motion.correct)(beliefs, observed.tips[jnp.maximum(tip, 0)], matched)
     following = jax.vmap(motion.predict, in_axes=(None, 0, None))(moves, corrected, config.drive)
-    tracks, identity = lifecycle.continued(config, state.tracks, following, matched, state.next_identity)
-
+    tracks, ready = lifecycle.continued(config, state.tracks, following, matched)
     places = corrected.mean[:, :2]
+    identity, fingers = method.name(config, placed, tracks, ready, places, observed, side)
+    tracks = tracks._replace(identity=identity)
     seen_twice = ~jnp.any(tip[:, None] == jnp.arange(len(observed.is_tip)), axis=0)
     new = seen_twice & method.may_begin(config, tracks, places, observed)
     tracks, first_tip = lifecycle.begun(config, moves, tracks, observed.tips, new, method.thumb.start(config, angles))
@@ -92,13 +98,14 @@ def step(
 
     after = placed._replace(
         tracks=tracks,
+        fingers=fingers,
         disordered=jnp.where(doubt, placed.disordered + 1, 0).astype(jnp.int32),
-        next_identity=identity,
+        next_identity=(state.next_identity + jnp.sum(ready)).astype(jnp.int32),
     )
     sight = _Sight(corrected, observed.tips[jnp.maximum(tip, 0)], matched, probability)
     report = _report(config, after, observed, sight, method)
     gone = after.empty >= config.empty_frames
-    nothing = start(config, angles, method=method)._replace(next_identity=identity)
+    nothing = start(config, angles, method=method)._replace(fingers=fingers, next_identity=after.next_identity)
     return jax.tree.map(lambda a, b: jnp.where(gone, a, b), nothing, after), report
 
 

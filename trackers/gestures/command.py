@@ -26,6 +26,7 @@ from jaxfilters.models.gesture.symbols import Recognition, extended, recognise_a
 from jaxfilters.models.synthetic.strokes import drawn, tracked
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
+from jaxfilters.trackers.gestures.streaming import fit_streams, recognise_streams
 from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
 from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes, usable
@@ -47,6 +48,10 @@ def fit_gestures(options: argparse.Namespace) -> str:
         InputError: the strokes cannot be used, or do not go with the model that they are added to.
         OutputError: the model cannot be written.
     """
+    if options.stream:
+        return fit_streams(options)
+    if options.held_out == "sequence":
+        raise InputError("--held-out sequence goes with --stream.")
     with jax.enable_x64(True):
         examples, source = _examples(options)
         # The generator draws every shape in one way.
@@ -97,6 +102,8 @@ def recognise(options: argparse.Namespace) -> str:
         InputError: the model or the strokes cannot be used.
         OutputError: the table cannot be written.
     """
+    if options.stream:
+        return recognise_streams(options)
     path = DEFAULT_FILE if str(options.model) == "default" else options.model
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:

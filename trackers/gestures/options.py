@@ -14,6 +14,11 @@ _DATA = (
     "with a folder of such files for each symbol, .npz with points, length, label and perhaps person, or file of "
     "UNIPEN, InkML (.inkml) or JSON (.json, .ndjson); without it, symbols that are drawn at random"
 )
+_STREAMS = (
+    "an .npz, or a folder of them, with points (F, J, 2 or 3) of all frames, length, the frames of each stream, "
+    "annotations, rows of stream, gesture, first and last frame, and perhaps fps and names; or gesture, a number for "
+    "each stream that is one example"
+)
 
 
 def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
@@ -25,8 +30,12 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         "--add", type=Path, metavar="MODEL.npz", help="keep the symbols of this model and add those of DATA; five do"
     )
     gestures.add_argument(
-        "--held-out", choices=("person",), help="also say how strokes of each person are recognised by the others'"
+        "--held-out",
+        choices=("person", "sequence"),
+        help="also say how strokes of each person are recognised by the others', or how gestures of streams are found "
+        "by the others'",
     )
+    gestures.add_argument("--stream", action="store_true", help=f"find gestures in streams: DATA is {_STREAMS}")
     gestures.add_argument(
         "--states", type=positive_integer, metavar="N", help="of each model (default: 10; 16 for paths in a plane)"
     )
@@ -49,6 +58,9 @@ def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
     )
     recognise.add_argument("data", nargs="?", type=Path, metavar="DATA", help=_DATA)
     recognise.add_argument("--out", type=Path, metavar="FILE.csv", help="write a row for each stroke there")
+    recognise.add_argument(
+        "--stream", action="store_true", help=f"find gestures in streams, by such a MODEL: DATA is {_STREAMS}"
+    )
     recognise.add_argument(
         "--margin",
         type=finite_number,

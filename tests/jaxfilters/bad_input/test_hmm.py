@@ -26,6 +26,7 @@ class Case(NamedTuple):
 
 LOGS = jnp.zeros((5, 2))
 CHAIN = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
+LASTING = jf.hmm.semi_markov([0.5, 0.5], [[0.0, 1.0], [1.0, 0.0]], [[0.5, 0.5], [0.0, 1.0]])
 CODED = jf.hmm.from_probabilities([0.5, 0.5], np.eye(2), jf.hmm.Codes(jnp.log(jnp.full((2, 3), 1 / 3))))
 VECTORS = jf.hmm.from_probabilities([0.5, 0.5], np.eye(2), jf.hmm.DiagonalGaussian(jnp.zeros((2, 1)), jnp.ones((2, 1))))
 WRONG_VARIANCE = jf.hmm.DiagonalGaussian(jnp.zeros((2, 3)), jnp.ones((2, 1)))
@@ -74,6 +75,42 @@ HMM = [
         ),
         ("emission", "2 states", "(4, 3)"),
     ),
+    Case(
+        "semi-Markov, durations of other states",
+        lambda: jf.hmm.semi_markov([0.5, 0.5], np.eye(2), np.ones((3, 1))),
+        ("durations", "(2, D)", "(3, 1)"),
+    ),
+    Case(
+        "semi-Markov, durations that are counts",
+        lambda: jf.hmm.semi_markov([0.5, 0.5], np.eye(2), [[3, 1], [1, 1]]),
+        ("durations", "sum to 1", "4"),
+    ),
+    Case(
+        "semi-Markov, NaN durations",
+        lambda: jf.hmm.semi_markov([0.5, 0.5], np.eye(2), [[np.nan, 1], [1, 0]]),
+        ("durations", "nan"),
+    ),
+    Case(
+        "semi-Markov, endless tail",
+        lambda: jf.hmm.semi_markov([0.5, 0.5], np.eye(2), np.ones((2, 1)), tail=1.0),
+        ("tail", "1.0"),
+    ),
+    Case(
+        "semi-Markov, varying transitions",
+        lambda: jf.hmm.semi_markov([0.5, 0.5], np.stack([np.eye(2)] * 3), np.ones((2, 1))),
+        ("transition", "(Q, Q)", "(3, 2, 2)"),
+    ),
+    *(
+        Case(f"semi-Markov, wrong Q, {call.__name__}", lambda call=call: call(LASTING, jnp.zeros((5, 3))), ("(5, 3)",))
+        for call in (jf.hmm.semi_markov_log_evidence, jf.hmm.semi_markov_posterior, jf.hmm.semi_markov_viterbi)
+    ),
+    Case(
+        "semi-Markov, frame of other states",
+        lambda: jf.run(jf.hmm.semi_markov_online(LASTING), KEY, jnp.zeros((5, 3))),
+        ("log_likelihoods", "2 states", "(3,)"),
+    ),
+    Case("semi-Markov, background", lambda: jf.hmm.semi_markov_spotter(LASTING, 2), ("background", "2")),
+    Case("semi-Markov, patience", lambda: jf.hmm.semi_markov_spotter(LASTING, 0, patience=0), ("patience", "0")),
     Case("hmm, topology", lambda: jf.hmm.from_topology(np.ones((2, 3), bool)), ("allowed", "(2, 3)")),
     Case(
         "hmm, topology, initial",

@@ -132,7 +132,7 @@ def test_one_hand_alone_is_the_first_and_returns_to_its_place():
     _, report = follow([[((200.0, 300.0), OPEN)]] * 30 + [[]] * 30 + [[((400.0, 300.0), OPEN)]] * 30)
     assert np.all(report.has_palm[:30, 0] & ~report.has_palm[:30, 1])
     assert report.num_tips[80, 0] == 2
-    assert set(report.identity[80, 0][report.identity[80, 0] >= 0]) == {2, 3}
+    assert set(report.identity[80, 0][report.identity[80, 0] >= 0]) == {0, 1}
 
 
 def test_a_stream_of_nothing_and_of_nonsense_goes_on():

@@ -164,15 +164,23 @@ def play(frames, state=None):
 INDEX, MIDDLE, THUMB = (-39.0, -108.0), (0.0, -125.0), (-80.0, -45.0)
 
 
+def names_from_the_left(report):
+    order = np.argsort(np.where(report.is_tip, report.position[:, 0], np.inf))
+    return report.identity[order][: int(report.num_tips)].tolist()
+
+
 @pytest.mark.system
 def test_a_finger_is_given_up_when_its_prediction_is_too_uncertain():
-    """After six misses while the palm is seen; who comes back has a new name."""
+    """After six misses while the palm is observed; who comes back to the same place has its name again."""
     both, one = shown([INDEX, MIDDLE]), shown([MIDDLE])
     state, reports = play([both] * 20 + [one] * 8)
     assert [int(report.num_tips) for report in reports] == [0, 0] + [2] * 24 + [1] * 2
     assert [int(report.is_observed.sum()) for report in reports[20:]] == [1] * 8
     _, again = play([both] * 3, state)
-    assert sorted(again[-1].identity[again[-1].is_tip]) == [int(max(reports[-1].identity)), 2]
+    np.testing.assert_array_equal(names_from_the_left(again[-1]), names_from_the_left(reports[10]))
+    # The thumb, which was not there before, is the first.
+    _, others = play([shown([INDEX, MIDDLE, THUMB])] * 4, state)
+    assert names_from_the_left(others[-1]) == [0, *names_from_the_left(reports[10])]
 
 
 @pytest.mark.system
@@ -201,13 +209,13 @@ def test_a_tip_seen_twice_in_one_place_begins_no_second_track():
     assert int(reports[-1].num_tips) == 1
 
 
-def test_a_hand_that_is_gone_is_forgotten_but_not_its_numbers():
+def test_a_hand_that_is_gone_is_forgotten_but_not_its_fingers():
     state, reports = play([shown([INDEX])] * 5 + [shown([], hand=False)] * 15)
     assert np.all(state.tracks.mode == FREE)
     assert int(state.empty) == 0
     assert int(reports[-1].mode) == ABSENT
-    _, reports = play([shown([INDEX])] * 3, state)
-    assert list(reports[-1].identity[reports[-1].is_tip]) == [1]
+    _, reports = play([shown([MIDDLE, INDEX])] * 3, state)
+    assert names_from_the_left(reports[-1]) == [1, 2]
 
 
 def test_without_the_arm_nothing_is_learnt_about_the_thumb():
