@@ -2,12 +2,15 @@
 
 import os
 import platform
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import jax
 
 from jaxfilters.trackers.app.devices import available_cores, processor
+
+PEERS = ("dynamax", "cuthbert", "filterpy", "particles", "smcx", "blackjax", "hmmlearn", "nlopt", "pyceres", "embreex")
+"""Libraries that scenarios compare with, where they are installed."""
 
 
 def environment() -> dict[str, Any]:
@@ -15,6 +18,7 @@ def environment() -> dict[str, Any]:
     devices = jax.devices()
     return {
         **{package: version(package) for package in ("jaxfilters", "jax", "jaxlib", "numpy")},
+        "peers": {peer: found for peer in PEERS if (found := _installed(peer)) is not None},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": processor("model name") or platform.processor() or platform.machine(),
@@ -24,3 +28,10 @@ def environment() -> dict[str, Any]:
         "device": devices[0].device_kind,
         "devices": len(devices),
     }
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -13,6 +13,7 @@ import json
 import pkgutil
 import sys
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 from jaxfilters.benchmarks import gate, metrics, scenarios
@@ -63,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.json:
         from jaxfilters.benchmarks.environment import environment
 
-        document = metrics.report(options.scenario, measured, environment())
+        today = datetime.now(UTC).date().isoformat()
+        document = metrics.report(options.scenario, measured, environment() | {"date": today})
         options.json.write_text(json.dumps(document, indent=2) + "\n")
     return _gate(bounds, measured) if options.gate else 0
 

@@ -15,8 +15,11 @@ _GROUPS = (
 _INTRODUCTION = """# Results
 
 Every number below comes from a run of `jaxfilters bench`, which anybody can repeat; `jaxfilters bench --report` wrote
-this page from the files of these runs, with the machine and the versions that they hold for. Recordings that may not be
-redistributed are described on the pages of the trackers.
+this page from the files of these runs, which are in `docs/results/`, with the day, the machine and the versions that
+they hold for. Recordings that may not be redistributed are described on the pages of the trackers.
+
+Ratios to other libraries are medians over rounds in which both take turns, so that they hold on a busy machine as well.
+Times in seconds hold for the machine and the load of the run: these machines were not idle.
 """
 
 
@@ -45,7 +48,8 @@ def results_page(documents: Sequence[Mapping[str, Any]], descriptions: Mapping[s
     parts = [_INTRODUCTION]
     for document in documents:
         name = document["scenario"]
-        parts.append(f"## {name}\n\n{descriptions.get(name, '')}\n\n{_conditions(document['environment'])}\n")
+        described = f"{descriptions.get(name, '')}\n\n`jaxfilters bench {name}`"
+        parts.append(f"## {name}\n\n{described}. {_conditions(document['environment'])}\n")
         ordered = sorted(document["metrics"].items(), key=lambda item: _group(item[0]))
         for index, metrics in groupby(ordered, key=lambda item: _group(item[0])):
             title, _, note = _GROUPS[index]
@@ -67,7 +71,10 @@ def _document(path: Path) -> dict[str, Any]:
 def _conditions(environment: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {environment[name]}" for name in ("jaxfilters", "jax", "numpy", "python"))
     load = "" if environment.get("load") is None else f", load {environment['load']} at its end"
-    return f"On {environment['cpu']}, {environment['cores']} cores, {environment['device']}{load}; {versions}."
+    peers = "".join(f", {name} {found}" for name, found in environment.get("peers", {}).items())
+    date = f"{environment['date']}, on" if "date" in environment else "On"
+    machine = f"{environment['cpu']}, {environment['cores']} cores, {environment['device']}"
+    return f"{date} {machine}{load}; {versions}{peers}."
 
 
 def _group(metric: str) -> int:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import jaxfilters
+from jaxfilters.benchmarks.harness import descriptions
+from jaxfilters.benchmarks.results_page import read_results, results_page
 from jaxfilters.trackers.app import cli
 
 ROOT = Path(__file__).parents[1]
@@ -202,6 +204,11 @@ def test_every_command_has_a_manual_with_all_its_options_and_choices():
         choices = [str(choice) for action in parser._actions for choice in action.choices or ()]
         missing += [f"{words} {choice}" for choice in choices if not re.search(rf"`[^`]*\b{choice}\b[^`]*`", manual)]
     assert not missing
+
+
+def test_the_page_of_results_is_made_of_the_files_of_runs():
+    made = results_page(read_results([DOCS / "results"]), descriptions())
+    assert (DOCS / "results.md").read_text() == made
 
 
 def test_commands_in_pages_are_understood():

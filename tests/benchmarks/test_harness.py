@@ -60,7 +60,7 @@ def test_files_of_runs_become_a_page(tmp_path, capsys):
     capsys.readouterr()
     assert main(["--report", str(tmp_path)]) == 0
     page = capsys.readouterr().out
-    assert "## two-numbers\n\nTwo numbers, quickly.\n\nOn " in page
+    assert "## two-numbers\n\nTwo numbers, quickly.\n\n`jaxfilters bench two-numbers`. 20" in page
     assert "| `frame_ms` | 25 | ms | lower |" in page
     assert "| `seed_given` | 0 | - | higher |" in page
 
