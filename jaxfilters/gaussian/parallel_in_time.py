@@ -3,10 +3,10 @@ r"""Kalman filter and smoother of long sequences in logarithmic depth, on roots 
 $$x_t = F_t x_{t-1} + b_t + q_t,\ q_t \sim N(0, Q_t),\qquad y_t = H_t x_t + d_t + r_t,\ r_t \sim N(0, R_t).$$
 
 An element summarises a run of frames; elements are combined by an associative operator, in any grouping, so that
-`jax.lax.associative_scan` needs about 2 log2 T rounds instead of T steps (F. Yaghoobi, A. Corenflos, S. Hassan,
-S. Särkkä, "Parallel square-root statistical linear regression for inference in nonlinear state space models", 2022,
-sections 3 and 4). The total number of operations is several times larger: it is meant for accelerators and long
-sequences. On a CPU, `kalman` and `smoothing.rts` are faster.
+`prefix_scan` needs about 32 log16 T rounds instead of T steps (F. Yaghoobi, A. Corenflos, S. Hassan, S. Särkkä,
+"Parallel square-root statistical linear regression for inference in nonlinear state space models", 2022, sections 3 and
+4). The total number of operations is several times larger: it is meant for accelerators and long sequences. On a CPU,
+`kalman` and `smoothing.rts` are faster.
 """
 
 import math
@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._xla.prefix_scan import prefix_scan
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.manifold import euclidean
-from jaxfilters.math import linalg
-from jaxfilters.math.linalg import tria
+from jaxfilters.math.linalg import matmul, solve_triangular, tria, tria_of_many
 
 
 class LinearModel(NamedTuple):
@@ -52,7 +51,7 @@ class _Step(NamedTuple):
     d: Array
 
 
-class _Past(NamedTuple):
+class _FilterElement(NamedTuple):
     """Some frames, given the state x before them.
 
     Their last state is N(A x + b, U U^T); the likelihood of x is exp(eta^T x - |Z^T x|^2 / 2).
@@ -65,7 +64,7 @@ class _Past(NamedTuple):
     Z: Array
 
 
-class _Future(NamedTuple):
+class _SmootherElement(NamedTuple):
     """A state, given a later state x and all observations before it, is N(E x + g, L L^T)."""
 
     E: Array
@@ -116,12 +115,12 @@ def parallel_kalman(
         H=jnp.where(read[..., None], steps.H, 0.0), root_R=jnp.where(read[..., None], steps.root_R, 0.0)
     )
     residuals = jnp.where(read, jnp.where(read, ys, 0.0) - steps.d, 0.0)
-    elements = jax.vmap(_past)(steps, residuals)
+    elements = jax.vmap(_filter_element, out_axes=-1)(steps, residuals)
     first = _first(prior, jax.tree.map(lambda leaf: leaf[0], steps), residuals[0])
-    elements = jax.tree.map(lambda leaf, start: leaf.at[0].set(start), elements, first)
-    found = jax.lax.associative_scan(jax.vmap(_combined), elements)
-    beliefs = GaussianRoot(found.b, found.U)
-    start = GaussianRoot(prior.mean, linalg.tria(prior.root))
+    elements = jax.tree.map(lambda leaf, start: leaf.at[..., 0].set(start), elements, first)
+    found = prefix_scan(jax.vmap(_combined, -1, -1), elements, axis=-1)
+    beliefs = GaussianRoot(found.b.T, jnp.moveaxis(found.U, -1, 0))
+    start = GaussianRoot(prior.mean, tria(prior.root))
     before = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many[:-1]]), start, beliefs)
     return beliefs, jax.vmap(_log_evidence)(before, steps, residuals)
 
@@ -153,11 +152,11 @@ def parallel_rts(beliefs: GaussianRoot, model: LinearModel) -> GaussianRoot:
     steps = _of_every_frame(model, beliefs.mean)
     following = jax.tree.map(lambda leaf: leaf[1:], steps)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
-    last = _Future(jnp.zeros_like(beliefs.root[-1]), beliefs.mean[-1], beliefs.root[-1])
-    elements = jax.vmap(_future)(earlier, following)
-    elements = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), elements, last)
-    found = jax.lax.associative_scan(jax.vmap(_chained), elements, reverse=True)
-    return GaussianRoot(found.g, found.L)
+    last = _SmootherElement(jnp.zeros_like(beliefs.root[-1]), beliefs.mean[-1], beliefs.root[-1])
+    elements = jax.vmap(_smoother_element, out_axes=-1)(earlier, following)
+    elements = jax.tree.map(lambda many, one: jnp.concatenate([many, one[..., None]], axis=-1), elements, last)
+    found = prefix_scan(jax.vmap(_chained, -1, -1), elements, axis=-1, reverse=True)
+    return GaussianRoot(found.g.T, jnp.moveaxis(found.L, -1, 0))
 
 
 def _check_model(model: LinearModel, n: int, m: int | None) -> None:
@@ -179,96 +178,92 @@ def _check_model(model: LinearModel, n: int, m: int | None) -> None:
             raise ValueError(f"model.{name} must have the shape ({size},), after an axis of time if any; got {shape}.")
 
 
-def _past(step: _Step, y: Array) -> _Past:
+def _filter_element(step: _Step, y: Array) -> _FilterElement:
     """One frame, given the state before it."""
     n = step.F.shape[0]
     root, gain, rest = _conditioned(step.H, step.root_Q, step.root_R)
     innovation = y - _times(step.H, step.b)
-    HF = linalg.matmul(step.H, step.F)
-    whitened = linalg.solve_triangular(root, HF)
-    Z = linalg.tria(whitened.T)
-    A = step.F - linalg.matmul(gain, HF)
-    eta = _times(whitened.T, linalg.solve_triangular(root, innovation))
-    return _Past(A, step.b + _times(gain, innovation), rest[:, :n], eta, Z)
+    HF = matmul(step.H, step.F)
+    whitened = solve_triangular(root, HF)
+    Z = tria(whitened.T)
+    A = step.F - matmul(gain, HF)
+    eta = _times(whitened.T, solve_triangular(root, innovation))
+    return _FilterElement(A, step.b + _times(gain, innovation), rest[:, :n], eta, Z)
 
 
-def _first(prior: GaussianRoot, step: _Step, y: Array) -> _Past:
+def _first(prior: GaussianRoot, step: _Step, y: Array) -> _FilterElement:
     """The first frame together with the prior: nothing depends on a state before it."""
     n = step.F.shape[0]
     mean = _times(step.F, prior.mean) + step.b
     root, gain, rest = _conditioned(step.H, _predicted(prior, step), step.root_R)
     del root
     nothing = jnp.zeros_like(step.F)
-    return _Past(nothing, mean + _times(gain, y - _times(step.H, mean)), rest[:, :n], jnp.zeros_like(mean), nothing)
+    return _FilterElement(
+        nothing, mean + _times(gain, y - _times(step.H, mean)), rest[:, :n], jnp.zeros_like(mean), nothing
+    )
 
 
-def _combined(past: _Past, then: _Past) -> _Past:
-    n = past.b.shape[0]
-    eye = jnp.eye(n, dtype=past.b.dtype)
-    blocks = jnp.block([[_product(past.U.T, then.Z), eye], [then.Z, jnp.zeros_like(eye)]])
-    root = tria(blocks)
-    turned = solve_triangular(root[:n, :n], past.U.T, lower=True).T
-    kept = eye - _product(turned, root[n:, :n].T)
-    through = _product(then.A, kept)
-    mean = past.b + _product(past.U, _product(past.U.T, then.eta))
-    information = then.eta - _product(then.Z, _product(then.Z.T, past.b))
-    return _Past(
-        _product(through, past.A),
-        _product(through, mean) + then.b,
-        tria(jnp.hstack([_product(then.A, turned), then.U])),
-        _product(past.A.T, _product(kept.T, information)) + past.eta,
-        tria(jnp.hstack([_product(past.A.T, root[n:, n:]), past.Z])),
+def _combined(earlier: _FilterElement, later: _FilterElement) -> _FilterElement:
+    n = earlier.b.shape[0]
+    eye = jnp.eye(n, dtype=earlier.b.dtype)
+    blocks = jnp.block([[matmul(earlier.U.T, later.Z), eye], [later.Z, jnp.zeros_like(eye)]])
+    root = tria_of_many(blocks)
+    turned = solve_triangular(root[:n, :n], earlier.U.T).T
+    kept = eye - matmul(turned, root[n:, :n].T)
+    through = matmul(later.A, kept)
+    mean = earlier.b + _times(earlier.U, _times(earlier.U.T, later.eta))
+    information = later.eta - _times(later.Z, _times(later.Z.T, earlier.b))
+    return _FilterElement(
+        matmul(through, earlier.A),
+        _times(through, mean) + later.b,
+        tria_of_many(jnp.hstack([matmul(later.A, turned), later.U])),
+        _times(earlier.A.T, _times(kept.T, information)) + earlier.eta,
+        tria_of_many(jnp.hstack([matmul(earlier.A.T, root[n:, n:]), earlier.Z])),
     )
 
 
 def _log_evidence(before: GaussianRoot, step: _Step, y: Array) -> Array:
     ahead = _times(step.F, before.mean) + step.b
-    parts = [linalg.matmul(step.H, _predicted(before, step)), step.root_R]
-    root = linalg.tria(jnp.hstack(parts))
+    parts = [matmul(step.H, _predicted(before, step)), step.root_R]
+    root = tria(jnp.hstack(parts))
     counts = jnp.diagonal(root) > 0
-    whitened = linalg.solve_triangular(root, y - _times(step.H, ahead))
+    whitened = solve_triangular(root, y - _times(step.H, ahead))
     log_scale = jnp.log(jnp.where(counts, jnp.diagonal(root), 1.0)) + 0.5 * math.log(2 * math.pi) * counts
     return -0.5 * jnp.sum(whitened**2) - jnp.sum(log_scale)
 
 
-def _future(belief: GaussianRoot, step: _Step) -> _Future:
+def _smoother_element(belief: GaussianRoot, step: _Step) -> _SmootherElement:
     root, gain, rest = _conditioned(step.F, belief.root, step.root_Q)
     del root
     mean = belief.mean - _times(gain, _times(step.F, belief.mean) + step.b)
-    return _Future(gain, mean, rest)
+    return _SmootherElement(gain, mean, rest)
 
 
-def _chained(later: _Future, earlier: _Future) -> _Future:
+def _chained(later: _SmootherElement, earlier: _SmootherElement) -> _SmootherElement:
     # A reversed scan hands over what is later in time first.
-    return _Future(
-        _product(earlier.E, later.E),
-        _product(earlier.E, later.g) + earlier.g,
-        tria(jnp.hstack([_product(earlier.E, later.L), earlier.L])),
+    return _SmootherElement(
+        matmul(earlier.E, later.E),
+        _times(earlier.E, later.g) + earlier.g,
+        tria_of_many(jnp.hstack([matmul(earlier.E, later.L), earlier.L])),
     )
-
-
-def _product(a: Array, b: Array) -> Array:
-    # The operator is compiled anew for every round of the scan: algebra on elements would take minutes. For the same
-    # reason it triangularises without looking for rows of zeros first.
-    return jnp.matmul(a, b, precision="highest")
 
 
 def _conditioned(H: Array, root_P: Array, root_R: Array) -> tuple[Array, Array, Array]:
     """Root of the covariance of H x + r, the gain, and a root of the covariance of x given H x + r."""
     m, n = H.shape
-    above = jnp.hstack([linalg.matmul(H, root_P), root_R])
+    above = jnp.hstack([matmul(H, root_P), root_R])
     below = jnp.hstack([root_P, jnp.zeros((n, root_R.shape[1]), root_P.dtype)])
-    joint = linalg.tria(jnp.vstack([above, below]))
+    joint = tria(jnp.vstack([above, below]))
     root = joint[:m, :m]
-    return root, linalg.solve_triangular(root, joint[m:, :m].T, transpose=True).T, joint[m:, m:]
+    return root, solve_triangular(root, joint[m:, :m].T, transpose=True).T, joint[m:, m:]
 
 
 def _predicted(belief: GaussianRoot, step: _Step) -> Array:
-    return jnp.hstack([linalg.matmul(step.F, belief.root), step.root_Q])
+    return jnp.hstack([matmul(step.F, belief.root), step.root_Q])
 
 
 def _times(A: Array, x: Array) -> Array:
-    return linalg.matmul(A, x[:, None])[:, 0]
+    return matmul(A, x[:, None])[:, 0]
 
 
 def _of_every_frame(model: LinearModel, frames: Array) -> _Step:

@@ -3,7 +3,7 @@ r"""Hidden Markov models in logarithmic depth: the forward-backward and Viterbi 
 An element summarises a run of frames as a matrix, $M_{ij} = p(y_{a:b}, s_b = j \mid s_{a-1} = i)$, scaled, and elements
 are combined by products of matrices: sums of products for probabilities, maxima of sums for the most probable path
 (S. Hassan, S. Särkkä and A. F. Garcia-Fernandez, "Temporal parallelization of inference in hidden Markov models", IEEE
-Transactions on Signal Processing 69, 2021). About 2 log2 T rounds take the place of T steps, with Q times as many
+Transactions on Signal Processing 69, 2021). About 32 log16 T rounds take the place of T steps, with Q times as many
 operations: they are meant for accelerators, few states and long sequences. The results are those of `forward`,
 `posterior` and `viterbi`, to rounding; a state whose probability is 1e-38 of the best one's in float32 counts as
 impossible.
@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._xla.prefix_scan import prefix_scan
 from jaxfilters.hmm.decoding import Path
 from jaxfilters.hmm.log_likelihoods import check_shapes, usable
 from jaxfilters.hmm.model import HiddenMarkovModel
@@ -73,7 +74,7 @@ def parallel_posterior(model: HiddenMarkovModel, log_likelihoods: Float[Array, "
     peaks = _peaks(frames)
     emission = jnp.exp(frames - peaks[:, None])
     # What follows frame t, from the states of frame t: runs of the frames after it, summed over their last state.
-    later = jax.lax.associative_scan(lambda b, a: _joined(a, b), _runs(A, emission[1:], peaks[1:]), reverse=True)
+    later = prefix_scan(lambda b, a: _joined(a, b), _runs(A, emission[1:], peaks[1:]), reverse=True)
     beta = jnp.concatenate([later.matrix.sum(axis=2), jnp.ones_like(emission[:1])])
     states = _normalized(ahead.matrix * beta)
     following = _normalized(emission[1:] * beta[1:])
@@ -97,13 +98,13 @@ def parallel_viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t 
     frames = usable(log_likelihoods)
     first = jnp.broadcast_to(model.log_initial + frames[0], (1, *[len(model.log_initial)] * 2))
     elements = jnp.concatenate([first, model.log_transition + frames[1:, None]])
-    scores = jax.lax.associative_scan(_best, elements)[:, 0]
+    scores = prefix_scan(_best, elements)[:, 0]
     reached = scores[:-1, :, None] + model.log_transition
     origins = jnp.argmax(reached, axis=1).astype(jnp.int32)
     last = jnp.argmax(scores[-1]).astype(jnp.int32)
     end = jnp.broadcast_to(last, (1, len(model.log_initial)))
     compose = lambda later, earlier: jnp.take_along_axis(earlier, later, axis=-1)
-    states = jax.lax.associative_scan(compose, jnp.concatenate([origins, end]), reverse=True)[:, 0]
+    states = prefix_scan(compose, jnp.concatenate([origins, end]), reverse=True)[:, 0]
     log_probability = scores[-1, last]
     return Path(jnp.where(log_probability > -jnp.inf, states, -1), log_probability)
 
@@ -126,7 +127,7 @@ def _ahead(model: HiddenMarkovModel, log_likelihoods: Array) -> _Run:
     first = jnp.broadcast_to(jnp.exp(model.log_initial) * emission[0], (1, *[len(model.log_initial)] * 2))
     later = _runs(jnp.exp(model.log_transition), emission[1:], peaks[1:])
     runs = jax.tree.map(lambda one, many: jnp.concatenate([one, many]), _rescaled(_Run(first, peaks[:1])), later)
-    found = jax.lax.associative_scan(_joined, runs)
+    found = prefix_scan(_joined, runs)
     return _Run(found.matrix[:, 0], found.log_scale)
 
 
