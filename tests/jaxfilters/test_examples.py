@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-EXTRAS = {"jaxfilters.motion.flow": "diffrax"}  # packages that come with an extra, by the module whose examples use them
+EXTRAS = {
+    "jaxfilters.motion.flow": "diffrax"
+}  # packages that come with an extra, by the module whose examples use them
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for path in sorted((ROOT / "jaxfilters").rglob("*.py"))
