@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.limits import SOFTNESS, limit_excess
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, local, retract
-from jaxfilters.models.rendering.depth import render_capsules
+from jaxfilters.models.rendering.depth import capsule_depth
 from jaxfilters.models.rendering.geometry import Capsules
 
 LARGEST_STEP = np.repeat(np.asarray([0.05, 0.4, 0.5], np.float32), (3, 3, 15))
@@ -147,7 +147,7 @@ def normal_equations(
     motion = _capsule_motion(pose, geometry)
     hand = jnp.isfinite(target.depth)
     observed = target.rays * jnp.where(hand, target.depth, 1.0)[:, None]
-    rendered = render_capsules(camera, capsules).reshape(-1)
+    rendered = capsule_depth(camera, capsules).reshape(-1)
     covered = jnp.isfinite(rendered)
     model = target.rays * jnp.where(covered, rendered, 1.0)[:, None]
     seen, shown = _contact(observed, capsules, motion), _contact(model, capsules, motion)

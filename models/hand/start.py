@@ -8,6 +8,8 @@ turned upside down, whose "arm" are the fingers.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
+from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -15,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfilters.math.lie import quaternion_multiply, quaternion_normalize, quaternion_to_matrix, so3_exp
+from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed
 from jaxfilters.models.hand.motion import per_coordinate
@@ -95,8 +97,7 @@ class Hypotheses(NamedTuple):
 
 def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequence[float]) -> Hypotheses:
     """Hands about the middle of a palm: rolls about the optical axis, palm or back to the camera, tilts, gestures."""
-    grid = _grid()
-    rotation, wrist, angles = grid
+    rotation, wrist, angles = _grid()
     poses = np.concatenate([center + scale * wrist, rotation, angles], axis=1).astype(np.float32)
     count = len(poses)
     return Hypotheses(
@@ -106,21 +107,26 @@ def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequenc
     )
 
 
+@cache
 def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotations (h, 4), wrists from the middle of the palm (h, 3) and angles (h, 15)."""
 
-    def rotation(roll: Array, flip: Array, tilt: Array) -> tuple[Array, Array]:
-        axes = jnp.eye(3)
-        turned = quaternion_multiply(so3_exp(roll * axes[2]), so3_exp(flip * axes[1]))
-        turned = quaternion_multiply(turned, so3_exp(tilt * axes[0]))
-        return turned, PALM_TO_WRIST * quaternion_to_matrix(turned)[:, 1]
+    def about(axis: int, angle: float) -> np.ndarray:
+        turn = np.zeros(4)
+        turn[[0, 1 + axis]] = math.cos(0.5 * angle), math.sin(0.5 * angle)
+        return turn
 
     rolls = np.arange(NUM_ROLLS) * (2 * math.pi / NUM_ROLLS)
-    grid = np.stack(np.meshgrid(rolls, [0.0, math.pi], TILTS, indexing="ij"), axis=-1).reshape(-1, 3)
-    rotations, wrists = jax.jit(jax.vmap(rotation))(*jnp.asarray(grid.T, jnp.float32))
+    rotations = np.stack(
+        [
+            _product(_product(about(2, roll), about(1, flip)), about(0, tilt))
+            for roll, flip, tilt in product(rolls, (0.0, math.pi), TILTS)
+        ]
+    )
+    wrists = PALM_TO_WRIST * np.stack([_second_axis(rotation) for rotation in rotations])
     repeat = len(GESTURES)
-    angles = np.tile(GESTURES, (len(grid), 1))
-    return np.repeat(np.asarray(rotations), repeat, axis=0), np.repeat(np.asarray(wrists), repeat, axis=0), angles
+    angles = np.tile(GESTURES, (len(rotations), 1))
+    return np.repeat(rotations, repeat, axis=0), np.repeat(wrists, repeat, axis=0), angles
 
 
 def find_starts(

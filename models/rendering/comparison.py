@@ -21,6 +21,9 @@ from jaxfilters.models.rendering.quadrics import CAPSULE, ELLIPSOID, capsule_par
 from jaxfilters.models.rendering.triangles import TRIANGLES, mesh_parts
 from jaxfilters.models.rendering.windows import COARSE, FINE, plan_windows
 
+_FEW_POSES = 32
+"""Below which half the time to compile is worth more than half the pixels."""
+
 
 class DepthTerms(NamedTuple):
     """Sums over the image from which depth costs are made; counts are whole numbers of a float type."""
@@ -135,7 +138,8 @@ def _mapped(of_one, sides):
 
     @custom_vmap
     def mapped(poses, observed, max_error):
-        plan = plan_windows(poses.box, observed.shape, sides) if poses_in_turn() else None
+        few = poses.box.shape[0] < _FEW_POSES
+        plan = plan_windows(poses.box, observed.shape, COARSE if few else sides) if poses_in_turn() else None
         return map_poses(of_one, (poses, plan), _frame(observed, max_error), observed.size)
 
     @mapped.def_vmap

@@ -24,7 +24,7 @@ from jaxfilters.models.hand.skeleton import (
     open_palm,
     retract,
 )
-from jaxfilters.models.rendering.depth import render_capsules
+from jaxfilters.models.rendering.depth import capsule_depth
 from jaxfilters.models.synthetic.depth_sensor import DepthSensor
 from jaxfilters.typing import AnyKey
 
@@ -182,7 +182,7 @@ def film_hand(
     def film(inputs):
         frame_key, pose = inputs
         kinematics = forward_kinematics(pose, geometry)
-        return kinematics.joints, sensor.sense(frame_key, render_capsules(camera, kinematics.capsules))
+        return kinematics.joints, sensor.sense(frame_key, capsule_depth(camera, kinematics.capsules))
 
     joints, depth_mm = jax.lax.map(film, (jax.random.split(key, len(poses)), poses))
     return HandSequence(poses, joints, depth_mm)

@@ -113,14 +113,18 @@ class Setup:
 
     def hand(self, state: "TrackState") -> HandLikelihood:
         """The likelihood of the hand that is tracked."""
-        scaled = self.likelihood.scaled(state.scale)
-        return replace(scaled, surface=scaled.surface.of_side(state.side))
+        return self.sized(state.scale, state.side)
+
+    def sized(self, scale: Array, side: Array) -> HandLikelihood:
+        """The likelihood of a hand of a size and a side."""
+        scaled = self.likelihood.scaled(scale)
+        return replace(scaled, surface=scaled.surface.of_side(side))
 
 
 @jax.jit
-def placed(key: Array, setup: Setup, pose: Array, state: TrackState) -> Any:
-    """An ensemble about a pose."""
-    filter = build_filter(setup, pose, setup.hand(state))
+def placed(key: Array, setup: Setup, pose: Array, scale: Array, side: Array) -> Any:
+    """An ensemble about a pose of the hand of a size and a side."""
+    filter = build_filter(setup, pose, setup.sized(scale, side))
     return filter.init(filter.params, key)
 
 

@@ -101,7 +101,7 @@ def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bo
         misses=jnp.zeros_like(state.misses),
         key=key,
     )
-    return state._replace(ensemble=placed(place_key, setup, jnp.asarray(found.pose), state))
+    return state._replace(ensemble=placed(place_key, setup, jnp.asarray(found.pose), state.scale, state.side))
 
 
 def _sizes(state: TrackState) -> tuple[float, ...]:

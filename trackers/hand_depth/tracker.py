@@ -104,7 +104,7 @@ def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
         key=key,
     )
     nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
-    state = state._replace(ensemble=placed(place_key, setup, nowhere, state))
+    state = state._replace(ensemble=placed(place_key, setup, nowhere, scale, side))
     return search(setup, state, frame, 0.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.math.lie import quaternion_to_matrix
-from jaxfilters.models.rendering.depth import render_capsules, render_ellipsoids
+from jaxfilters.models.rendering.depth import capsule_depth, render_capsules, render_ellipsoids
 from jaxfilters.models.rendering.geometry import Capsules, Ellipsoids
 
 GRAZING = 1e-7  # metres: rays that miss or cut by less are left to rounding
@@ -118,3 +118,13 @@ def test_a_pose_moves_the_capsules(x64, camera, random_capsules, random_transfor
     capsules = random_capsules(2)
     here = capsules.moved(T.inverse())
     np.testing.assert_allclose(render_capsules(camera, here, T), render_capsules(camera, capsules), rtol=1e-9)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("stride", [1, 2])
+def test_depth_without_a_derivative_is_the_same_image(x64, camera, random_capsules, stride):
+    rows, columns = camera.shape
+    camera, capsules = camera.crop(jnp.zeros(2), (rows // stride, columns // stride), stride), random_capsules(4)
+    depth = jax.jit(capsule_depth)(camera, capsules)
+    assert np.isfinite(depth).any()
+    np.testing.assert_allclose(depth, render_capsules(camera, capsules), rtol=1e-12)
