@@ -80,6 +80,7 @@ def looked_for(
     images: Float[Array, "C rows cols"],
     rig: CameraRig,
     x: Float[Array, " n"],
+    drift: recent.Drift = recent.DRIFT_PX,
 ) -> tuple[Alignment, Bool[Array, "C K"], Bool[Array, "C K"]]:
     """Landmarks in the images, which of them look as registered, and which are followed from the last frame.
 
@@ -90,11 +91,12 @@ def looked_for(
         images: Grey levels.
         rig: Cameras.
         x: Pose and mode coefficients near which they are looked for.
+        drift: Of those that are followed, pixels.
     """
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
     found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
     anchored = recent.is_anchored(found)
     found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
-    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
-    return found._replace(covariance=state.residual_scale * found.covariance + drift), anchored, is_followed
+    drifted = recent.drifted(state.recent, is_followed, drift)[..., None, None] * jnp.eye(2)
+    return found._replace(covariance=state.residual_scale * found.covariance + drifted), anchored, is_followed
