@@ -166,7 +166,11 @@ def _excess(found, seen, residual, S, by_shape, size):
 
 
 def running_variance(
-    variance: Float[Array, " K"], fit: Refined, gain: float, limits: tuple[float, float]
+    variance: Float[Array, " K"],
+    excess: Float[Array, " K"],
+    alignment_variance: Float[Array, " K"],
+    gain: float,
+    limits: tuple[float, float],
 ) -> Float[Array, " K"]:
     """Variance of each landmark about the model after one more frame.
 
@@ -176,13 +180,14 @@ def running_variance(
 
     Args:
         variance: Before, mm^2.
-        fit: To the frame.
+        excess: Of the frame, as `Refined` has it.
+        alignment_variance: The same.
         gain: Of a frame with perfect alignments.
         limits: Least and most.
     """
-    likely = jnp.maximum(variance, fit.excess)
-    share = jnp.square(likely / (likely + fit.alignment_variance))
-    return jnp.clip(variance + gain * share * (fit.excess - variance), *limits)
+    likely = jnp.maximum(variance, excess)
+    share = jnp.square(likely / (likely + alignment_variance))
+    return jnp.clip(variance + gain * share * (excess - variance), *limits)
 
 
 def displaced(

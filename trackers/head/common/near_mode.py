@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters import weights
@@ -67,10 +68,23 @@ def predicted(
     return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
 
 
-def anywhere(patches: Patches, slopes: Slopes, images: Array, uv: Array, M: Array, pose: Array, rig: CameraRig):
-    """Landmarks aligned from where they are expected, and those that were not found also from elsewhere (`align`)."""
-    found = align(patches, slopes, images, uv, M, pose, rig)
-    return relocated(patches, slopes, images, found, uv, M, pose, rig)
+def anywhere(
+    patches: Patches,
+    slopes: Slopes,
+    images: Float[Array, "C rows cols"],
+    uv: Float[Array, "C K 2"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+    *,
+    beyond: Bool[ArrayLike, ""] = True,
+) -> Alignment:
+    """Landmarks aligned from where they are expected (`align`), and those that were not found also from elsewhere.
+
+    The latter may be left out: `beyond`.
+    """
+    found = align(patches, slopes, images, uv, shape, pose, rig)
+    return relocated(patches, slopes, images, found, uv, shape, pose, rig, beyond)
 
 
 def looked_for(

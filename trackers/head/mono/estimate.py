@@ -1,16 +1,18 @@
 """What one image says of pose and expression of a person who is known so far, and where it shows the landmarks."""
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.models.face.alignment import align
+from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.point_recalculation import point_windows, recalculate_points
-from jaxfilters.models.face.refinement import LEAST_SCORE, PIXEL_FLOOR, refine, running_variance
+from jaxfilters.models.face.refinement import LEAST_SCORE, PIXEL_FLOOR, Refined, refine, running_variance
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
@@ -77,10 +79,17 @@ def aligned(
     loose = state.model_variance[:, None, None] * jnp.eye(3)
     x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
     drift = FOLLOWED.scaled(rig.focal[0, 0] / jnp.maximum(x[2], 1.0))
-    found, _, _ = looked_for(align, state, state.model, images, rig, x, drift)
-    x = refine(prior, found, state.slopes, state.model, loose, rig, x).belief.mean
-    found, anchored, is_followed = looked_for(anywhere, state, state.model, images, rig, x, drift)
-    fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
+
+    def looked(x: Array, is_last: Array) -> tuple[Array, tuple[Alignment, Array, Array, Refined]]:
+        """Landmarks near a state, in the last look also from elsewhere, and the fit to them."""
+        way = partial(anywhere, beyond=is_last)
+        found, anchored, is_followed = looked_for(way, state, state.model, images, rig, x, drift)
+        fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
+        return fit.belief.mean, (found, anchored, is_followed, fit)
+
+    # One program for both looks: it takes half as long to compile.
+    _, looks = jax.lax.scan(looked, x, jnp.array([False, True]))
+    found, anchored, is_followed, fit = jax.tree.map(lambda leaf: leaf[-1], looks)
     M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
     sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
     drifted = recent.drifted(state.recent, is_followed, drift)
@@ -99,7 +108,7 @@ def aligned(
         seen,
         state.windows,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
-        running_variance(state.model_variance, fit, 1 - MEMORY, MODEL_VARIANCE),
+        running_variance(state.model_variance, fit.excess, fit.alignment_variance, 1 - MEMORY, MODEL_VARIANCE),
         jnp.clip(
             state.residual_scale * (1 + (1 - MEMORY) * fit.misfit_share * (fit.residual_scale - 1)), *RESIDUAL_SCALE
         ),

@@ -157,8 +157,7 @@ def _followed(
     moved = (x - before.estimate)[:POSE] / jnp.where(has_gone_on, elapsed, 1.0)
     velocity = jnp.where(has_gone_on, moved, before.velocity)
     # Few landmarks tell the depth of a head by their distances alone: what it seems to move by is their error.
-    along = jnp.where(estimate.num_anchored < FEWEST_SURE, velocity.at[2].set(0.0), velocity)
-    velocity = along
+    velocity = jnp.where(estimate.num_anchored < FEWEST_SURE, velocity.at[2].set(0.0), velocity)
     followed = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=before.fit)
     return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), followed, search)
 
