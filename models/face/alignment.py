@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.face.correlation import score_map
@@ -103,6 +104,7 @@ def relocated(
     shape: Float[Array, "K 3"],
     pose: Float[Array, " 6"],
     rig: CameraRig,
+    allowed: Bool[ArrayLike, ""] = True,
 ) -> Alignment:
     """The alignment with landmarks that fit badly searched for all around, up to `SEARCHED_PX` away.
 
@@ -118,8 +120,9 @@ def relocated(
         shape: Model frame, millimetres.
         pose: Millimetres and radians.
         rig: Cameras.
+        allowed: Whether to search at all.
     """
-    doubtful = found.seen & (found.score < DOUBTFUL_SCORE)
+    doubtful = found.seen & (found.score < DOUBTFUL_SCORE) & allowed
     return jax.lax.cond(
         jnp.any(doubtful),
         lambda: _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig),

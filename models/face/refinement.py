@@ -44,6 +44,8 @@ class Refined(NamedTuple):
     """log p of the aligned landmarks under the model, by Laplace's approximation."""
     excess: Float[Array, " K"]
     """Squared residual beyond what the alignment's error explains, mm^2 on each axis; may be negative."""
+    alignment_variance: Float[Array, " K"]
+    """Of the alignment's error, mm^2 on each axis; infinite where no camera sees the landmark."""
     trust: Float[Array, " K"]
     """Weight in the last iteration: about 1 for a landmark that fits, towards 0 for one that does not."""
     residual_scale: Float[Array, ""]
@@ -103,12 +105,14 @@ def refine(
     information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
     covariance = _covariance(precision, information, trust, per_landmark, SH, H)
     log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + _laplace(x - prior.mean, precision, information)
+    excess, alignment_variance = _excess(found, seen, residual, S, by_shape, x.size)
     own = jnp.where((seen if is_own is None else seen & is_own)[..., None, None], found.covariance, 0.0)
     residual_scale, share = _misfit(own, residual, S, SH, trust, information)
     return Refined(
         belief=Gaussian(x, covariance),
         log_evidence=log_evidence,
-        excess=_excess(found, seen, residual, S, by_shape, x.size),
+        excess=excess,
+        alignment_variance=alignment_variance,
         trust=trust,
         residual_scale=residual_scale,
         misfit_share=share,
@@ -151,13 +155,39 @@ def _misfit(own, residual, S, SH, trust, information):
 
 
 def _excess(found, seen, residual, S, by_shape, size):
-    """What the residuals hold beyond the alignments' own errors, spread over the axes of the model frame."""
+    """What residuals hold beyond the alignments' own errors, and these, spread over the axes of the model frame."""
     count = 2.0 * jnp.sum(seen)
     fitted = jnp.maximum(count / jnp.maximum(count - size, 2.0), 1.0)
     squares = jnp.minimum(jnp.sum(residual**2, axis=1), MOST_DISTANCE * jnp.trace(S, axis1=1, axis2=2))
     own = jnp.sum(jnp.where(seen[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
-    reach = jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3))
-    return jnp.where(jnp.any(seen, axis=0), (fitted * squares - own) / jnp.maximum(reach, 1e-6), 0.0)
+    reach = jnp.maximum(jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3)), 1e-6)
+    is_seen = jnp.any(seen, axis=0)
+    return jnp.where(is_seen, (fitted * squares - own) / reach, 0.0), jnp.where(is_seen, own / reach, jnp.inf)
+
+
+def running_variance(
+    variance: Float[Array, " K"],
+    excess: Float[Array, " K"],
+    alignment_variance: Float[Array, " K"],
+    gain: float,
+    limits: tuple[float, float],
+) -> Float[Array, " K"]:
+    """Variance of each landmark about the model after one more frame.
+
+    A frame counts by its Fisher information about the variance `v`, which is that of a residual with a variance of
+    `v + a` for an alignment's error of `a`: `(v / (v + a))^2` of what a perfect alignment would tell. A landmark that
+    is followed at a loss of precision must not look as if it fitted the model perfectly.
+
+    Args:
+        variance: Before, mm^2.
+        excess: Of the frame, as `Refined` has it.
+        alignment_variance: The same.
+        gain: Of a frame with perfect alignments.
+        limits: Least and most.
+    """
+    likely = jnp.maximum(variance, excess)
+    share = jnp.square(likely / (likely + alignment_variance))
+    return jnp.clip(variance + gain * share * (excess - variance), *limits)
 
 
 def displaced(

@@ -363,3 +363,12 @@ def test_displaced_is_the_posterior_mean_of_each_place(face):
         off = (np.asarray(uv) - np.asarray(face.project(x)))[:, k].ravel()
         step = np.linalg.solve(information, J.T @ np.linalg.solve(noise, off))
         np.testing.assert_allclose(result[k], M[k] + step, atol=1e-9)
+
+
+def test_a_variance_is_updated_by_what_a_frame_can_tell_of_it():
+    """Exact alignments are averaged as they are; one that is followed imprecisely, or hidden, tells next to nothing."""
+    excess = jnp.array([2.0, -9.0, 0.0, 2.0])
+    alignment = jnp.array([0.0, 9.0, jnp.inf, 2.0])
+    new = module.running_variance(jnp.full(4, 0.5), excess, alignment, 0.1, (1e-4, 100.0))
+    # The second loses a tenth of 9.5 by the square of .5 / 9.5; the last gains a tenth of 1.5 by that of 2 / 4.
+    np.testing.assert_allclose(new, [0.65, 0.5 - 0.95 * (0.5 / 9.5) ** 2, 0.5, 0.5 + 0.15 / 4], rtol=1e-6)

@@ -14,6 +14,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.synthetic.face_motion import FPS, MONOCULAR_PLACE_MM, motion, speech_schedule
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence, sequence
+from jaxfilters.trackers.head.common.quarter_turns import upright
 from jaxfilters.trackers.head.common.report import HeadTruth
 from jaxfilters.trackers.head.common.table import pose_in_metres
 from jaxfilters.trackers.io.cameras import open_intrinsics
@@ -94,16 +95,17 @@ def _single(options: argparse.Namespace, name: str) -> Setup:
         raise InputError(
             "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
         )
-    source = open_video(name, fps=options.fps)
+    source, note = open_video(name, fps=options.fps), None
+    if not options.camera and options.points is None:
+        source, note = upright(source)
     cols, rows = source.image_size
-    note = None
     if options.camera:
         K, distortion, image_size = open_intrinsics(options.camera)
         _check_size(source, image_size, str(options.camera))
     else:
         focal = FOCAL_WIDTHS * cols
         K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
-        note = f"an assumed focal length of {focal:.0f} px"
+        note = "; ".join([*filter(None, [note]), f"an assumed focal length of {focal:.0f} px"])
     undistortion = Undistortion((rows, cols), K, distortion)
     rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
     return Setup(rig, [undistortion], [source], _points(options, undistortion), None, note)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters import weights
@@ -67,10 +68,23 @@ def predicted(
     return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
 
 
-def anywhere(patches: Patches, slopes: Slopes, images: Array, uv: Array, M: Array, pose: Array, rig: CameraRig):
-    """Landmarks aligned from where they are expected, and those that were not found also from elsewhere (`align`)."""
-    found = align(patches, slopes, images, uv, M, pose, rig)
-    return relocated(patches, slopes, images, found, uv, M, pose, rig)
+def anywhere(
+    patches: Patches,
+    slopes: Slopes,
+    images: Float[Array, "C rows cols"],
+    uv: Float[Array, "C K 2"],
+    shape: Float[Array, "K 3"],
+    pose: Float[Array, " 6"],
+    rig: CameraRig,
+    *,
+    beyond: Bool[ArrayLike, ""] = True,
+) -> Alignment:
+    """Landmarks aligned from where they are expected (`align`), and those that were not found also from elsewhere.
+
+    The latter may be left out: `beyond`.
+    """
+    found = align(patches, slopes, images, uv, shape, pose, rig)
+    return relocated(patches, slopes, images, found, uv, shape, pose, rig, beyond)
 
 
 def looked_for(
@@ -80,6 +94,7 @@ def looked_for(
     images: Float[Array, "C rows cols"],
     rig: CameraRig,
     x: Float[Array, " n"],
+    drift: recent.Drift = recent.DRIFT_PX,
 ) -> tuple[Alignment, Bool[Array, "C K"], Bool[Array, "C K"]]:
     """Landmarks in the images, which of them look as registered, and which are followed from the last frame.
 
@@ -90,11 +105,12 @@ def looked_for(
         images: Grey levels.
         rig: Cameras.
         x: Pose and mode coefficients near which they are looked for.
+        drift: Of those that are followed, pixels.
     """
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
     found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
     anchored = recent.is_anchored(found)
     found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
-    drift = recent.drifted(state.recent, is_followed)[..., None, None] * jnp.eye(2)
-    return found._replace(covariance=state.residual_scale * found.covariance + drift), anchored, is_followed
+    drifted = recent.drifted(state.recent, is_followed, drift)[..., None, None] * jnp.eye(2)
+    return found._replace(covariance=state.residual_scale * found.covariance + drifted), anchored, is_followed

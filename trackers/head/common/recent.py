@@ -5,8 +5,11 @@ change little. Such a landmark is found by its window of the last frame, at the 
 registered again: the registered picture comes first wherever it fits.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.face.alignment import Alignment, align, facing, taken_over
@@ -20,11 +23,28 @@ CLEARLY_BETTER = 0.1
 """By how much it must then resemble the last frame better."""
 ANCHORED_SCORE = 0.5
 """Normalised correlation from which on a landmark looks as registered."""
-DRIFT_PX, MOST_DRIFT_PX = 0.3, 4.0
-"""Standard deviation of what following adds with every frame; at most; so far is a landmark that the model alone has
-placed."""
+MOST_DRIFT_PX = 4.0
+"""Standard deviation of a landmark that the model alone has placed."""
 FAR_PX = 3.0
 """How far a landmark is from the model's that has left its place."""
+
+
+class Drift(NamedTuple):
+    """How far a landmark is off that is followed from frame to frame: standard deviations of a coordinate."""
+
+    first: Float[ArrayLike, ""]
+    """In the first frame."""
+    each: Float[ArrayLike, ""]
+    """What each frame adds."""
+    most: Float[ArrayLike, ""]
+
+    def scaled(self, factor: Float[ArrayLike, ""]) -> "Drift":
+        """In other units."""
+        return Drift(*(factor * value for value in self))
+
+
+DRIFT_PX = Drift(0.0, 0.3, MOST_DRIFT_PX)
+"""Pixels."""
 
 
 def nothing_changed(
@@ -104,9 +124,10 @@ def as_seen(
     return Recent(windows(images, uv + apart), apart, windows(images, uv), drift, ~anchored | has_left, shape, pose)
 
 
-def drifted(recent: Recent, is_followed: Bool[Array, "C K"]) -> Float[Array, "C K"]:
+def drifted(recent: Recent, is_followed: Bool[Array, "C K"], drift: Drift = DRIFT_PX) -> Float[Array, "C K"]:
     """Variance of the landmarks that are followed from the last frame on, pixels squared; 0 of the others."""
-    return jnp.where(is_followed, jnp.minimum(recent.drift + DRIFT_PX**2, MOST_DRIFT_PX**2), 0.0)
+    first, each, most = (jnp.square(value) for value in drift)
+    return jnp.where(is_followed, jnp.minimum(jnp.maximum(recent.drift, first) + each, most), 0.0)
 
 
 def latest_templates(

@@ -156,6 +156,8 @@ def _followed(
     has_gone_on = elapsed > LEAST_STEPS
     moved = (x - before.estimate)[:POSE] / jnp.where(has_gone_on, elapsed, 1.0)
     velocity = jnp.where(has_gone_on, moved, before.velocity)
+    # Few landmarks tell the depth of a head by their distances alone: what it seems to move by is their error.
+    velocity = jnp.where(estimate.num_anchored < FEWEST_SURE, velocity.at[2].set(0.0), velocity)
     followed = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=before.fit)
     return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), followed, search)
 
@@ -165,17 +167,19 @@ def _after(
 ) -> MonoState:
     """The state after a frame but for the person, and for what counts frames."""
     found = ~missed
-    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(found, a, b), new, old)
+    pick = lambda use, new, old: jax.tree.map(lambda a, b: jnp.where(use, a, b), new, old)
+    # Where most landmarks are hidden or changed, residuals say nothing of what skin and model are like otherwise.
+    is_usual = found & (estimate.num_anchored >= FEWEST_SURE)
     # A face that is not found is not headed anywhere.
     search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
     return state._replace(
         search=search,
         belief=belief,
-        recent=keep(estimate.recent, state.recent),
-        windows=keep(estimate.windows, state.windows),
-        slopes=keep(estimate.slopes, state.slopes),
-        model_variance=keep(estimate.model_variance, state.model_variance),
-        residual_scale=keep(estimate.residual_scale, state.residual_scale),
+        recent=pick(found, estimate.recent, state.recent),
+        windows=pick(found, estimate.windows, state.windows),
+        slopes=pick(is_usual, estimate.slopes, state.slopes),
+        model_variance=pick(is_usual, estimate.model_variance, state.model_variance),
+        residual_scale=pick(is_usual, estimate.residual_scale, state.residual_scale),
     )
 
 

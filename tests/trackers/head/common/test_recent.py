@@ -84,7 +84,7 @@ def test_a_landmark_drifts_with_every_frame_until_it_is_anchored_again(scene):
         last = recent.as_seen(again, anchored, shape, pose, after, rig, drift)
         variances.append(np.asarray(last.drift))
         np.testing.assert_array_equal(drift, last.drift)
-    step = recent.DRIFT_PX**2
+    step = recent.DRIFT_PX.each**2
     np.testing.assert_allclose(np.array(variances)[:, :, CHANGED], np.outer([1, 2, 3], [step, step]), rtol=1e-5)
     assert not np.delete(variances[-1], CHANGED, axis=1).any()
     grown = last._replace(drift=jnp.full_like(last.drift, 1e3))
