@@ -129,6 +129,27 @@ def test_a_lost_face_is_reported_and_found_again(rig, face, talking, detected):
 
 
 @pytest.mark.system
+def test_a_patch_over_nose_and_mouth_does_not_drag_the_head_along(rig, face, talking, detected, followed):
+    """Frames 24 to 38 are covered from the nostrils down; ten frames later all is as if they had not been."""
+    made, images = talking
+    texture = np.random.default_rng(0).uniform(90, 210, (12, 16)).repeat(12, axis=0).repeat(12, axis=1).astype(np.uint8)
+    covered = images.copy()
+    for i in range(24, 39):
+        (u, v), height = made.uv[i, 0, [4, 6]].min(axis=0) - [25, 15], 120
+        covered[i, 0, int(v) : int(v) + height, int(u) : int(u) + 170] = texture[:height, :170]
+    track = process(MonoSession(rig, face, detections=detected), covered, made.times)
+    during, after, clean = slice(26, 39), slice(49, None), followed[1]
+    assert np.any(track.status[during] == DOUBTFUL)
+    assert not np.any(track.status == LOST)
+    apart = np.abs(track.pose - clean.pose) * DEGREES
+    assert np.all(apart[during].max(axis=0) < [1, 1.5, 12, 0.6, 2.5, 3])
+    assert np.all(apart[after].max(axis=0) < [0.5, 0.5, 2.5, 0.3, 0.6, 1.2])
+    np.testing.assert_array_equal(track.status[after], DEFORMABLE)
+    wide = np.abs(track.pose - made.poses)[during] < 3 * track.pose_std[during]
+    assert wide.mean() > 0.9
+
+
+@pytest.mark.system
 def test_a_known_distance_of_the_eyes_sets_the_scale(rig, face, detected):
     """The same landmarks with the eyes said to be 5 % farther apart: a face so much larger and farther away."""
     points = jnp.asarray(detected.points, float)
