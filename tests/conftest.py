@@ -78,6 +78,22 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(f"{taken[name]:8.2f} s {name}")
 
 
+def pytest_collection_modifyitems(items):
+    """Puts a test of every system or page, by its parameter, behind the tests of that system: they share programs."""
+    from jaxfilters.trackers.registry import SYSTEMS  # checked by jaxtyping if imported this late
+
+    folders = {system.name: system.package.removeprefix("jaxfilters.").replace(".", "/") for system in SYSTEMS}
+
+    def place(item):
+        path = str(item.path.relative_to(item.config.rootpath))
+        parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        names = [str(value).removesuffix(".md") for value in parameters if isinstance(value, str | Path)]
+        of_system = [folders.get(name) or name.rpartition("/docs/")[2] for name in names]
+        return next((f"tests/{folder}~" for folder in of_system if folder.startswith("trackers/")), path)
+
+    items.sort(key=place)
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item):
     item.stash[PROCESSOR_SECONDS] = processor_s()

@@ -12,6 +12,7 @@ from jaxfilters.trackers.app.argument_types import image_size, seed
 from jaxfilters.trackers.app.compiled import keep_compiled_programs
 from jaxfilters.trackers.app.devices import use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
+from jaxfilters.trackers.app.output_folder import check_free
 from jaxfilters.trackers.calibration.options import add_calibrate
 from jaxfilters.trackers.fitting.options import add_fit
 from jaxfilters.trackers.gestures.options import add_recognise
@@ -40,6 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # What computes is imported by the commands: `--help` answers at once, and the number of devices is set by now.
     try:
         with ended_by_signals():
+            if options.command in ("track", "demo"):
+                check_free(options.out)
             print(_command_of(options)(options))
     except (InputError, OutputError, CheckpointError) as error:
         print(f"jaxfilters: error: {error}", file=sys.stderr)

@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import errno
 import json
 import platform
 import shutil
@@ -14,8 +13,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from filelock import FileLock, Timeout
 
+from jaxfilters.trackers.app.output_folder import OutputFolder, reason
 from jaxfilters.trackers.app.progress import note
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.errors import CheckpointError, OutputError
@@ -53,31 +52,6 @@ class TrackTable(NamedTuple):
     def numbers(self, track: Any) -> np.ndarray:
         """(frames, columns) of a track."""
         return np.concatenate([part.values(track).reshape(len(track.times_s), -1) for part in self.parts], axis=1)
-
-
-class OutputFolder:
-    """A folder that one run writes into; no other run can until it is closed or its process ends."""
-
-    def __init__(self, path: Path):
-        """Make the folder if need be, and lock it.
-
-        Raises:
-            OutputError: it cannot be written, or another run writes into it.
-        """
-        self.path = path
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._lock = FileLock(path / ".lock", timeout=0, thread_local=False)
-            self._lock.acquire()
-        except Timeout:
-            raise OutputError(f"{path}: another run writes into it; choose another --out.") from None
-        except OSError as error:
-            raise OutputError(f"cannot write into {path}: {_cause(error)}.") from None
-
-    def close(self) -> None:
-        """Let other runs have it."""
-        self._lock.release()
-        (self.path / ".lock").unlink(missing_ok=True)
 
 
 class TrackWriter:
@@ -168,7 +142,7 @@ class TrackWriter:
         try:
             yield
         except OSError as error:
-            raise OutputError(f"cannot write {path}: {_cause(error)}; {self.kept()}.") from error
+            raise OutputError(f"cannot write {path}: {reason(error)}; {self.kept()}.") from error
 
 
 def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bool = False) -> TrackWriter:
@@ -279,7 +253,3 @@ def _checkpoint_folder(folder: Path) -> Path:
 
 def _part_path(folder: Path, first: int) -> Path:
     return _checkpoint_folder(folder) / f"rows_{first:08d}.npz"
-
-
-def _cause(error: OSError) -> str:
-    return "no space left on the device" if error.errno == errno.ENOSPC else error.strerror or str(error)

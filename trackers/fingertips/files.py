@@ -10,7 +10,8 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, OutputFolder, can_resume
+from jaxfilters.trackers.app.output_folder import OutputFolder
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, can_resume
 from jaxfilters.trackers.fingertips.events import Event
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.io import checkpoint

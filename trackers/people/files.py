@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline, outline
+from jaxfilters.trackers.app.output_folder import OutputFolder
 from jaxfilters.trackers.app.progress import note
-from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, OutputFolder, can_resume
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, can_resume
 from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people.checkpoints import load, save

@@ -8,8 +8,8 @@ import pytest
 
 from jaxfilters.trackers.app import endings
 from jaxfilters.trackers.app.cli import main
+from jaxfilters.trackers.app.output_folder import OutputFolder
 from jaxfilters.trackers.app.progress import ProgressLine
-from jaxfilters.trackers.app.results import OutputFolder
 from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.registry import SYSTEMS, system
 
@@ -20,7 +20,6 @@ def keep_environment(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("name", [one.name for one in SYSTEMS])
 def test_a_folder_that_another_run_writes_into_is_refused(name, tmp_path, capsys):
     with closing(OutputFolder(tmp_path / "out")):
