@@ -243,6 +243,9 @@ def _predict(model: CorrelatedNoise, key: AnyKey, belief: Belief, inputs: PyTree
         Q = model.process_noise_of(belief, inputs)
         ahead = model.arithmetic.predict(increments(belief), step.F, Q, step.value, step.residual_root)
         return retract_belief(model.manifold, origin, with_mean(ahead, step.value))
+    # Rounding leaves P not quite symmetric. What an update contracts as a whole may grow in the blocks that are treated
+    # apart below, until P is indefinite: only a P that is symmetric may be taken apart.
+    belief = Gaussian(belief.mean, 0.5 * (belief.covariance + belief.covariance.T))
     dt, own, inner_inputs = model.dt_of(inputs), model.own(belief), model.inputs_of_inner(inputs)
     origin, step = model.inner.linear_transition(own, inner_inputs)
     Q = model.inner.process_noise_of(own, inner_inputs)

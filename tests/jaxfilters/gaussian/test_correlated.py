@@ -155,6 +155,45 @@ def evidence_of(parameters, build, R):
     return jf.log_evidence(filter, KEY, jnp.asarray(WHOLE_FRAMES, jnp.float32), STEPS)
 
 
+def test_errors_that_never_end_leave_the_covariance_symmetric_and_positive_for_hundreds_of_steps():
+    """A vehicle among beacons of unknown places and biased ranges, against one extended filter of all that is unknown.
+
+    Blocks of a covariance that rounding has made unsymmetric must not be propagated apart: the difference would grow
+    until the covariance is indefinite, in float64 as well.
+    """
+    beacons = jnp.array([[-3.0, -2.0], [4.0, -3.0], [7.0, 3.0], [3.0, 9.0]])
+    n, k = 10, 4
+    turn = 0.0628 * jnp.arange(300)
+    moves = 0.25 * jnp.stack([jnp.cos(turn), jnp.sin(turn)], axis=1)
+    truth = jnp.cumsum(moves, axis=0)
+    noise = 0.1 * jax.random.normal(KEY, (300, k)) + 0.5 * jax.random.normal(jax.random.key(1), (k,))
+    ys = jnp.linalg.norm(truth[:, None] - beacons, axis=2) + noise
+    move = lambda x, u: x.at[:2].add(u)
+    ranges = lambda x: jnp.linalg.norm(x[2:n].reshape(k, 2) - x[:2], axis=1)
+    mean = jnp.concatenate([jnp.zeros(2), beacons.ravel() + jax.random.normal(jax.random.key(2), (2 * k,))])
+    P = jnp.diag(jnp.concatenate([jnp.full(2, 1e-6), jnp.ones(2 * k)]))
+    Q = jnp.zeros((n, n)).at[[0, 1], [0, 1]].set(1e-3)
+    bias = jf.GaussMarkov(jnp.array(jnp.inf), jnp.full(k, 0.25))
+    inner = jf.extended_kalman(jf.Gaussian(mean, P), move, Q, ranges, 0.01 * jnp.eye(k))
+    whole = jf.extended_kalman(
+        jf.Gaussian(
+            jnp.pad(mean, (0, k)), jnp.zeros((n + k, n + k)).at[:n, :n].set(P).at[n:, n:].set(0.25 * jnp.eye(k))
+        ),
+        move,
+        jnp.pad(Q, ((0, k), (0, k))),
+        lambda x: ranges(x) + x[n:],
+        0.01 * jnp.eye(k),
+    )
+    _, (found, _) = jf.run(jf.correlated_noise(inner, bias), KEY, ys, moves)
+    _, (expected, _) = jf.run(whole, KEY, ys, moves)
+    covariance = np.asarray(found.covariance)
+    np.testing.assert_allclose(covariance, covariance.swapaxes(1, 2), atol=1e-5)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    # Float32 over 300 steps; the standard deviations are 0.1 to 1.
+    np.testing.assert_allclose(found.mean[-1], expected.mean[-1], atol=5e-3)
+    np.testing.assert_allclose(found.covariance[-1], expected.covariance[-1], atol=2e-3)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize(("build", "R"), [(jf.correlated_noise, 0.2), (jf.measurement_differencing, 0.0)])
 def test_evidence_has_the_derivatives_of_the_joint_gaussian(build, R):
