@@ -19,6 +19,7 @@ def stated(script):
     return [float(number) for number in re.findall(r"\*\*(-?[\d.]+)\*\*", first.partition("**Result:**")[2])]
 
 
+@pytest.mark.optimised
 @pytest.mark.system
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_script_computes_what_it_states(script, tmp_path, monkeypatch):

@@ -54,17 +54,10 @@ def check_accuracy(num_fingers, shape, blur, num_frames):
 
 @pytest.mark.system
 @pytest.mark.parametrize("num_fingers", range(6))
-@pytest.mark.parametrize(("shape", "blur"), [(SMALL, 1.0), (SMALL, 2.2), (LARGE, 2.2)])
-def test_counts_and_places_are_right(num_fingers, shape, blur):
-    check_accuracy(num_fingers, shape, blur, 15)
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("num_fingers", range(6))
 @pytest.mark.parametrize("blur", [1.0, 2.2])
 @pytest.mark.parametrize("shape", [SMALL, LARGE])
-def test_counts_and_places_are_right_in_150_frames(num_fingers, shape, blur):
-    check_accuracy(num_fingers, shape, blur, 150)
+def test_counts_and_places_are_right_in_50_frames(num_fingers, shape, blur):
+    check_accuracy(num_fingers, shape, blur, 50)
 
 
 @pytest.mark.parametrize("shape", [SMALL, LARGE])
