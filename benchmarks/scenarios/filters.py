@@ -117,7 +117,8 @@ def ask(python: str, request: Request, cores: int = 1) -> dict[str, Metric]:
 
 def _answer(command: list[str], python: str):
     # One device for a process, whatever this one was given: particles of one filter are compared.
-    environment = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
+    # A program that is found in a cache is not compiled: first calls of libraries could not be compared.
+    environment = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     finished = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=environment, check=False)
     if finished.returncode != 0:
         raise RuntimeError(f"{python} failed to measure; is jaxfilters installed there? It said what above.")

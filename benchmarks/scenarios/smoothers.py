@@ -34,7 +34,7 @@ class Sizes(NamedTuple):
 
     num_frames: int = 512
     num_parallel_frames: int = 128
-    """Programs of logarithmic depth take minutes to compile for more."""
+    """The programs of other libraries take minutes to compile for more."""
     num_particles: int = 1000
     num_particle_frames: int = 50
 
