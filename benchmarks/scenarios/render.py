@@ -91,11 +91,11 @@ def comparing(compare: Callable, shapes: PyTree, camera: Pinhole, observed: Floa
     return lambda: compiled(shapes, observed)
 
 
-def _compare_capsules(camera, capsules, observed):
+def compare_hand_capsules(camera, capsules, observed):
     return compare_capsules(camera, capsules, observed, MAX_ERROR)
 
 
-def _compare_parts(parts: ConvexParts) -> Callable:
+def compare_parts(parts: ConvexParts) -> Callable:
     return lambda camera, T, observed: compare_convex_parts(camera, parts, T, observed, MAX_ERROR)
 
 
@@ -111,8 +111,8 @@ def _headline(seed, rounds):
     first = jax.tree.map(lambda leaf: leaf[..., 0], hypotheses)
     observed = render_capsules(camera, first.capsules)
     functions = {
-        "capsules": comparing(_compare_capsules, hypotheses.capsules, camera, observed),
-        "mesh": comparing(_compare_parts(parts), hypotheses.T_camera_parts, camera, observed),
+        "capsules": comparing(compare_hand_capsules, hypotheses.capsules, camera, observed),
+        "mesh": comparing(compare_parts(parts), hypotheses.T_camera_parts, camera, observed),
         "triangles": comparing(_compare_triangles(mesh), hypotheses.vertices, camera, observed),
     }
     with_embree = importlib.util.find_spec("embreex") is not None
@@ -188,13 +188,13 @@ def _growth(seed, rounds):
         functions[name] = comparing(compare, shapes, camera, render_capsules(camera, first.capsules))
 
     for count, many in hypotheses.items():
-        add(f"capsules_n{count}", window_camera(WINDOW), many.capsules, _compare_capsules)
+        add(f"capsules_n{count}", window_camera(WINDOW), many.capsules, compare_hand_capsules)
     for size in WINDOWS:
-        add(f"capsules_window{size}", window_camera(size), usual.capsules, _compare_capsules)
+        add(f"capsules_window{size}", window_camera(size), usual.capsules, compare_hand_capsules)
     for stride in STRIDES:
-        add(f"capsules_stride{stride}", window_camera(WINDOW, stride), usual.capsules, _compare_capsules)
+        add(f"capsules_stride{stride}", window_camera(WINDOW, stride), usual.capsules, compare_hand_capsules)
     for mesh in (coarse, fine):
-        compare = _compare_parts(convex_parts(part_meshes(mesh)))
+        compare = compare_parts(convex_parts(part_meshes(mesh)))
         for stride in STRIDES[:2]:
             camera = window_camera(WINDOW, stride)
             add(f"mesh_f{len(mesh.faces)}_stride{stride}", camera, usual.T_camera_parts, compare)
