@@ -225,7 +225,9 @@ def _forecast(
         covariance = model.localization.observation * covariance
     readings = jnp.where(observed, observation, 0.0)
     root = cholesky(covariance + R)
-    return Forecast(mean[:, 0], deviations, predicted, readings, observed, R, root, model.localization)
+    # The same in every step: the compiler moves it out of the loop.
+    noise_root = cholesky(model.R)
+    return Forecast(mean[:, 0], deviations, predicted, readings, observed, R, noise_root, root, model.localization)
 
 
 def _relaxed(

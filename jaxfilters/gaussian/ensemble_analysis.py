@@ -28,6 +28,8 @@ class Forecast(NamedTuple):
     observed: Bool[Array, " m"]
     R: Float[Array, "m m"]
     """Covariance of the observation noise."""
+    noise_root: Float[Array, "m m"]
+    """Lower root of the covariance of the noise of all components, whether observed or not."""
     root: Float[Array, "m m"]
     """Lower root of the innovation covariance, localised."""
     localization: Localization | None
@@ -57,7 +59,7 @@ def perturbed_observations(key: AnyKey, forecast: Forecast) -> Float[Array, "n k
     Review 126, 1998.
     """
     predicted, observed = forecast.predicted, forecast.observed[:, None]
-    noise = matmul(cholesky(forecast.R), standard_normal(key, predicted.shape, predicted.dtype))
+    noise = matmul(forecast.noise_root, standard_normal(key, predicted.shape, predicted.dtype))
     noise = jnp.where(observed, noise - jnp.mean(noise, axis=1, keepdims=True), 0.0)
     innovations = jnp.where(observed, forecast.observation[:, None] + noise - predicted, 0.0)
     x = forecast.deviations

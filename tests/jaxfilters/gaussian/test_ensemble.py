@@ -107,7 +107,8 @@ def test_products_in_any_order_move_samples_by_the_gain(x64, n, m, count):
     x -= x.mean(1, keepdims=True)
     spread = predicted - predicted.mean(1, keepdims=True)
     S = spread @ spread.T / (count - 1) + np.eye(m)
-    arrays = [jnp.asarray(a) for a in (np.ones(n), x, predicted, y, np.isfinite(y), np.eye(m), np.linalg.cholesky(S))]
+    root = np.linalg.cholesky(S)
+    arrays = [jnp.asarray(a) for a in (np.ones(n), x, predicted, y, np.isfinite(y), np.eye(m), np.eye(m), root)]
     moved = perturbed_observations(KEY, Forecast(*arrays, None))
     gain = x @ spread.T / (count - 1) @ np.linalg.inv(S)
     np.testing.assert_allclose(moved.mean(1), 1 + gain @ (y - predicted.mean(1)), rtol=1e-10, atol=1e-10)
