@@ -44,10 +44,10 @@ def dynamax(
     Raises:
         ValueError: If a symbol is in no training sequence.
     """
-    if missing := sorted(set(range(model.emission.log_probability.shape[1])) - set(np.unique(training).tolist())):
+    initial, transition, emission = _probabilities(model)
+    if missing := sorted(set(range(emission.shape[1])) - set(np.unique(training).tolist())):
         raise ValueError(f"training must hold every symbol, without which dynamax gives NaN; got none of {missing}.")
     inference = import_module("dynamax.hidden_markov_model.inference")
-    initial, transition, emission = _probabilities(model)
     log_emission = jnp.log(emission)
     scores = log_emission.T[codes]
 

@@ -45,6 +45,8 @@ def shared_frames(a: Segment, b: Segment) -> int:
 def total(scores: Sequence[Score]) -> Score:
     """Of several sequences together."""
     return Score(
-        *(sum(getattr(score, name) for score in scores) for name in ("detected", "false_positives", "total")),
+        sum(score.detected for score in scores),
+        sum(score.false_positives for score in scores),
+        sum(score.total for score in scores),
         [value for score in scores for value in score.jaccard],
     )

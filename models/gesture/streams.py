@@ -145,7 +145,7 @@ def spot(model: StreamModel, stream: Stream) -> list[Spotted]:
     scores[: len(logs)] = np.where(present[:, None], TEMPER * logs, 0.0)
     infos = _spotted(model.durations, jnp.asarray(scores, jnp.float32))
     found = []
-    for frame in np.flatnonzero(infos.reports):
+    for frame in np.flatnonzero(infos.reports).tolist():
         label, start, end = (int(leaf[frame]) for leaf in infos.found[:3])
         last = min(frame + LOOKAHEAD, len(places) - 1)
         own = Segment(label, *(int(np.rint(places[i])) for i in (start, end)))

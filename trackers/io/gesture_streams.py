@@ -170,8 +170,9 @@ def read_stream_model(path: Path) -> StreamModel:
     middle = leaves[2:-2]
     layers = tuple(zip(middle[::2], middle[1::2], strict=True))
     classifier = FrameClassifier(leaves[0], leaves[1], layers, (leaves[-2], leaves[-1]))
-    chain = [jnp.asarray(arrays[name], float) for name in _CHAIN]
-    model = StreamModel(tuple(names), _template(arrays), classifier, SemiMarkovModel(*chain))
+    log_initial, log_transition, log_end, log_stay = (jnp.asarray(arrays[name], float) for name in _CHAIN)
+    durations = SemiMarkovModel(log_initial, log_transition, log_end, log_stay)
+    model = StreamModel(tuple(names), _template(arrays), classifier, durations)
     _check_model(model, path)
     return model
 
