@@ -22,6 +22,8 @@ from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.linear import kalman
 from jaxfilters.gaussian.parallel_in_time import LinearModel, parallel_kalman, parallel_rts
 from jaxfilters.gaussian.smoothing import filter_and_smooth
+from jaxfilters.hmm import HiddenMarkovModel
+from jaxfilters.hmm import log_evidence as log_evidence_of_chains
 from jaxfilters.models.hand.mesh import hand_mesh, part_meshes
 from jaxfilters.models.hand.skeleton import forward_kinematics
 from jaxfilters.models.rendering.depth import render_capsules
@@ -61,10 +63,10 @@ def _depth(kind: str, seed: int, count: int) -> Work:
     cloud = render.cloud(seed, count, mesh)
     first = jax.tree.map(lambda leaf: leaf[..., 0], cloud.capsules)
     observed = render_capsules(camera, first)
+    compare = render.compare_hand_capsules
+    shapes: PyTree = cloud.capsules
     if kind == "mesh":
         compare, shapes = render.compare_parts(convex_parts(part_meshes(mesh))), cloud.T_camera_parts
-    else:
-        compare, shapes = render.compare_hand_capsules, cloud.capsules
     every = jax.vmap(lambda shape, y: compare(camera, shape, y).absolute_sum, in_axes=(-1, None))
     return Work(partial(_in_chunks, every), (shapes, observed), max(1, count // CHUNK))
 
@@ -159,10 +161,11 @@ def _hidden_markov(seed: int, count: int) -> Work:
     """Forward recursions of sequences of 100 symbols, 8 states."""
     model = hmm.random_model(seed)
     codes = hmm.draw(seed, model, count)
+    scores = jax.vmap(HiddenMarkovModel.log_likelihoods, (None, -1), -1)(model, jnp.asarray(codes.T))
     others = {}
-    if find_spec("dynamax"):
-        others["dynamax"] = hmm_peers.dynamax(model, codes, codes, 1).forward
-    return Work(hmm.ours(model, codes, codes[:2], 1).forward, (), codes.shape[1], others)
+    if find_spec("dynamax") and (theirs := hmm_peers.dynamax(model, codes, codes, 1).forward):
+        others["dynamax"] = theirs
+    return Work(log_evidence_of_chains, (model, scores), codes.shape[1], others)
 
 
 def tasks(seed: int) -> dict[str, Task]:

@@ -54,8 +54,8 @@ def simulate(seed: int, steps: int) -> Problem:
         x = F @ x + np.sqrt(Q_VARIANCE) * rng.normal(size=STATES)
         truth.append(x)
         counts.append(rng.poisson(np.exp(C @ x + 1.0)))
-    F, C, truth, counts = (jnp.asarray(np.array(each), float) for each in (F, C, truth, counts))
-    return Problem(F, C, 1.0, truth, counts)
+    array = lambda values: jnp.asarray(np.array(values), float)
+    return Problem(array(F), array(C), 1.0, array(truth), array(counts))
 
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
