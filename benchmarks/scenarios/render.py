@@ -26,7 +26,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.mesh import HandMesh, capsule_mesh, hand_mesh, part_meshes, pose_vertices
 from jaxfilters.models.hand.parts import part_transforms
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm, retract
-from jaxfilters.models.rendering.comparison import compare_capsules, compare_convex_parts, compare_mesh
+from jaxfilters.models.rendering.comparison import DepthTerms, compare_capsules, compare_convex_parts, compare_mesh
 from jaxfilters.models.rendering.depth import render_capsules, render_convex_parts
 from jaxfilters.models.rendering.geometry import Capsules, ConvexParts, Mesh, convex_parts
 from jaxfilters.models.synthetic.hand import START, kinect_v2
@@ -91,11 +91,13 @@ def comparing(compare: Callable, shapes: PyTree, camera: Pinhole, observed: Floa
     return lambda: compiled(shapes, observed)
 
 
-def compare_hand_capsules(camera, capsules, observed):
+def compare_hand_capsules(camera: Pinhole, capsules: Capsules, observed: Float[Array, "rows cols"]) -> DepthTerms:
+    """Depth terms of capsules in an image."""
     return compare_capsules(camera, capsules, observed, MAX_ERROR)
 
 
 def compare_parts(parts: ConvexParts) -> Callable:
+    """`(camera, T_camera_parts, observed) -> terms` of the posed parts in an image."""
     return lambda camera, T, observed: compare_convex_parts(camera, parts, T, observed, MAX_ERROR)
 
 
