@@ -36,6 +36,7 @@ MANUALS = {
     "fit noise": "trackers/fingertips.md",
     "recognise": "trackers/fingertips.md",
     "view": "viewer.md",
+    "batch": "batch.md",
 }
 """Where the manual of each command is."""
 

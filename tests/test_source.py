@@ -24,7 +24,7 @@ MODULE_NAMES = {"opencv-python-headless": "cv2", "lazy-loader": "lazy_loader"}
 """Where a distribution is not imported by its own name."""
 BEFORE_THE_KEY = {"self", "cls", "filter", "params", "model", "tracker"}
 """What a function belongs to may stand before the random key; nothing else."""
-APPLICATION = {"app", "calibration", "fitting", "gestures"}
+APPLICATION = {"app", "batch", "calibration", "fitting", "gestures"}
 """Folders of `trackers/` that are commands; in the others, only the files below know that there is a command line."""
 PRESENTATION = {"command", "options", "run", "drawing", "pictures", "summary", "table", "files", "outcome"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60

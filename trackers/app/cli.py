@@ -13,6 +13,7 @@ from jaxfilters.trackers.app.compiled import keep_compiled_programs
 from jaxfilters.trackers.app.devices import use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
 from jaxfilters.trackers.app.output_folder import check_free
+from jaxfilters.trackers.batch.options import add_batch
 from jaxfilters.trackers.calibration.options import add_calibrate
 from jaxfilters.trackers.fitting.options import add_fit
 from jaxfilters.trackers.gestures.options import add_recognise
@@ -66,6 +67,7 @@ def _command_of(options: argparse.Namespace) -> Callable[[argparse.Namespace], s
     if options.command == "demo":
         return system("hand-depth").part("command", "track")
     modules = {
+        ("batch", None): ("batch.command", "batch"),
         ("calibrate", None): ("calibration.command", "calibrate"),
         ("recognise", None): ("gestures.command", "recognise"),
         ("fit", "noise"): ("fitting.noise", "fit_noise"),
@@ -108,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(input=None, resume=False, overwrite=True)
     add_tracker_options(demo)
 
+    add_batch(commands)
     add_calibrate(commands, image_size)
     add_fit(commands, seed)
     add_recognise(commands, seed)

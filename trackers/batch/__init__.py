@@ -1,0 +1,1 @@
+"""`jaxfilters batch`: many recordings over processes and machines that share a folder."""
