@@ -6,6 +6,7 @@ frame, a mean over subjects; `least_with_<n>` the smallest over seven subjects, 
 without a suffix are the modern tracker's, with `_published` the paper's, with `_detected` those of single frames,
 without correspondence. `_image` are rendered hands of 640x480 pixels, blurred by lens and motion, through detection.
 `hand_video_` is the recording dexretarget_hand_video, where JAXFILTERS_DATA has it: tips beside key points.
+`found_pct_`, `false_pct_` and `names_per_finger_` are of real videos beside tips marked by hand, see `_marked_tips`.
 """
 
 import sys
@@ -29,6 +30,7 @@ from jaxfilters.benchmarks.scenarios._hand_video import (
     hand_video_metrics,
     load_hand_video,
 )
+from jaxfilters.benchmarks.scenarios._marked_tips import VIDEOS, marked_metrics
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.models.fingertip import thumb
 from jaxfilters.models.fingertip.detection import detect_hand
@@ -75,7 +77,8 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     parameters = open_hand(key)
     metrics |= image_metrics(rendered, parameters)
     metrics |= time_metrics(rendered[-1], parameters, QUICK_ROUNDS if quick else ROUNDS)
-    return metrics | video_metrics(out, 40 if quick else None)
+    metrics |= video_metrics(out, 40 if quick else None)
+    return metrics if quick else metrics | marked_video_metrics()
 
 
 def point_metrics(key: jax.Array, groups: int, frames: int) -> dict[str, Metric]:
@@ -210,6 +213,21 @@ def video_metrics(out: Path | None, num_frames: int | None) -> dict[str, Metric]
     found = hand_video_metrics(folder, out, num_frames=num_frames)
     found |= tracked_video_metrics(load_hand_video(folder, num_frames=num_frames))
     return {f"hand_video_{name}": _with_unit(name, value) for name, value in found.items()}
+
+
+def marked_video_metrics() -> dict[str, Metric]:
+    """Of the videos with fingertips marked by hand that are there."""
+    metrics: dict[str, Metric] = {}
+    for name in VIDEOS:
+        try:
+            found = marked_metrics(name, recording_folder(name))
+        except RecordingError as error:
+            sys.stderr.write(f"  without {name}: {error}\n")
+            continue
+        metrics[f"found_pct_{name}"] = Metric(found["found_pct"], "%", "higher")
+        metrics[f"false_pct_{name}"] = Metric(found["false_pct"], "%", "lower")
+        metrics[f"names_per_finger_{name}"] = Metric(found["names_per_finger"], "", "lower")
+    return metrics
 
 
 def tracked_video_metrics(video: HandVideo) -> dict[str, float]:

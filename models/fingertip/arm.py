@@ -60,8 +60,8 @@ def find_palm(depth: Float[np.ndarray, "rows cols"], contact: Int[np.ndarray, "n
         depth: Distance of each pixel to the outline, 0 outside, pixels; not 0 everywhere.
         contact: Of `border_contact`; of a forearm and a fist that are equally thick, the farther one is the hand.
     """
-    y, x = np.nonzero(depth > FAR_PALM * depth.max())
-    places, values = np.stack([x, y], axis=1), depth[y, x]
+    places = cv2.findNonZero((depth > FAR_PALM * depth.max()).view(np.uint8))[:, 0]
+    values = depth[places[:, 1], places[:, 0]]
     away = np.hypot(*(places - contact.mean(axis=0)).T) if len(contact) else np.zeros(len(places))
     seed = places[np.argmax(values * (1 + (1 / FAR_PALM - 1) * away / max(float(away.max()), 1e-6)))]
     near = np.hypot(*(places - seed).T) < 0.5 * depth.max()

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from jaxfilters.models.fingertip.arm import Palm, border_contact, find_arm, find_palm
 from jaxfilters.models.fingertip.fingers import Bases, find_bases, measured_ends
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
-from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation
+from jaxfilters.models.fingertip.observation import COVERAGE_SHAPE, MAX_TIPS, WHOLE_IMAGE, HandObservation
 from jaxfilters.models.fingertip.tip_template import (
     SUPPRESSION,
     best_apart,
@@ -32,6 +32,10 @@ LEAST_AGREEMENT = 0.75
 """Of a tip with a half disc on a finger of its own direction and thickness."""
 THICKEST, SHORTEST = 1.7, 0.6
 """Tip radii: what is thicker where it ends, or nearer to where it begins, is a knuckle of a fist."""
+AHEAD = 1.25
+"""Radii from the middle of a tip to where the image is over if its border cuts the finger."""
+MOST_FOR_SHORT_LABELS = 4 * 2**16
+"""Pixels of a mask whose components are labelled in 16 bits, twice as fast; four pixels hold one component at most."""
 MAX_CANDIDATES, CANDIDATES_APART = 24, 0.7
 """Places that are looked at more closely, and tip radii between them."""
 
@@ -66,6 +70,8 @@ def no_hand() -> HandObservation:
         "axis": vector,
         "has_axis": np.zeros((), bool),
         "is_hand": np.zeros((), bool),
+        "coverage": np.ones(COVERAGE_SHAPE, np.float32),
+        "cell": np.full(2, WHOLE_IMAGE, np.float32),
     }
     return HandObservation(**hand)
 
@@ -130,7 +136,8 @@ def _components(skin: np.ndarray, tip_radius: float) -> Iterator[_Silhouette]:
     step = np.array([cols / size[0], rows / size[1]])
     small = cv2.resize(255 * skin, size, interpolation=cv2.INTER_AREA) if shrink > 1 else 255 * skin
     inside = cv2.threshold(small, 127, 1, cv2.THRESH_BINARY)[1]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)
+    ltype = cv2.CV_16U if inside.size < MOST_FOR_SHORT_LABELS else cv2.CV_32S
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8, ltype=ltype)
     areas = stats[:, cv2.CC_STAT_AREA] * (np.arange(count) > 0)  # 0 is what is no component
     for label in np.argsort(-areas, kind="stable"):
         if areas[label] < math.pi * (SMALLEST_PALM * tip_radius / shrink) ** 2:
@@ -160,6 +167,7 @@ def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservatio
     ends = measured_ends(silhouette.image, found, towards, radius)
     is_finger = ~bases.is_found | (np.hypot(*(found - bases.points).T) > SHORTEST * radius)
     is_tip = is_finger & ends.is_end & (ends.scores > LEAST_AGREEMENT) & (ends.radii < THICKEST * radius)
+    is_tip &= ~_is_cut(inside, ends.points + AHEAD * ends.radii[:, None] * towards)
     best = best_apart(ends.points, np.where(is_tip, ends.scores, 0.0), SUPPRESSION * radius, MAX_TIPS)
     bases = Bases(bases.points[best], bases.is_found[best])
     starts = np.where(bases.is_found[:, None], silhouette.placed(bases.points), 0.0)
@@ -174,6 +182,8 @@ def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservatio
         "axis": arm.direction.astype(np.float32),
         "has_axis": np.asarray(arm.is_seen),
         "is_hand": np.asarray(True),
+        "coverage": cv2.resize(255 * inside, COVERAGE_SHAPE[::-1], interpolation=cv2.INTER_AREA) / np.float32(255),
+        "cell": (silhouette.step * inside.shape[::-1] / COVERAGE_SHAPE[::-1]).astype(np.float32),
     }
     return HandObservation(**hand)
 
@@ -190,6 +200,13 @@ def _candidates(
     far = np.linalg.norm(arm, axis=1) > NEAR * palm.radius
     score = np.where(far & (arm @ axis > -BEHIND * palm.radius), found.scores, 0.0)
     return places[best_apart(places, score, CANDIDATES_APART * radius, MAX_CANDIDATES)]
+
+
+def _is_cut(inside: UInt8[np.ndarray, "rows cols"], ahead: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Which fingers go on as far as the border of the image, by places ahead of what looks like their ends."""
+    places = np.rint(ahead).astype(int)
+    last = np.clip(places, 0, np.array(inside.shape[::-1]) - 1)
+    return np.any(places != last, axis=1) & (inside[last[:, 1], last[:, 0]] > 0)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:

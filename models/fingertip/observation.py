@@ -6,6 +6,10 @@ from jaxtyping import Array, Bool, Float
 
 MAX_TIPS = 5
 """Of one hand."""
+COVERAGE_SHAPE = (60, 80)
+"""Cells, rows and columns, that say where in the image a hand is: no wider than a finger of a hand that fills it."""
+WHOLE_IMAGE = 1e6
+"""Pixels: a cell as large as any image, where there is no silhouette."""
 
 
 class HandObservation(NamedTuple):
@@ -26,3 +30,7 @@ class HandObservation(NamedTuple):
     has_axis: Bool[Array, ""]
     """Whether the forearm reaches the border of the image, so that its axis can be trusted."""
     is_hand: Bool[Array, ""]
+    coverage: Float[Array, "rows cols"]
+    """Share of each cell of a grid over the image that the hand covers; ones where there is no silhouette."""
+    cell: Float[Array, "2"]
+    """Width and height of a cell, pixels; `WHOLE_IMAGE` where there is no silhouette."""

@@ -41,7 +41,8 @@ def correlation(
 def peaks(response: Float[np.ndarray, "rows cols"], min_correlation: float) -> TipCandidates:
     """Local maxima of a correlation, best first, to fractions of a pixel."""
     largest = cv2.dilate(response, np.ones((3, 3), np.uint8))
-    y, x = np.nonzero((response >= largest) & (response > min_correlation))
+    # A search in one dimension is several times as fast as one in two.
+    y, x = np.divmod(np.flatnonzero((response >= largest) & (response > min_correlation)), response.shape[1])
     order = np.argsort(-response[y, x], kind="stable")
     places = np.stack([x[order], y[order]], axis=1)
     return TipCandidates(_refined(response, places), response[y[order], x[order]])

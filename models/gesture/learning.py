@@ -12,13 +12,16 @@ from jaxfilters.models.gesture import calibration
 from jaxfilters.models.gesture.calibration import Scores
 from jaxfilters.models.gesture.coded import learn_paths
 from jaxfilters.models.gesture.discriminative import trained_apart
+from jaxfilters.models.gesture.free_hand import with_variations
 from jaxfilters.models.gesture.stroke import NUM_POINTS, Drawn, stacked, to_judge
 from jaxfilters.models.gesture.symbols import SHARPNESS, Symbols, learn, recognise_all
 
 EXAMPLES_A_WAY, MOST_WAYS = 40, 20
 """Examples of a symbol for each way to draw it that is looked for, and how many ways at most."""
 NUM_STATES, MIN_VARIANCE = 10, 0.1
-"""Of strokes with several pieces or in space."""
+"""Of strokes with several pieces, and of many in space."""
+SPACE_STATES, SPACE_VARIANCE = 18, 0.15
+"""Of few strokes in space, with their variations."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
 EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
@@ -52,6 +55,11 @@ def is_path(strokes: Sequence[Drawn]) -> bool:
     return all(len(pieces) == 1 and np.shape(pieces[0])[1:] == (2,) for pieces, _ in strokes)
 
 
+def is_in_space(strokes: Sequence[Drawn]) -> bool:
+    """Whether the positions have three dimensions."""
+    return any(np.shape(piece)[1:] == (3,) for pieces, _ in strokes for piece in pieces)
+
+
 def ways_of(labels: Sequence[str]) -> int:
     """How many ways to draw a symbol its examples can tell of: one for 40, and at most 20."""
     counts = np.unique(np.asarray(labels), return_counts=True)[1]
@@ -69,7 +77,7 @@ def learn_strokes(
     """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
 
     Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
-    `discriminative.trained_apart`.
+    `discriminative.trained_apart`. Few strokes in space are fitted with `free_hand.with_variations`.
 
     Args:
         strokes: In two dimensions or in three.
@@ -92,15 +100,19 @@ def learn_strokes(
             num_variants=ways_of(labels) if num_variants is None else num_variants,
             min_variance=PATH_VARIANCE if min_variance is None else min_variance,
         )
-    features = stacked(strokes)
     are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
-    most = MOST_WAYS_APART if are_many else MOST_WAYS
+    ways = min(ways_of(labels), MOST_WAYS_APART if are_many else MOST_WAYS) if num_variants is None else num_variants
+    usual_states, usual_variance = NUM_STATES, MIN_VARIANCE
+    if not are_many and is_in_space(strokes):
+        strokes, labels = with_variations(strokes, labels)
+        usual_states, usual_variance = SPACE_STATES, SPACE_VARIANCE
+    features = stacked(strokes)
     symbols = learn(
         features,
         labels,
-        num_states=num_states or NUM_STATES,
-        num_variants=min(ways_of(labels), most) if num_variants is None else num_variants,
-        min_variance=MIN_VARIANCE if min_variance is None else min_variance,
+        num_states=num_states or usual_states,
+        num_variants=ways,
+        min_variance=usual_variance if min_variance is None else min_variance,
     )
     return trained_apart(symbols, features, labels) if are_many else symbols
 

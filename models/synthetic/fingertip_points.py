@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation
+from jaxfilters.models.fingertip.observation import MAX_TIPS, WHOLE_IMAGE, HandObservation
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture
 from jaxfilters.typing import AnyKey
 
@@ -99,6 +99,8 @@ def points(
         axis=axis,
         has_axis=always,
         is_hand=always,
+        coverage=jnp.ones((num_frames, 1, 1), tips.dtype),
+        cell=jnp.full((num_frames, 2), WHOLE_IMAGE, tips.dtype),
     )
     return PointSequence(observed, tips, fingers)
 

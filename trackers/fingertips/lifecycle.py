@@ -19,6 +19,9 @@ from jaxfilters.trackers.fingertips.state import (
     repeated,
 )
 
+LEAST_COVERED = 0.25
+"""Of the cell of the image beneath a predicted fingertip, that the hand covers if it may be there."""
+
 
 def no_hint(config: FingertipConfig, state: HandState, observed: HandObservation) -> Gaussian:
     """Predictions as they are: the paper looks at tips alone."""
@@ -63,6 +66,21 @@ def away_from_others(
     apart = jnp.sum(jnp.square(observed.tips[:, None] - positions), axis=-1)
     taken = jnp.any((apart < config.apart**2) & (tracks.mode == CONFIRMED), axis=1)
     return observed.is_tip & ~taken
+
+
+def always(positions: Float[Array, "slots 2"], observed: HandObservation) -> Bool[Array, " slots"]:
+    """Every prediction is reported, as in the paper."""
+    del observed
+    return jnp.ones(len(positions), bool)
+
+
+def on_hand(positions: Float[Array, "slots 2"], observed: HandObservation) -> Bool[Array, " slots"]:
+    """A fingertip that is predicted where the image shows something else is folded, or has gone another way."""
+    column, row = jnp.floor((positions + 0.5) / observed.cell).astype(jnp.int32).T
+    rows, columns = observed.coverage.shape
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    covered = observed.coverage[jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1)] >= LEAST_COVERED
+    return (inside & covered) | ~observed.is_hand
 
 
 def continued(

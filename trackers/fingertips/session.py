@@ -86,8 +86,9 @@ class FingertipSession:
             observed: (frames, hands, ...); the components of a frame in any order.
             times_s: Of the frames.
         """
-        moved = jax.tree.map(jnp.asarray, observed)
-        self._state, found = run_hands(self.config, self._angles, self._state, moved, self._sides, method=self._method)
+        self._state, found = run_hands(
+            self.config, self._angles, self._state, observed, self._sides, method=self._method
+        )
         report: Any = jax.tree.map(np.asarray, found)
         displacement, code = self._symbols(report)
         for i, time_s in enumerate(times_s):

@@ -199,6 +199,8 @@ class Method(NamedTuple):
     are that become fingertips in this frame."""
     report: Callable[..., Array]
     """`(detected, filtered) -> position` that is reported where a tip was detected."""
+    may_coast: Callable[..., Array]
+    """`(positions, observed) -> which predictions may be reported` where no tip was detected."""
     thumb: ThumbTest
 
 

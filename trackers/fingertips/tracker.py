@@ -32,10 +32,22 @@ from jaxfilters.trackers.fingertips.state import (
 from jaxfilters.trackers.fingertips.thumbs import MEAN_SCORE, POSTERIOR
 
 MODERN = Method(
-    lifecycle.carried, likeliest, lifecycle.away_from_others, naming.by_place, lifecycle.filtered, POSTERIOR
+    lifecycle.carried,
+    likeliest,
+    lifecycle.away_from_others,
+    naming.by_place,
+    lifecycle.filtered,
+    lifecycle.on_hand,
+    POSTERIOR,
 )
 PUBLISHED = Method(
-    lifecycle.no_hint, nearest_in_order, lifecycle.anywhere, naming.numbered, lifecycle.detected, MEAN_SCORE
+    lifecycle.no_hint,
+    nearest_in_order,
+    lifecycle.anywhere,
+    naming.numbered,
+    lifecycle.detected,
+    lifecycle.always,
+    MEAN_SCORE,
 )
 PUBLISHED_CONFIG = FingertipConfig(lost=300.0)
 """The published constants."""
@@ -212,7 +224,8 @@ def _report(
     config: FingertipConfig, after: HandState, observed: HandObservation, sight: _Sight, method: Method
 ) -> HandReport:
     tracks = after.tracks
-    is_tip = tracks.mode == CONFIRMED
+    is_there = sight.matched | method.may_coast(sight.corrected.mean[:, :2], observed)
+    is_tip = (tracks.mode == CONFIRMED) & is_there
     reported = jax.vmap(method.report)(sight.tips, sight.corrected.mean[:, :2])
     position = jnp.where(sight.matched[:, None], reported, sight.corrected.mean[:, :2])
     sd = config.measurement_sd * jnp.sqrt(jnp.maximum(motion.uncertainty(sight.corrected), 0.0))

@@ -37,7 +37,10 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
     )
     gestures.add_argument("--stream", action="store_true", help=f"find gestures in streams: DATA is {_STREAMS}")
     gestures.add_argument(
-        "--states", type=positive_integer, metavar="N", help="of each model (default: 10; 16 for paths in a plane)"
+        "--states",
+        type=positive_integer,
+        metavar="N",
+        help="of each model (default: 10; 16 for paths in a plane, 18 for few strokes in space)",
     )
     gestures.add_argument(
         "--ways",

@@ -203,3 +203,22 @@ def test_other_masks_are_refused_by_name(mask):
 def test_a_capacity_of_none_is_refused():
     with pytest.raises(ValueError, match="capacity"):
         detect_hands(np.zeros(SMALL, bool), parameters(), capacity=0)
+
+
+def test_a_finger_that_the_border_cuts_has_no_tip_there():
+    mask = open_hand(lengths=(0, 1, 1, 0, 0))
+    whole = detect_hand(mask, parameters())
+    tips = whole.tips[whole.is_tip]
+    assert len(tips) == 2
+    longest = tips[:, 1].argmin()
+    cut = detect_hand(np.ascontiguousarray(mask[int(tips[longest, 1]) + 4 :]), parameters())
+    left = cut.tips[cut.is_tip] + [0, int(tips[longest, 1]) + 4]
+    np.testing.assert_allclose(left, tips[[1 - longest]], atol=0.5)
+
+
+def test_the_grid_says_where_the_hand_is():
+    hand = detect_hand(open_hand(), parameters())
+    column, row = ((hand.palm + 0.5) / hand.cell).astype(int)
+    assert hand.coverage[row, column] == 1
+    assert hand.coverage[0, 0] == 0
+    assert math.isclose(hand.coverage.mean(), open_hand().mean(), rel_tol=0.01)

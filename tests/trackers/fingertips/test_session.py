@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.fingertip import thumb
-from jaxfilters.models.fingertip.observation import HandObservation
+from jaxfilters.models.fingertip.observation import WHOLE_IMAGE, HandObservation
 from jaxfilters.trackers.fingertips.drawing import NOTHING_DRAWN, Drawing, DrawingConfig, finished
 from jaxfilters.trackers.fingertips.events import Recognised
 from jaxfilters.trackers.fingertips.session import FingertipSession
@@ -33,7 +33,8 @@ def observed(frames, hands=2):
             bases[i, h, :n] = np.asarray(place) + 0.4 * np.asarray(own)
     axis = np.broadcast_to(np.float32([0, -1]), (*shape, 2))
     radius = np.full(shape, 46, np.float32)
-    return HandObservation(tips, is_tip, is_tip * 1.0, bases, is_tip, palm, radius, axis, there, there)
+    coverage, cell = np.ones((*shape, 1, 1), np.float32), np.full((*shape, 2), WHOLE_IMAGE, np.float32)
+    return HandObservation(tips, is_tip, is_tip * 1.0, bases, is_tip, palm, radius, axis, there, there, coverage, cell)
 
 
 def follow(frames, **options):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.fingertip import thumb
-from jaxfilters.models.fingertip.observation import HandObservation
+from jaxfilters.models.fingertip.observation import WHOLE_IMAGE, HandObservation
 from jaxfilters.models.gesture import codes
 from jaxfilters.models.synthetic import fingertip_points as points
 from jaxfilters.trackers.fingertips import tracker
@@ -147,7 +147,18 @@ def shown(tips, *, palm=(0.0, 0.0), bases=None, axis=True, hand=True):
     padded = jnp.zeros((capacity, 2)).at[: len(tips)].set(place + jnp.asarray(tips).reshape(-1, 2))
     bases = 0.4 * (padded - place) + place if bases is None else bases
     return HandObservation(
-        padded, there, there * 1.0, bases, there, place, jnp.asarray(46.0), UP, jnp.asarray(axis), jnp.asarray(hand)
+        padded,
+        there,
+        there * 1.0,
+        bases,
+        there,
+        place,
+        jnp.asarray(46.0),
+        UP,
+        jnp.asarray(axis),
+        jnp.asarray(hand),
+        coverage=jnp.ones((1, 1)),
+        cell=jnp.full(2, WHOLE_IMAGE),
     )
 
 
@@ -270,3 +281,15 @@ def test_configurations_are_checked_and_scale_with_image_and_frame_rate():
         replace(CONFIG, gate=0.0)
     with pytest.raises(ValueError, match="capacity must be at least 5"):
         replace(CONFIG, capacity=3)
+
+
+def test_a_prediction_where_the_image_shows_no_hand_is_not_reported_and_keeps_its_name():
+    """A folded finger has no observations, and the same name when it is extended again."""
+    both, index = (INDEX, MIDDLE), (INDEX,)
+    cover = jnp.zeros((60, 80)).at[:, :36].set(1.0)  # of 640x480: the middle finger, at x = 320, is not on it
+    beside = shown(index)._replace(coverage=cover, cell=jnp.full(2, 8.0))
+    _, reports = play([shown(both)] * 6 + [beside] * 3 + [shown(both)] * 2)
+    assert [int(report.num_tips) for report in reports[5:]] == [2, 1, 1, 1, 2, 2]
+    assert set(reports[-1].identity[reports[-1].is_tip]) == set(reports[5].identity[reports[5].is_tip])
+    _, reports = play([shown(both)] * 6 + [shown(index)] * 3)
+    assert [int(report.num_tips) for report in reports[5:]] == [2, 2, 2, 2]
