@@ -22,7 +22,7 @@ from jaxfilters.benchmarks.scenarios._head_runs import (
 from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.app.chart import Curve, Shade, draw_chart
-from jaxfilters.trackers.head.common.state import HeadOptions
+from jaxfilters.trackers.head.common.config import HeadConfig
 
 AMPLITUDE, MILD_AMPLITUDE = 1.8, 1.0
 CONTRIBUTION_FRAME = 600
@@ -54,13 +54,13 @@ class Schedule(NamedTuple):
         }
 
     @property
-    def trackers(self) -> dict[str, HeadOptions]:
+    def trackers(self) -> dict[str, HeadConfig]:
         """By name; deformations are estimated, and not yet used, until the face deforms."""
         return {
-            "rigid": HeadOptions(learn=False),
-            "deformable": HeadOptions(rigid_frames=self.start),
-            "paper_rigid": HeadOptions(mode="paper", learn=False),
-            "paper_deformable": HeadOptions(mode="paper", rigid_frames=self.start),
+            "rigid": HeadConfig(learn=False),
+            "deformable": HeadConfig(rigid_frames=self.start),
+            "paper_rigid": HeadConfig(mode="paper", learn=False),
+            "paper_deformable": HeadConfig(mode="paper", rigid_frames=self.start),
         }
 
 
@@ -75,7 +75,7 @@ def deformation_metrics(seeds: range, schedule: Schedule, out: Path | None) -> d
 
 
 def deforming_runs(
-    seeds: range, schedule: Schedule, amplitude: float, trackers: dict[str, HeadOptions]
+    seeds: range, schedule: Schedule, amplitude: float, trackers: dict[str, HeadConfig]
 ) -> dict[str, list[HeadRun]]:
     """Runs of every tracker over all faces."""
     runs: dict[str, list[HeadRun]] = {name: [] for name in trackers}

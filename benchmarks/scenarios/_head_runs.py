@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
-from jaxfilters.trackers.head.common.state import HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.config import HeadConfig
+from jaxfilters.trackers.head.common.state import HeadTrack
 from jaxfilters.trackers.head.stereo.session import HeadSession
 
 AXES = ("x", "y", "z", "roll", "yaw", "pitch")
@@ -61,7 +62,7 @@ class HeadRun(NamedTuple):
         return np.sqrt(np.mean(np.sum(np.asarray(off, float) ** 2, axis=-1), axis=-1))
 
 
-def follow(sequence: FaceSequence, trackers: Mapping[str, HeadOptions]) -> dict[str, HeadRun]:
+def follow(sequence: FaceSequence, trackers: Mapping[str, HeadConfig]) -> dict[str, HeadRun]:
     """Runs of all trackers over one sequence, which is rendered once.
 
     They are given where the landmarks are in the first image of the first camera, and nothing else.

@@ -14,9 +14,10 @@ from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.models.synthetic.face_motion import deformation_schedule, motion
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence
 from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.estimate import refined
 from jaxfilters.trackers.head.common.search import Searches, at, first_diffusion, searches
-from jaxfilters.trackers.head.common.state import POSE, HeadOptions, HeadState, compiled
+from jaxfilters.trackers.head.common.state import POSE, HeadState
 from jaxfilters.trackers.head.stereo.registration import register
 from jaxfilters.trackers.head.stereo.tracking import SHARPENING, advance, begin
 from jaxfilters.trackers.head.stereo.variants import VARIANTS
@@ -40,7 +41,7 @@ class Prepared(NamedTuple):
     """A tracker in full swing, and the frames it sees next."""
 
     truth: FaceSequence
-    options: HeadOptions
+    options: HeadConfig
     search: Searches
     state: HeadState
     images: np.ndarray
@@ -55,9 +56,9 @@ class Prepared(NamedTuple):
 def speed_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str, Metric]:
     """Of both modes in batches, of single frames as from live cameras, and of the stages."""
     recorded = recording(seed)
-    options = {f"_{count}_particles": HeadOptions(num_particles=count, rigid_frames=0) for count in counts}
+    options = {f"_{count}_particles": HeadConfig(num_particles=count, rigid_frames=0) for count in counts}
     usual = f"_{USUAL}_particles"
-    options[f"{usual}_paper"] = HeadOptions(mode="paper", num_particles=USUAL, rigid_frames=0)
+    options[f"{usual}_paper"] = HeadConfig(mode="paper", num_particles=USUAL, rigid_frames=0)
     trackers = {name: prepared(recorded, chosen) for name, chosen in options.items()}
     modern, paper = trackers[usual], trackers[f"{usual}_paper"]
     trackers[f"{usual}_live"] = modern._replace(images=modern.images[:1], times=modern.times[:1])
@@ -93,7 +94,7 @@ def recording(seed: int) -> Recording:
     return Recording(truth, truth.frames(0, num_frames))
 
 
-def prepared(recorded: Recording, options: HeadOptions) -> Prepared:
+def prepared(recorded: Recording, options: HeadConfig) -> Prepared:
     """A tracker after some frames, old enough not to sharpen the registered shape any more."""
     truth, images = recorded
     registration = register(images[0], np.asarray(truth.uv[0, 0], float), truth.rig)

@@ -24,9 +24,9 @@ from jaxfilters.models.synthetic.ict_course import read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import MonoOptions
 from jaxfilters.trackers.io.face_models import people_face_model
 
 SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
@@ -103,7 +103,7 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
         detector: Of the landmarks.
         seed: Of the particles.
     """
-    session = MonoSession(made.rig, face, MonoOptions(seed=seed), detector=detector)
+    session = MonoSession(made.rig, face, MonoConfig(seed=seed), detector=detector)
     poses, stds, status, located = [], [], [], []
     for start, images in made.chunks(PIECE):
         track = session.process(images, made.times[start : start + len(images)])

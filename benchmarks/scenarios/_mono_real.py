@@ -23,9 +23,9 @@ from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
 from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
 from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import MonoOptions
 from jaxfilters.trackers.io.face_models import people_face_model
 
 PEOPLE = ((0, 1), (1, 2), (2, 0), (3, 13), (4, 5), (5, 14), (6, 3), (7, 8))
@@ -71,7 +71,7 @@ def modelled_face(seed: int, landmarks: tuple[int, ...] = FROM_68, pairs: Pairs 
 def cross_model(seed: int) -> dict[str, Contender]:
     """The tracker with what modelled people differ in, for faces of the generator; nothing without that model."""
     try:
-        return {"b_rendered_modelled": Contender(modelled_face(seed), MonoOptions())}
+        return {"b_rendered_modelled": Contender(modelled_face(seed), MonoConfig())}
     except RecordingError as error:
         sys.stderr.write(f"  left out: {error}\n")
         return {}
@@ -89,11 +89,11 @@ def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     model = read_ict(recording_folder("ict_face_model"))
     turns = read_biwi(recording_folder("biwi_head_rotation"))
     speech = read_livelink(recording_folder("livelinkface_take"), model.names)
-    contenders = {"modelled": Contender(modelled_face(seed), MonoOptions())}
+    contenders = {"modelled": Contender(modelled_face(seed), MonoConfig())}
     if not quick:
         dense = modelled_face(seed, tuple(range(NUM_DENSE)), PAIRS_68)
-        contenders["modelled_68"] = Contender(dense, MonoOptions())
-        contenders["modelled_rendered"] = Contender(people_face_model().model, MonoOptions())
+        contenders["modelled_68"] = Contender(dense, MonoConfig())
+        contenders["modelled_rendered"] = Contender(people_face_model().model, MonoConfig())
     runs: dict[str, list[MonoRun]] = {name: [] for name in contenders}
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
     for person, stretch in PEOPLE[: 1 if quick else None]:
@@ -121,7 +121,7 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         images, fps = read_video(folder / file, QUICK_VIDEO_FRAMES if quick else None)
         rows, cols = images.shape[1:]
         rig = monocular(Pinhole.from_intrinsics(FOCAL_WIDTHS * cols, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
-        session = MonoSession(rig, people_face_model().model, MonoOptions(seed=seed))
+        session = MonoSession(rig, people_face_model().model, MonoConfig(seed=seed))
         times = np.arange(len(images)) / fps
         parts = [
             session.process(images[i : i + PIECE, None], times[i : i + PIECE]) for i in range(0, len(images), PIECE)

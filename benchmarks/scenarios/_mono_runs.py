@@ -19,10 +19,11 @@ from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequenc
 from jaxfilters.models.synthetic.face_training import generator_shapes
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.table import TRACKED
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
 from jaxfilters.trackers.head.mono.detections import Detections
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
+from jaxfilters.trackers.head.mono.state import MonoTrack
 
 DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
 """From millimetres and radians to millimetres and degrees."""
@@ -92,7 +93,7 @@ class Contender(NamedTuple):
     """A tracker, and what it knows of faces."""
 
     face: MultilinearFace
-    options: MonoOptions
+    options: MonoConfig
     remembered: Remembered | None = None
     """Whom it may recognise."""
 

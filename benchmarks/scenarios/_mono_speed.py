@@ -7,8 +7,8 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._mono_runs import camera, talking_head
 from jaxfilters.benchmarks.timing import interleaved
+from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
 from jaxfilters.trackers.io.face_models import default_face_model
 
 FRAMES, WARM_UP = 32, 64
@@ -21,11 +21,11 @@ def speed_metrics(seed: int, rounds: int) -> dict[str, Metric]:
     images = made.frames(0, FRAMES)
     face = default_face_model().model
     options = {
-        "": replace(MonoOptions(), selection="latest"),
-        "_usual": MonoOptions(),
-        "_without_adjustment": replace(MonoOptions(), adjust=False),
+        "": replace(MonoConfig(), selection="latest"),
+        "_usual": MonoConfig(),
+        "_without_adjustment": replace(MonoConfig(), adjust=False),
         "_paper": PUBLISHED,
-        "_live": replace(MonoOptions(), chunk=1),
+        "_live": replace(MonoConfig(), chunk=1),
     }
     calls = {}
     for name, one in options.items():

@@ -10,8 +10,9 @@ from jaxfilters.models.face.bundle import Bundle, projected
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.start import initialise
-from jaxfilters.trackers.head.mono.state import NUM_FRAMES, MonoOptions
+from jaxfilters.trackers.head.mono.state import NUM_FRAMES, prior_of
 
 SPREADS = (0.1, 0.5, 1.0, 2.0)
 TURNED_DEG = (3.0, 12.0, 7.0)
@@ -22,7 +23,7 @@ MOVED_MM = (10.0, 10.0, 20.0)
 def start_metrics(face: MultilinearFace, seed: int, starts: int) -> dict[str, Metric]:
     """Errors of the pose and of the reprojection over many people whom the model can form, with and without priors."""
     rig, rng = camera(), np.random.default_rng(seed)
-    priors = {"": MonoOptions().prior, "_free": Prior(0.0, 0.0)}
+    priors = {"": prior_of(MonoConfig()), "_free": Prior(0.0, 0.0)}
     metrics: dict[str, Metric] = {}
     for spread in SPREADS:
         found: dict[str, list] = {suffix: [] for suffix in priors}

@@ -25,8 +25,9 @@ from jaxfilters.models.articulated.limits import LimitRows, limit_rows, within
 from jaxfilters.models.articulated.motion import MOVEMENT_TIME, AboutEase, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import FeatureFrame, Start
-from jaxfilters.trackers.articulated.tracker import ArticulatedConfig, tracker_of
+from jaxfilters.trackers.articulated.tracker import tracker_of
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 TRIANGLE = ("hand_top", "hand_left", "hand_right")

@@ -27,9 +27,10 @@ from jaxfilters.models.articulated.limits import limit_rows
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import FeatureFrame, keypoint_noise, persistence
 from jaxfilters.trackers.articulated.start import starts_from_points
-from jaxfilters.trackers.articulated.tracker import TRACKING, ArticulatedConfig, tracker_of
+from jaxfilters.trackers.articulated.tracker import TRACKING, tracker_of
 
 HYPOTHESES = 4
 QUICK_FRAMES = 240

@@ -47,7 +47,7 @@ from jaxfilters.benchmarks.scenarios._mono_speed import speed_metrics
 from jaxfilters.benchmarks.scenarios._mono_starts import start_metrics
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.synthetic.face import make_identity
-from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
+from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
 
 THESIS = {
     "a": (2.60, 3.12, 9.56, 0.43, 2.45, 2.33),
@@ -68,7 +68,7 @@ FIRST_OTHER = 1000
 """Of the people who are never users."""
 NUM_FRAMES, QUICK_NUM_FRAMES = 900, 64
 WIDE_IDENTITIES, EYES_STD_MM = 15, 1.0
-USUAL = MonoOptions()
+USUAL = MonoConfig()
 PAPER_MAP = replace(PUBLISHED, prior_weight=0.7)
 
 

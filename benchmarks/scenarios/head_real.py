@@ -31,10 +31,11 @@ from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.detect import detect
 from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
-from jaxfilters.trackers.head.common.state import HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.state import HeadTrack
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.stereo.session import HeadSession
 
@@ -93,7 +94,7 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         rows, cols = images.shape[1:]
         focal = FOCAL_WIDTHS * cols
         rig = monocular(Pinhole.from_intrinsics(focal, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
-        session = HeadSession(rig, HeadOptions(seed=seed))
+        session = HeadSession(rig, HeadConfig(seed=seed))
         track = follow(session, images[:, None], np.arange(len(images)) / fps)
         is_tracked = np.isin(track.status, TRACKED)
         apart = detector_distances(images, track, round(fps))
@@ -133,7 +134,7 @@ def modelled(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int
 
 def followed(made: IctSequence, seed: int) -> Modelled:
     """A modelled person, tracked, beside the truth."""
-    session = HeadSession(made.rig, HeadOptions(seed=seed), np.asarray(made.uv[0, 0], float))
+    session = HeadSession(made.rig, HeadConfig(seed=seed), np.asarray(made.uv[0, 0], float))
     parts = [session.process(images, made.times[start : start + len(images)]) for start, images in made.chunks(PIECE)]
     track = jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
     is_tracked = np.isin(track.status, TRACKED)

@@ -24,26 +24,26 @@ from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS, HeadRun
 from jaxfilters.benchmarks.scenarios._head_speed import speed_metrics
 from jaxfilters.models.synthetic.face_motion import DIMMING_FRAMES, OCCLUSION_FRAMES, motion
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
-from jaxfilters.trackers.head.common.state import HeadOptions
+from jaxfilters.trackers.head.common.config import HeadConfig
 
 FIRST_SEED = 100
 """The tracker was made with smaller ones."""
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Root mean square errors of tables 3 and 4 in millimetres and degrees."""
-ALWAYS = {"": HeadOptions(learn=False), "_learning": HeadOptions()}
-_PAPER = HeadOptions(mode="paper", learn=False)
+ALWAYS = {"": HeadConfig(learn=False), "_learning": HeadConfig()}
+_PAPER = HeadConfig(mode="paper", learn=False)
 PAPER = {
     "_paper": _PAPER,
-    "_paper_fixed5": HeadOptions(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=5.0),
-    "_paper_fixed1": HeadOptions(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=1.0),
+    "_paper_fixed5": HeadConfig(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=5.0),
+    "_paper_fixed1": HeadConfig(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=1.0),
 }
 TABLED = ("", "_learning", "_paper")
 """With their ratios to the paper's errors, and their coverage."""
 ABLATIONS = {
-    "_online_diffusion": HeadOptions(learn=False, diffusion="online"),
-    "_50_particles": HeadOptions(learn=False, num_particles=50),
-    "_fixed5": HeadOptions(learn=False, diffusion="fixed", fixed_diffusion=5.0),
-    "_fixed1": HeadOptions(learn=False, diffusion="fixed", fixed_diffusion=1.0),
+    "_online_diffusion": HeadConfig(learn=False, diffusion="online"),
+    "_50_particles": HeadConfig(learn=False, num_particles=50),
+    "_fixed5": HeadConfig(learn=False, diffusion="fixed", fixed_diffusion=5.0),
+    "_fixed1": HeadConfig(learn=False, diffusion="fixed", fixed_diffusion=1.0),
 }
 NUM_SEEDS, NUM_PAPER_SEEDS, NUM_FRAMES = 10, 3, 600
 QUICK_NUM_SEEDS, QUICK_NUM_FRAMES = 2, 120
@@ -81,7 +81,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     return metrics | speed | deformation_metrics(people, QUICK_SCHEDULE if quick else SCHEDULE, out)
 
 
-def moving_runs(kind: str, seeds: range, num_frames: int, few: Mapping[str, HeadOptions]) -> Runs:
+def moving_runs(kind: str, seeds: range, num_frames: int, few: Mapping[str, HeadConfig]) -> Runs:
     """Runs over one table's sequences; trackers in `few` see the first of them only."""
     runs: Runs = {}
     for seed in seeds:

@@ -30,8 +30,8 @@ from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, Contender, MonoR
 from jaxfilters.benchmarks.scenarios._pets import load_pets
 from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_capture, track_lengths, true_lengths
 from jaxfilters.models.synthetic.face_sequence import sequence
-from jaxfilters.trackers.head.common.state import HeadOptions
-from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.head.common.config import HeadConfig
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.io.face_models import default_face_model
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.state import PeopleConfig
@@ -75,13 +75,13 @@ def stereo_claims(quick: bool, seed: int) -> Claims:
     runs = []
     for head in _heads(quick, seed):
         made = sequence(jax.random.key(head), "slow", QUICK_NUM_FRAMES if quick else NUM_FRAMES, head)
-        runs.append(follow(made, {"": HeadOptions(learn=False)})[""])
+        runs.append(follow(made, {"": HeadConfig(learn=False)})[""])
     return Claims("head_stereo", "rendered", POSE, [_of_head(run) for run in runs])
 
 
 def mono_claims(quick: bool, seed: int) -> Claims:
     """Heads before one camera, rendered, who move and speak; the model of faces is that of the package."""
-    contender = Contender(default_face_model().model, MonoOptions(seed=seed))
+    contender = Contender(default_face_model().model, MonoConfig(seed=seed))
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
     runs = [follow_all(talking_head(head, num_frames), {"": contender}, head)[""] for head in _heads(quick, seed)]
     return Claims("head_mono", "rendered", POSE, [_of_mono(run) for run in runs])

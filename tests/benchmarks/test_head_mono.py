@@ -12,8 +12,9 @@ from jaxfilters.models.face.multilinear import shape
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.detectors import Seen
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoTrack
+from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.io.face_models import default_face_model
 
 
@@ -98,7 +99,7 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
             return MonoTrack(**track | {"pose": pose, "shape": shape, "status": np.full(len(rows), DEFORMABLE)})
 
     monkeypatch.setattr(_mono_runs, "MonoSession", Session)
-    contender = Contender(default_face_model().model, MonoOptions())
+    contender = Contender(default_face_model().model, MonoConfig())
     runs = follow_all(made, {"usual": contender, "other": contender}, 0)
     first = _mono_runs.START_FRAMES[-1] + 1
     for session in sessions:

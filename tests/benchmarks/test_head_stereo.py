@@ -17,7 +17,8 @@ from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
-from jaxfilters.trackers.head.common.state import RIGID, HeadOptions, HeadTrack
+from jaxfilters.trackers.head.common.config import HeadConfig
+from jaxfilters.trackers.head.common.state import RIGID, HeadTrack
 
 K, ASTRAY = 10, 50.0
 
@@ -252,7 +253,7 @@ def test_a_run_begins_with_the_second_frame_and_has_every_other_one(monkeypatch)
             return HeadTrack(*(images[:, None] for _ in HeadTrack._fields))
 
     monkeypatch.setattr(runs, "HeadSession", Session)
-    run = runs.follow(Numbers(91), {"usual": HeadOptions()})["usual"]
+    run = runs.follow(Numbers(91), {"usual": HeadConfig()})["usual"]
     assert handed == [1, 40, 40, 10]
     np.testing.assert_array_equal(run.track.score[:, 0], range(1, 91))
     np.testing.assert_array_equal(run.contributions, [41, 81, 91])

@@ -7,14 +7,43 @@ from pathlib import Path
 from typing import TypeVar
 
 from jaxfilters.trackers.app.argument_types import positive_number, seed
+from jaxfilters.trackers.configuration import settings_of
 
 Made = TypeVar("Made")
+_SHORT = {"num_particles": "--particles"}
+"""Further names of options."""
 
 
 def config_from_args(config: Callable[..., Made], options: argparse.Namespace) -> Made:
     """A configuration with the options of the command line; those that are None keep the default of its field."""
     names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
     return config(**{name: value for name in names if (value := getattr(options, name, None)) is not None})
+
+
+def add_config(parser: argparse.ArgumentParser, config: type, *names: str) -> None:
+    """Options from fields of a configuration, with their types, choices and docstrings; None unless given.
+
+    Args:
+        parser: Of the command.
+        config: A dataclass whose fields `jaxfilters.trackers.configuration` can read.
+        names: The fields, in the order of the help.
+    """
+    settings = settings_of(config)
+    for setting in (settings[name] for name in names):
+        flags = [f"--{setting.name.replace('_', '-')}", *filter(None, [_SHORT.get(setting.name)])]
+        text = (setting.meaning[:1].lower() + setting.meaning[1:]).removesuffix(".").replace("%", "%%")
+        if setting.kind is bool:
+            parser.add_argument(
+                *flags,
+                action=argparse.BooleanOptionalAction,
+                help=f"{text} (default: {'' if setting.default else 'no-'}{setting.name})",
+            )
+            continue
+        default = "" if setting.default is None else f" (default: {setting.default})"
+        metavar = {int: "N", float: "X"}.get(setting.kind)
+        parser.add_argument(
+            *flags, type=setting.kind, choices=setting.choices or None, metavar=metavar, help=text + default
+        )
 
 
 def add_recording(parser: argparse.ArgumentParser, what: str) -> None:

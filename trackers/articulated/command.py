@@ -9,6 +9,7 @@ from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.articulated import tracker as articulated_hand
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.drawing import scene, write_overlay
 from jaxfilters.trackers.articulated.recording import FeatureSequence
 from jaxfilters.trackers.articulated.summary import errors_of, write_summary
@@ -34,7 +35,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = as_input_error(partial(config_from_args, articulated_hand.ArticulatedConfig, options))
+    config = as_input_error(partial(config_from_args, ArticulatedConfig, options))
     sequence = _sequence(options, config)
     hand = as_input_error(partial(articulated_hand.hand_model, sequence, config))
     return RunSpec(
@@ -48,7 +49,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
     )
 
 
-def _sequence(options: argparse.Namespace, config: articulated_hand.ArticulatedConfig) -> FeatureSequence:
+def _sequence(options: argparse.Namespace, config: ArticulatedConfig) -> FeatureSequence:
     of_input = {"--image-size": options.image_size, "--noise": options.noise, "--fps": options.fps}
     if options.input is None:
         if unused := [name for name, value in of_input.items() if value is not None]:

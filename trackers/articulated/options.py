@@ -3,28 +3,18 @@
 import argparse
 
 from jaxfilters.trackers.app.argument_types import image_size, positive_number
-from jaxfilters.trackers.app.options import add_recording, add_results_options, add_seed
+from jaxfilters.trackers.app.options import add_config, add_recording, add_results_options, add_seed
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to the parser of the command.
-
-    Options of the tracker are None unless given, so that the defaults stand in one place, `ArticulatedConfig`.
-    """
+    """Add the options to the parser of the command."""
     add_recording(
         parser,
         ".npz with features or keypoints, folder of OpenPose's *_keypoints.json, or .json or .csv of MediaPipe's "
         "landmarks",
     )
-    parser.add_argument(
-        "--mode",
-        choices=("recommended", "literal", "unconstrained"),
-        help="how estimates are kept within the limits of a hand (default: recommended; literal: as in the paper)",
-    )
-    parser.add_argument("--hypotheses", type=int, metavar="N", help="how many at most (default: 6)")
-    parser.add_argument(
-        "--gate", type=float, metavar="SIGMAS", help="leave out features that are farther off (default: 5; 0: never)"
-    )
+    add_config(parser, ArticulatedConfig, "mode", "hypotheses", "gate", "hand")
     parser.add_argument(
         "--image-size", type=image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
     )
@@ -40,6 +30,5 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="FPS",
         help="frames per second of a recording without times (default: 30)",
     )
-    parser.add_argument("--hand", choices=("right", "left"), help="which hand (default: right)")
     add_seed(parser)
     add_results_options(parser)

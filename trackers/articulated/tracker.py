@@ -6,7 +6,7 @@ Image Sequence Based on Loose Constraints". The filters are those of `jaxfilters
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
 from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
 from jaxfilters.trackers.tracker import Tracker, track_frames
@@ -49,31 +50,6 @@ HAND_DIAGONAL = 0.19
 """Metres: of the box around the keypoints of an average hand; what a hand's speed in the image is measured by."""
 PATIENCE = 10
 """Frames in a row without the hand before it is searched anew, where keypoints allow it."""
-
-
-@dataclass(frozen=True)
-class ArticulatedConfig:
-    """What a user may set; Python values, read when the tracker is built."""
-
-    mode: str = "recommended"
-    """`recommended`, `literal` (the paper's filter, one hypothesis) or `unconstrained` (one hypothesis)."""
-    hypotheses: int = 6
-    """Slots of the bank in the recommended mode."""
-    hand: str = "right"
-    """Which hand keypoints are of."""
-    gate: float = 5.0
-    """Standard deviations of its innovation beyond which a feature is left out; 0 never leaves one out."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        choices = {"mode": ("recommended", "literal", "unconstrained"), "hand": ("right", "left")}
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
-        if self.hypotheses < 1:
-            raise ValueError(f"hypotheses must be at least 1; got {self.hypotheses}.")
-        if not self.gate >= 0:
-            raise ValueError(f"gate must be standard deviations, 0 or more; got {self.gate}.")
 
 
 class ArticulatedTrack(NamedTuple):

@@ -9,8 +9,8 @@ import pytest
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.articulated import tracker as articulated_hand
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.table import articulated_table
-from jaxfilters.trackers.articulated.tracker import ArticulatedConfig
 from jaxfilters.trackers.tracker import CHUNK
 
 OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}
@@ -183,8 +183,8 @@ def test_wrong_recordings_are_one_clear_line(what, npz, tmp_path, capfd):
     ("options", "message"),
     [
         ("--hypotheses 0", "hypotheses must be at least 1; got 0."),
-        ("--gate -1", "gate must be standard deviations, 0 or more; got -1.0."),
-        ("--gate nan", "gate must be standard deviations, 0 or more; got nan."),
+        ("--gate -1", "gate must be at least 0; got -1.0."),
+        ("--gate nan", "gate must be at least 0; got nan."),
         ("--noise 2 --fps 30", "--noise, --fps: of no use without a recording; the synthetic one has its own."),
     ],
 )

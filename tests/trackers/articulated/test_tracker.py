@@ -11,8 +11,9 @@ from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
+from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import FeatureSequence
-from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING, ArticulatedConfig
+from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING
 
 
 def follow(sequence, config=None):
@@ -106,7 +107,7 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
     [
         ({"mode": "best"}, "mode must be one of recommended, literal, unconstrained; got 'best'"),
         ({"hypotheses": 0}, "hypotheses must be at least 1; got 0"),
-        ({"gate": -1.0}, "gate must be standard deviations, 0 or more; got -1.0"),
+        ({"gate": -1.0}, "gate must be at least 0; got -1.0"),
         ({"hand": "third"}, "hand must be one of right, left; got 'third'"),
     ],
 )

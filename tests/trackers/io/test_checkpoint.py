@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.errors import CheckpointError
 
@@ -61,7 +61,7 @@ def test_a_failure_while_writing_leaves_the_old_file(tmp_path, monkeypatch):
 
 def test_trees_of_plain_values_come_back_with_their_types(tmp_path):
     belief = Gaussian(jnp.zeros(2), jnp.eye(2))
-    tree = {"a": [1, 2.5, "x", None, True, np.float64(np.nan), -np.inf], "b": (belief, MonoOptions(seed=3)), "c": ()}
+    tree = {"a": [1, 2.5, "x", None, True, np.float64(np.nan), -np.inf], "b": (belief, MonoConfig(seed=3)), "c": ()}
     checkpoint.save(tmp_path / "c.npz", tree, {})
     found, _ = checkpoint.load(tmp_path / "c.npz")
     assert jax.tree.structure(found) == jax.tree.structure(tree)

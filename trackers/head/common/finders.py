@@ -87,4 +87,4 @@ class MeshFinder:
 
 
 FINDERS: dict[str, type[CascadeFinder] | type[MeshFinder]] = {"cascades": CascadeFinder, "mediapipe": MeshFinder}
-"""By `HeadOptions.detector`."""
+"""By `HeadConfig.detector`."""

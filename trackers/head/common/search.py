@@ -22,7 +22,8 @@ from jaxfilters.models.face.rig import CameraRig, project_shape
 from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState, adaptive_diffusion
 from jaxfilters.particle.partitioned import Partitions, consecutive
-from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS, HeadOptions
+from jaxfilters.trackers.head.common.config import HeadConfig
+from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS
 from jaxfilters.typing import AnyKey
 
 KAPPA = 0.5
@@ -69,7 +70,7 @@ class Searches(NamedTuple):
     """Half of the particles move in the pose, half in the deformation (Sugano 2007, section 3.3.2)."""
 
 
-def searches(rig: CameraRig, options: HeadOptions) -> Searches:
+def searches(rig: CameraRig, options: HeadConfig) -> Searches:
     """The filters for a rig."""
     templates = jnp.zeros((rig.num_cameras, NUM_LANDMARKS, SIZE, SIZE))
     nobody = rigid(jnp.zeros((NUM_LANDMARKS, 3)), templates, num_modes=NUM_MODES)
@@ -88,7 +89,7 @@ def searches(rig: CameraRig, options: HeadOptions) -> Searches:
     return Searches(build(), build(partitions=Partitions(consecutive(POSE, NUM_MODES))))
 
 
-def first_diffusion(options: HeadOptions) -> DiffusionFit:
+def first_diffusion(options: HeadConfig) -> DiffusionFit:
     """`A = I` and a unit of each coordinate a frame; no `A` if it is fixed."""
     # Its arguments are checked by value, also where a caller is being traced.
     with jax.ensure_compile_time_eval():
@@ -120,7 +121,7 @@ def gathered(search: AdaptiveDiffusionState, x: Float[Array, " d"]) -> AdaptiveD
     return search._replace(particles=particles, log_weights=weights.uniform(particles.shape[1], particles.dtype))
 
 
-def start(x: Float[Array, " d"], options: HeadOptions, fit: DiffusionFit | None = None) -> AdaptiveDiffusionState:
+def start(x: Float[Array, " d"], options: HeadConfig, fit: DiffusionFit | None = None) -> AdaptiveDiffusionState:
     """The state at registration: the place is known, and counts as the first estimate.
 
     Args:

@@ -1,7 +1,6 @@
 """The options of the head tracker, its state, and its track."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,59 +24,6 @@ POSE = 6
 DEGREE = math.radians(1.0)
 UNITS = np.array([1.0, 1.0, 1.0, DEGREE, DEGREE, DEGREE])
 """Of pose, in which the paper counts velocity and diffusion: a millimetre, a degree."""
-CHOICES = {
-    "mode": ("modern", "paper"),
-    "diffusion": ("proportional", "online", "fixed"),
-    "detector": ("cascades", "mediapipe"),
-}
-
-
-@dataclass(frozen=True)
-class HeadOptions:
-    """What a user may set; Python values, read when a session is built."""
-
-    mode: str = "modern"
-    """`modern` refines what the particles find; `paper` is Oka, Sato and Sugano's tracker."""
-    num_particles: int = 1000
-    seed: int = 0
-    diffusion: str = "proportional"
-    """`proportional`: speed plus one unit, as in the paper's experiments; `online`: that regression is updated while
-    tracking; `fixed`: `fixed_diffusion`, whatever the speed."""
-    fixed_diffusion: float = 5.0
-    """Millimetres and degrees a frame."""
-    learn: bool = True
-    """Whether the face may deform; with one camera it never does."""
-    rigid_frames: int = 120
-    """Frames after registration in which deformations are estimated but not yet used."""
-    detector: str = "cascades"
-    """What finds the landmarks at the start: OpenCV's `cascades` and corners, or the face mesh of `mediapipe`."""
-    chunk: int = 8
-    """Frames in one compiled call; 1 for live cameras."""
-    live: bool = False
-    """Whether frames cannot wait: a lost face is then searched for beside the tracking."""
-
-    def __post_init__(self) -> None:
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
-        for name in ("num_particles", "chunk"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        if not self.fixed_diffusion > 0:
-            raise ValueError(f"fixed_diffusion must be positive; got {self.fixed_diffusion}.")
-        if self.rigid_frames < 0:
-            raise ValueError(f"rigid_frames must be 0 or more; got {self.rigid_frames}.")
-
-
-def compiled(options: HeadOptions) -> HeadOptions:
-    """What of the options a compiled program knows: those that differ only in numbers share one.
-
-    The diffusion is among the filters and in the state, but for whether it is estimated.
-    """
-    learns = "online" if options.diffusion == "online" else "proportional"
-    return HeadOptions(
-        options.mode, options.num_particles, diffusion=learns, learn=options.learn, rigid_frames=options.rigid_frames
-    )
 
 
 class Learner(NamedTuple):

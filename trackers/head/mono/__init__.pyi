@@ -1,3 +1,3 @@
+from .config import MonoConfig as MonoConfig
 from .session import MonoSession as MonoSession
 from .session import track as track
-from .state import MonoOptions as MonoOptions

@@ -18,9 +18,10 @@ from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.square_root_prior import joined
 from jaxfilters.optimize.least_squares import cauchy, huber
 from jaxfilters.trackers.head.common.state import POSE
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame, units
 from jaxfilters.trackers.head.mono.person import Modes, model_of
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, Window
+from jaxfilters.trackers.head.mono.state import MonoState, Window, reach_of
 
 STEPS = (5, 5)
 """Of both stages."""
@@ -87,7 +88,7 @@ def uncertainty(
 
 
 def choose(
-    face: MultilinearFace, window: Window, prior: Prior, person: Person, frame: Frame, options: MonoOptions
+    face: MultilinearFace, window: Window, prior: Prior, person: Person, frame: Frame, options: MonoConfig
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Which frame of the window the new one replaces, and whether it does."""
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
@@ -108,7 +109,7 @@ def adjusted(
     state: MonoState,
     frame: Frame,
     place: Int[Array, ""],
-    options: MonoOptions,
+    options: MonoConfig,
 ) -> MonoState:
     """The state after an adjustment to the window with a new frame; not finite if that came to nothing.
 
@@ -142,7 +143,7 @@ def fitted(
     rig: CameraRig,
     state: MonoState,
     start: Bundle,
-    options: MonoOptions,
+    options: MonoConfig,
     steps: tuple[int, int] = STEPS,
 ) -> tuple[Bundle, Adjustment]:
     """The window adjusted to one of the faces that it may be of; arguments are those of `adjusted` and `adjust`."""
@@ -150,7 +151,7 @@ def fitted(
     if prior.past is not None:
         prior = prior._replace(past=about_face(prior.past, unknown, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
-    return adjust(face, rig, state.window.views, start, prior, options.reach, steps=steps, losses=losses)
+    return adjust(face, rig, state.window.views, start, prior, reach_of(options), steps=steps, losses=losses)
 
 
 def settled(
@@ -160,7 +161,7 @@ def settled(
     bundle: Bundle,
     pose: Float[Array, " 6"],
     expression: Float[Array, " A"],
-    options: MonoOptions,
+    options: MonoConfig,
 ) -> MonoState:
     """The state with its window adjusted: the person, the face that the search works with, particles and belief.
 

@@ -18,10 +18,10 @@ from jaxfilters.trackers.head.common.outcome import finite, format_report, run_r
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
 from jaxfilters.trackers.head.common.table import STATUS_WORDS
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import MonoOptions
 from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres, mono_table
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
 from jaxfilters.trackers.io.errors import InputError, as_input_error
@@ -44,7 +44,7 @@ def track(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
-    settings = as_input_error(partial(config_from_args, MonoOptions, options))
+    settings = as_input_error(partial(config_from_args, MonoConfig, options))
     model = _model(options)
     place = setup_of_one(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
@@ -63,7 +63,7 @@ def track(options: argparse.Namespace) -> str:
 
 def _tracked(
     options: argparse.Namespace,
-    settings: MonoOptions,
+    settings: MonoConfig,
     run: HeadRun,
     session: MonoSession,
     model: FaceModelFile,

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 from jaxfilters.models.face.bundle import Bundle
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.recognition import weighed
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState
+from jaxfilters.trackers.head.mono.state import MonoState
 
 LOG_STD = 0.3
 """Of the logarithm of a focal length about the assumed one: cameras of 0.9 to 1.6 image widths where 1.2 is assumed."""
@@ -44,7 +45,7 @@ class FocalLength(NamedTuple):
 
 @partial(jax.jit, static_argnames="options")
 def focal_length(
-    unknown: MultilinearFace, face: MultilinearFace, rig: CameraRig, state: MonoState, options: MonoOptions
+    unknown: MultilinearFace, face: MultilinearFace, rig: CameraRig, state: MonoState, options: MonoConfig
 ) -> FocalLength:
     """The focal length by the evidence of the window's frames, of which each is tried with all others anew.
 

@@ -3,15 +3,12 @@
 import argparse
 from pathlib import Path
 
-from jaxfilters.trackers.app.argument_types import positive_number
-from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_config, add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.head.mono.config import MonoConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to the parser of the command.
-
-    Options of the tracker are None unless given, so that the defaults stand in one place, `MonoOptions`.
-    """
+    """Add the options to the parser of the command."""
     parser.add_argument(
         "video_source",
         nargs="?",
@@ -46,12 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="what finds the landmarks: OpenCV's cascades (default), or MediaPipe's face mesh, which with a model of "
         "68 landmarks gives most of them, and the width of the irises",
     )
-    parser.add_argument(
-        "--eyes-apart-mm",
-        type=positive_number,
-        metavar="MM",
-        help="distance between the pupils, if it is known: without it, size and distance are known to some 3 %%",
-    )
+    add_config(parser, MonoConfig, "eyes_apart_mm", "num_particles")
     parser.add_argument(
         "--known",
         type=Path,
@@ -59,7 +51,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="PERSON.npz",
         help="people who may be before the camera: person.npz of earlier runs with the same model",
     )
-    parser.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 750)")
     add_seed(parser)
     add_video_options(parser)
     add_resume(parser)

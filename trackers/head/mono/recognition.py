@@ -20,8 +20,9 @@ from jaxfilters.models.face.remembered import Remembered, hypotheses
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.adjustment import fitted, informed, known, prior_information, settled
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import units
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState
+from jaxfilters.trackers.head.mono.state import MonoState
 
 STEPS = (10, 20)
 """Of both stages of an adjustment: from one person's face to another's is farther than from frame to frame."""
@@ -52,7 +53,7 @@ def people(face: MultilinearFace, remembered: Remembered | None) -> People:
 
 
 @partial(jax.jit, static_argnames="options")
-def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoOptions) -> MonoState:
+def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoConfig) -> MonoState:
     """The state as it is for whoever the window tells most of; unchanged if nobody's face can be fitted.
 
     Args:
@@ -77,7 +78,7 @@ def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoOp
     return jax.tree.map(lambda a, b: jnp.where(changes, a, b), anew, state)
 
 
-def tried(people: People, rig: CameraRig, state: MonoState, options: MonoOptions) -> tuple[Bundle, Float[Array, " n"]]:
+def tried(people: People, rig: CameraRig, state: MonoState, options: MonoConfig) -> tuple[Bundle, Float[Array, " n"]]:
     """The window adjusted to each of the faces, and the logarithms of their evidence but for a common constant.
 
     Arguments are those of `recognised`.
@@ -94,7 +95,7 @@ def weighed(
     rig: CameraRig,
     state: MonoState,
     start: Bundle,
-    options: MonoOptions,
+    options: MonoConfig,
 ) -> tuple[Bundle, Float[Array, ""]]:
     """The window adjusted to one face from a start, and the logarithm of its evidence but for a common constant.
 

@@ -21,6 +21,7 @@ from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import Beginning, Following
 from jaxfilters.trackers.head.common.state import INITIALISING, POSE
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head.mono.detections import Collector, Detections
 from jaxfilters.trackers.head.mono.detectors import Detector
@@ -28,7 +29,7 @@ from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
 from jaxfilters.trackers.head.mono.recognition import People, as_remembered, one_of, people, recognised
 from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, search_of
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
+from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack, prior_of
 from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_points
 
@@ -63,7 +64,7 @@ class MonoSession:
         self,
         rig: CameraRig,
         face: MultilinearFace,
-        options: MonoOptions | None = None,
+        options: MonoConfig | None = None,
         points: Float[np.ndarray, "K 2"] | None = None,
         *,
         detections: Detections | None = None,
@@ -96,7 +97,7 @@ class MonoSession:
             check_points(points)
         else:
             check_points(np.asarray(points)[list(FROM_68)])
-        options = options or MonoOptions()
+        options = options or MonoConfig()
         _check_remembered(remembered, tracked(face), options)
         self._tracker = _MonoTracker(rig, face, options, points, detections, detector, remembered)
         self._following = Following(self._tracker)
@@ -154,7 +155,7 @@ def track(
     times_s: Float[np.ndarray, " b"],
     camera: Pinhole,
     face: MultilinearFace,
-    options: MonoOptions | None = None,
+    options: MonoConfig | None = None,
     **known: Any,
 ) -> MonoTrack:
     """The head in images in memory; `MonoSession` takes them in pieces.
@@ -185,7 +186,7 @@ class _MonoTracker:
         self,
         rig: CameraRig,
         face: MultilinearFace,
-        options: MonoOptions,
+        options: MonoConfig,
         points: np.ndarray | None,
         detections: Detections | None,
         detector: Detector | None,
@@ -196,7 +197,7 @@ class _MonoTracker:
         """With all its landmarks."""
         self._face, self._options, self._points, self._detections = face, options, points, detections
         # What is compiled knows its options, but need not be compiled anew for other numbers.
-        self._compiled = replace(MonoOptions(), **{name: getattr(options, name) for name in _STATIC})
+        self._compiled = replace(MonoConfig(), **{name: getattr(options, name) for name in _STATIC})
         self._remembered = remembered
         self._people = people(face, remembered)
         self._system = System(face, face, rig, search_of(rig, options))
@@ -340,9 +341,9 @@ class _MonoTracker:
         """What holds the face, with what the detector misplaces."""
         options, errors = self._options, detections.errors
         if errors is None or options.is_published or not options.prior_weight:
-            return options.prior
+            return prior_of(options)
         covariance = errors.covariance + UNRENDERED_MM**2 * np.eye(len(errors.covariance))
-        return options.prior._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std))
+        return prior_of(options)._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std))
 
     def _told(self, detections: Detections, start: Start, prior: Prior) -> _Found:
         """The start with all that the detections tell beside the ten landmarks."""
@@ -362,7 +363,7 @@ class _MonoTracker:
         return _Found(detections, start, views, prior._replace(past=past))
 
 
-def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoOptions) -> None:
+def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoConfig) -> None:
     if remembered is None:
         return
     if options.is_published:

@@ -18,13 +18,15 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import SIZE, SKIN_NORMALS, WIDE_SIZE, patches_of, unknown_slopes, windows
 from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, posed_shape
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.recent import nothing_changed
 from jaxfilters.trackers.head.common.search import Searches, searches
 from jaxfilters.trackers.head.common.search import start as start_search
-from jaxfilters.trackers.head.common.state import POSE, HeadOptions
+from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.adjustment import informed
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.person import model_of
-from jaxfilters.trackers.head.mono.state import AVERAGED, MonoOptions, MonoState, Registered, Window
+from jaxfilters.trackers.head.mono.state import AVERAGED, MonoState, Registered, Window
 from jaxfilters.typing import AnyKey
 
 STEPS = (10, 10)
@@ -116,7 +118,7 @@ def begin(
     frame: Int[ArrayLike, ""],
     images: Num[Array, "2 rows cols"],
     time: Float[Array, ""],
-    options: MonoOptions,
+    options: MonoConfig,
     prior: Prior,
 ) -> MonoState:
     """State in the last frame of the start, with templates from one of its frames.
@@ -169,19 +171,19 @@ def begin(
     )
 
 
-def _held(face: MultilinearFace, prior: Prior, options: MonoOptions) -> Prior:
+def _held(face: MultilinearFace, prior: Prior, options: MonoConfig) -> Prior:
     """As a state has it: arrays, and a past from the first where frames will leave one."""
     if prior.past is None and options.past == "marginalised":
         prior = prior._replace(past=nothing_past(face))
     return jax.tree.map(lambda a: jnp.asarray(a, face.mean.dtype), prior)
 
 
-def search_options(options: MonoOptions) -> HeadOptions:
+def search_options(options: MonoConfig) -> HeadConfig:
     """Of the particle filter, which is that of the tracker with several cameras."""
-    return HeadOptions(num_particles=options.num_particles)
+    return HeadConfig(num_particles=options.num_particles)
 
 
-def search_of(rig: CameraRig, options: MonoOptions) -> Searches:
+def search_of(rig: CameraRig, options: MonoConfig) -> Searches:
     """The particle filters for a camera; for the published tracker with its standard deviation of the scores."""
     usual = searches(rig, search_options(options))
     if not options.is_published:
@@ -203,7 +205,7 @@ def _registered(face, rig, bundle, uv, frame, image) -> Registered:
     return Registered(wide, wide[..., border:-border, border:-border], seen)
 
 
-def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike, ""], options: MonoOptions) -> Window:
+def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike, ""], options: MonoConfig) -> Window:
     """The frames of the start; that of the templates comes first, where they are exact by definition."""
     n = len(views.uv)
     order = jnp.arange(n).at[0].set(frame).at[frame].set(0)

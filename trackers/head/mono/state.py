@@ -1,7 +1,5 @@
 """The options of the one-camera head tracker, its state, and its track."""
 
-import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +12,7 @@ from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common.state import Recent
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.person import Modes
 
 NUM_FRAMES = 5
@@ -26,79 +25,20 @@ REACH = Reach(
 """Of one adjustment, as published or, where the thesis is silent, as chosen here."""
 WIDE_REACH = Reach(pose=REACH.pose, expression=2.0, identity=1.0, deviations=4.0)
 """Of one adjustment that a prior holds."""
-EYES_APART_MM, EYES_APART_STD_MM = (40.0, 80.0), 1.0
-"""Of people of any age; how well a known one is known, that between the middles of the corners included."""
-CHOICES = {
-    "landmarks": ("aligned", "recalculated", "projected"),
-    "selection": ("information", "angles", "latest"),
-    "past": ("dropped", "marginalised"),
-}
+EYES_APART_STD_MM = 1.0
+"""How well a known distance between the pupils is known, that between the middles of the corners included."""
 
 
-@dataclass(frozen=True)
-class MonoOptions:
-    """What a user may set; Python values, read when a session is built."""
-
-    num_particles: int = 750
-    seed: int = 0
-    landmarks: str = "aligned"
-    """How landmarks are measured: `aligned` patches that turn with the head; `recalculated` as published, then also
-    with its estimate from particles, its narrow boxes and its mean identity; or `projected` from the estimate itself
-    instead, which only shows what measuring is good for."""
-    selection: str = "information"
-    """Which frames are adjusted to: those of most `information` about the person, of the largest variance of `angles`,
-    as published, or the `latest`."""
-    past: str = "dropped"
-    """What frames that are replaced leave behind: nothing, or, `marginalised`, their information about the person. The
-    latter forgets nothing, neither the errors that landmarks have in common over many frames."""
-    adjust: bool = True
-    """Whether the face is adjusted while it is followed; otherwise at the start alone."""
-    prior_weight: float = 1.0
-    """Of the training set's statistics; 0 as published."""
-    offset_std: float = 0.7
-    """Millimetres by which a face may differ from what the model can form; 0 as published."""
-    eyes_apart_mm: float | None = None
-    """Distance between the pupils, as an optician measures it; without it the size of a face is that of people."""
-    chunk: int = 8
-    """Frames in one compiled call; 1 for live cameras."""
-    live: bool = False
-    """Whether frames cannot wait: a face is then searched for beside the tracking."""
-
-    def __post_init__(self) -> None:
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
-        for name in ("num_particles", "chunk"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        for name in ("prior_weight", "offset_std"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"{name} must be finite and at least 0; got {getattr(self, name)}.")
-
-        least, most = EYES_APART_MM
-        if self.eyes_apart_mm is not None and not least <= self.eyes_apart_mm <= most:
-            raise ValueError(f"eyes_apart_mm must be within {least:g} and {most:g}; got {self.eyes_apart_mm}.")
-
-    @property
-    def prior(self) -> Prior:
-        """What holds every adjustment."""
-        if self.eyes_apart_mm is None:
-            return Prior(self.prior_weight, self.offset_std)
-        return Prior(self.prior_weight, self.offset_std, self.eyes_apart_mm, EYES_APART_STD_MM)
-
-    @property
-    def is_published(self) -> bool:
-        """Whether estimates, boxes and the identity's mean are those of the thesis."""
-        return self.landmarks != "aligned"
-
-    @property
-    def reach(self) -> Reach:
-        """Of every adjustment."""
-        return REACH if self.is_published else WIDE_REACH
+def prior_of(config: MonoConfig) -> Prior:
+    """What holds every adjustment."""
+    if config.eyes_apart_mm is None:
+        return Prior(config.prior_weight, config.offset_std)
+    return Prior(config.prior_weight, config.offset_std, config.eyes_apart_mm, EYES_APART_STD_MM)
 
 
-PUBLISHED = MonoOptions(landmarks="recalculated", selection="angles", prior_weight=0.0, offset_std=0.0)
-"""The tracker of the thesis."""
+def reach_of(config: MonoConfig) -> Reach:
+    """How far an adjustment may go."""
+    return REACH if config.is_published else WIDE_REACH
 
 
 class Window(NamedTuple):

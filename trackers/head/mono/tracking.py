@@ -22,8 +22,9 @@ from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import adjustment
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
-from jaxfilters.trackers.head.mono.state import MonoOptions, MonoState, MonoTrack
+from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import (
     FEWEST_ANCHORED,
     LEAST_SCORE,
@@ -60,7 +61,7 @@ def advance(
     images: Num[Array, "b 1 rows cols"],
     times: Float[Array, " b"],
     is_frame: Bool[Array, " b"],
-    options: MonoOptions,
+    options: MonoConfig,
 ) -> tuple[MonoState, MonoTrack]:
     """State and track after `b` frames; those that are none leave the state alone, and their rows mean nothing."""
 
@@ -76,7 +77,7 @@ def advance(
 
 @partial(jax.jit, static_argnames="options")  # traced once for its shapes and its program
 def _step(
-    system: System, state: MonoState, images: Array, time: Array, options: MonoOptions
+    system: System, state: MonoState, images: Array, time: Array, options: MonoConfig
 ) -> tuple[MonoState, MonoTrack]:
     rig = system.rig
     images = images.astype(state.belief.mean.dtype)
@@ -111,7 +112,7 @@ def _step(
     return state, _track(system, state, score, info.effective_sample_size, is_adjusted, num_sure)
 
 
-def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoOptions) -> tuple[Array, Array]:
+def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoConfig) -> tuple[Array, Array]:
     """What landmarks look like as the head is expected to be turned: as at registration; and, if changed, of late."""
     if options.is_published:
         return state.registered.templates, state.registered.templates
@@ -132,7 +133,7 @@ def _searched(
     templates: Array,
     images: Array,
     steps: Array,
-    options: MonoOptions,
+    options: MonoConfig,
 ) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     """Particles after this frame; where they make the estimate, half of them move in the expression."""
 
@@ -184,7 +185,7 @@ def _after(
 
 
 def _adjusted(
-    system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoOptions
+    system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoConfig
 ) -> tuple[MonoState, Array]:
     """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
     unknown, face, rig, _ = system

@@ -10,10 +10,10 @@ import numpy as np
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.input import Setup, setup_of
 from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
-from jaxfilters.trackers.head.common.state import HeadOptions
 from jaxfilters.trackers.head.common.summary import write_summary
 from jaxfilters.trackers.head.common.table import HEAD_TABLE, STATUS_WORDS, empty_rows, in_metres
 from jaxfilters.trackers.head.stereo.session import HeadSession
@@ -29,7 +29,7 @@ def track(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
-    settings = as_input_error(partial(config_from_args, HeadOptions, options))
+    settings = as_input_error(partial(config_from_args, HeadConfig, options))
     place = setup_of(options)
     if any(isinstance(source, LiveCamera) for source in place.sources):
         settings = dataclasses.replace(settings, chunk=1, live=True)
@@ -39,7 +39,7 @@ def track(options: argparse.Namespace) -> str:
         return _tracked(options, settings, run, session)
 
 
-def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, session: HeadSession) -> str:
+def _tracked(options: argparse.Namespace, settings: HeadConfig, run: HeadRun, session: HeadSession) -> str:
     if run.place.note:
         warn(run.place.note)
     followed = run.follow()
@@ -58,7 +58,7 @@ def _tracked(options: argparse.Namespace, settings: HeadOptions, run: HeadRun, s
     return format_report(report, options)
 
 
-def _session(place: Setup, settings: HeadOptions) -> HeadSession:
+def _session(place: Setup, settings: HeadConfig) -> HeadSession:
     points = place.points
     if points is not None and len(points) > NUM_LANDMARKS:
         points = points[list(FROM_68)]

@@ -3,14 +3,12 @@
 import argparse
 from pathlib import Path
 
-from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_config, add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.head.common.config import HeadConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to the parser of the command.
-
-    Options of the tracker are None unless given, so that the defaults stand in one place, `HeadOptions`.
-    """
+    """Add the options to the parser of the command."""
     parser.add_argument(
         "sources",
         nargs="*",
@@ -34,15 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="columns name,u,v: the ten landmarks in the first image of the first camera, pixels from the centre of "
         "the top left one (default: they are detected)",
     )
-    parser.add_argument(
-        "--mode", choices=("modern", "paper"), help="improved filter (default: modern), or the one of the papers"
-    )
-    parser.add_argument(
-        "--detector",
-        choices=("cascades", "mediapipe"),
-        help="what finds the landmarks at the start: OpenCV's cascades (default) or MediaPipe's face mesh",
-    )
-    parser.add_argument("--num-particles", type=int, metavar="N", help="number of particles (default: 1000)")
+    add_config(parser, HeadConfig, "mode", "detector", "num_particles")
     add_seed(parser)
     add_video_options(parser)
     add_resume(parser)

@@ -12,18 +12,11 @@ from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import align
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
 from jaxfilters.trackers.head.common.following import Beginning, Following
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
-from jaxfilters.trackers.head.common.state import (
-    INITIALISING,
-    NUM_MODES,
-    POSE,
-    HeadOptions,
-    HeadState,
-    HeadTrack,
-    compiled,
-)
+from jaxfilters.trackers.head.common.state import INITIALISING, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
 from jaxfilters.trackers.head.stereo.tracking import advance, begin
 
@@ -43,7 +36,7 @@ class HeadSession:
     """Tracks one head through frames that are handed over in pieces."""
 
     def __init__(
-        self, rig: CameraRig, options: HeadOptions | None = None, points: Float[np.ndarray, "K 2"] | None = None
+        self, rig: CameraRig, options: HeadConfig | None = None, points: Float[np.ndarray, "K 2"] | None = None
     ) -> None:
         """A session before its first frame.
 
@@ -57,7 +50,7 @@ class HeadSession:
             ImportError: if the detector of the options is not installed.
         """
         check_points(points)
-        self._following = Following(_HeadTracker(rig, options or HeadOptions(), points))
+        self._following = Following(_HeadTracker(rig, options or HeadConfig(), points))
 
     @property
     def events(self) -> list[tuple[int, str]]:
@@ -103,7 +96,7 @@ def track(
     images: UInt8[np.ndarray, "b C rows cols"],
     times_s: Float[np.ndarray, " b"],
     rig: CameraRig,
-    options: HeadOptions | None = None,
+    options: HeadConfig | None = None,
     points: Float[np.ndarray, "K 2"] | None = None,
 ) -> HeadTrack:
     """The head in images in memory; `HeadSession` takes them in pieces.
@@ -137,7 +130,7 @@ def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:
 class _HeadTracker:
     """What `Following` asks of a tracker."""
 
-    def __init__(self, rig: CameraRig, options: HeadOptions, points: Float[np.ndarray, "K 2"] | None) -> None:
+    def __init__(self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
         self._options, self._points = options, points
         self._compiled, self._diffusion = compiled(options), first_diffusion(options)

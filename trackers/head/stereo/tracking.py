@@ -18,6 +18,7 @@ from jaxfilters.models.face.shape_model import FaceModel, rigid
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import Estimate, around_mode
 from jaxfilters.trackers.head.common.recent import nothing_changed
 from jaxfilters.trackers.head.common.search import Searches, at, gathered, score_at
@@ -31,7 +32,6 @@ from jaxfilters.trackers.head.common.state import (
     POSE,
     RIGID,
     UNITS,
-    HeadOptions,
     HeadState,
     HeadTrack,
     Registered,
@@ -63,7 +63,7 @@ def begin(
     images: Num[Array, "C rows cols"],
     time: Float[Array, ""],
     rig: CameraRig,
-    options: HeadOptions,
+    options: HeadConfig,
     diffusion: DiffusionFit | None = None,
 ) -> HeadState:
     """State at registration.
@@ -114,7 +114,7 @@ def advance(
     images: Num[Array, "b C rows cols"],
     times: Float[Array, " b"],
     is_frame: Bool[Array, " b"],
-    options: HeadOptions,
+    options: HeadConfig,
 ) -> tuple[HeadState, HeadTrack]:
     """State and track after `b` frames; those that are none leave the state alone, and their rows mean nothing."""
 
@@ -130,7 +130,7 @@ def advance(
 
 @partial(jax.jit, static_argnames="options")  # traced once for its shapes and its program
 def _step(
-    rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadOptions
+    rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadConfig
 ) -> tuple[HeadState, HeadTrack]:
     way = VARIANTS[options.mode]
     images = images.astype(state.belief.mean.dtype)
@@ -219,7 +219,7 @@ def _learnt(
     missed: Array,
     images: Array,
     rig: CameraRig,
-    options: HeadOptions,
+    options: HeadConfig,
 ) -> HeadState:
     """The state after a frame, but for what counts frames."""
     found = ~missed

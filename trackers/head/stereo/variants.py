@@ -18,10 +18,11 @@ from jaxfilters.models.face.shape_model import FaceModel, shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common import learning
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import Estimate, around_mode, refined
 from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import Searches, gathered
-from jaxfilters.trackers.head.common.state import PATIENCE, POSE, HeadOptions, HeadState
+from jaxfilters.trackers.head.common.state import PATIENCE, POSE, HeadState
 
 Templates = tuple[Array, Array]
 """(C, K, T, T) each: of the registered face, and of the face as it looked last."""
@@ -89,7 +90,7 @@ def _refined(
     rig: CameraRig,
     moved: Array,
     steps: Array,
-    options: HeadOptions,
+    options: HeadConfig,
 ) -> tuple[Estimate, AdaptiveDiffusionState]:
     """The fit; particles, velocity and diffusion follow it."""
     estimate = refined(search, state, model, images, rig, moved)
@@ -110,7 +111,7 @@ def _around_mode(
     rig: CameraRig,
     moved: Array,
     steps: Array,
-    options: HeadOptions,
+    options: HeadConfig,
 ) -> tuple[Estimate, AdaptiveDiffusionState]:
     """What the search itself has made."""
     del images, rig, moved, steps, options
@@ -134,4 +135,4 @@ VARIANTS = {
         _flat_templates, _layered_search, _around_mode, _recalculated, 1.0, learning.without_weighted_motion, False
     ),
 }
-"""By `HeadOptions.mode`."""
+"""By `HeadConfig.mode`."""

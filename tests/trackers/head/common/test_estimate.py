@@ -9,9 +9,10 @@ from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.head.common import estimate as module
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import MODEL_VARIANCE, RESIDUAL_SCALE, around_mode
 from jaxfilters.trackers.head.common.search import gathered
-from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS, HeadOptions
+from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS
 from jaxfilters.trackers.head.stereo.registration import register
 from jaxfilters.trackers.head.stereo.tracking import begin
 
@@ -30,7 +31,7 @@ class Face:
         self.images, self.rig = jnp.asarray(images, float), self.video.rig
         model, pose, _ = register(images[0], self.video.uv[0, 0].astype(float), self.rig, num_modes=NUM_MODES)
         self.state = begin(
-            jax.random.key(0), model, pose, images[0], jnp.zeros(()), self.rig, options=HeadOptions(num_particles=50)
+            jax.random.key(0), model, pose, images[0], jnp.zeros(()), self.rig, options=HeadConfig(num_particles=50)
         )
 
     def refined(self, frame, off=0.0, images=None):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.configuration import settings_of
 from jaxfilters.trackers.head.common import finders as module
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.detect import STABLE_FRAMES
 from jaxfilters.trackers.head.common.finders import FINDERS, MOST_MOVED_PX, CascadeFinder, MeshFinder
-from jaxfilters.trackers.head.common.state import CHOICES
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ IMAGE = np.zeros((480, 640), np.uint8)
 
 
 def test_every_choice_has_a_finder():
-    assert tuple(FINDERS) == CHOICES["detector"]
+    assert tuple(FINDERS) == settings_of(HeadConfig)["detector"].choices
 
 
 def test_the_cascades_wait_for_a_face_that_holds_still_and_complete_it(draw_face):

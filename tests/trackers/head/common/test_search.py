@@ -14,6 +14,7 @@ from jaxfilters.models.face.shape_model import rigid
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.head.common import search as module
+from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.search import (
     HIGH,
     KAPPA,
@@ -26,11 +27,11 @@ from jaxfilters.trackers.head.common.search import (
     searches,
 )
 from jaxfilters.trackers.head.common.search import start as start_search
-from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS, HeadOptions, compiled
+from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, UNITS
 from jaxfilters.trackers.head.stereo.registration import register
 
 N = 300
-OPTIONS = HeadOptions(num_particles=N)
+OPTIONS = HeadConfig(num_particles=N)
 likelihood = jax.jit(lambda likelihood, particles, images: likelihood(particles, images))
 score_at = jax.jit(module.score_at)
 step = jax.jit(lambda filter, key, state, tau: predict(filter, key, state, tau))
@@ -170,7 +171,7 @@ def test_particles_spread_as_fast_as_the_head_goes(face):
 
 @pytest.mark.parametrize(("fixed", "expected"), [(5.0, 5.0), (1.0, 1.0), (100.0, None)])
 def test_a_fixed_diffusion_does_not_care_for_speed(face, fixed, expected):
-    options = HeadOptions(num_particles=N, diffusion="fixed", fixed_diffusion=fixed)
+    options = HeadConfig(num_particles=N, diffusion="fixed", fixed_diffusion=fixed)
     filter = at(searches(face.rig, options).rigid, face.rigid, face.rigid.templates, jnp.zeros(NUM_MODES))
     for speed in (0.0, 7.0):
         state = start_search(face.x, options)._replace(velocity=jnp.asarray(speed * UNITS, float))
@@ -180,10 +181,10 @@ def test_a_fixed_diffusion_does_not_care_for_speed(face, fixed, expected):
 
 def test_options_that_differ_in_numbers_share_a_program():
     """The diffusion is a leaf of filters and state, not a constant of what is compiled."""
-    fixed = [HeadOptions(diffusion="fixed", fixed_diffusion=value, seed=i) for i, value in enumerate((1.0, 5.0))]
-    assert compiled(fixed[0]) == compiled(fixed[1]) == compiled(HeadOptions())
-    assert compiled(HeadOptions(diffusion="online")) != compiled(HeadOptions())
-    assert compiled(HeadOptions(mode="paper")) != compiled(HeadOptions())
+    fixed = [HeadConfig(diffusion="fixed", fixed_diffusion=value, seed=i) for i, value in enumerate((1.0, 5.0))]
+    assert compiled(fixed[0]) == compiled(fixed[1]) == compiled(HeadConfig())
+    assert compiled(HeadConfig(diffusion="online")) != compiled(HeadConfig())
+    assert compiled(HeadConfig(mode="paper")) != compiled(HeadConfig())
     one, two = (jax.tree.structure(first_diffusion(options)) for options in fixed)
     assert one == two
 

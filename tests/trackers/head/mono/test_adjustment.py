@@ -14,13 +14,14 @@ from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.face.shape_model import shape as shape_of_model
 from jaxfilters.trackers.head.mono.adjustment import Frame, adjusted, choose, frame_of, informed, uncertainty
+from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
 from jaxfilters.trackers.head.mono.start import Start, begin, detected
-from jaxfilters.trackers.head.mono.state import PUBLISHED, REACH, MonoOptions, Window
+from jaxfilters.trackers.head.mono.state import REACH, Window, prior_of
 
 pytestmark = pytest.mark.system
 
 NUM = 5
-USUAL = MonoOptions(num_particles=20)
+USUAL = MonoConfig(num_particles=20)
 PAPER = replace(PUBLISHED, num_particles=20)
 LANDMARK_PX = 0.5
 
@@ -56,7 +57,7 @@ def window_of(rig, face, seen, options):
     ages = jnp.array([9, 1, 2, 4, 3], jnp.int32)
     empty = jnp.zeros((NUM, size, size)), jnp.zeros((NUM, size))
     return jax.jit(informed)(
-        face, rig, Window(views, true.poses, true.expressions, ages, *empty), true.person, options.prior
+        face, rig, Window(views, true.poses, true.expressions, ages, *empty), true.person, prior_of(options)
     )
 
 
@@ -75,7 +76,16 @@ def state_of(rig, face, seen, options):
     start = Start(bundle, Adjustment(*jnp.zeros(3)), views.uv)
     images = jnp.asarray(np.random.default_rng(1).uniform(0, 255, (2, 480, 640)), jnp.float32)
     return begin(
-        jax.random.key(0), face, rig, start, views, jnp.zeros((), int), images, jnp.zeros(()), options, options.prior
+        jax.random.key(0),
+        face,
+        rig,
+        start,
+        views,
+        jnp.zeros((), int),
+        images,
+        jnp.zeros(()),
+        options,
+        prior_of(options),
     )
 
 
@@ -87,7 +97,7 @@ def new_frame(rig, face, state, seen, options):
     view = detected(projected(face, rig, now), LANDMARK_PX)
     believed = now.poses[0] + jnp.array([0.5, 0.5, 3, 0.01, 0.01, -0.01])
     x = jnp.concatenate([believed, state.modes.coefficients(face, now.expressions[0])])
-    return jax.jit(frame_of)(face, rig, view, state.person, x, state.modes, options.prior)
+    return jax.jit(frame_of)(face, rig, view, state.person, x, state.modes, prior_of(options))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +140,7 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     # The frames tell 0.3, 0.9, 0.5, 1 and 0.8 of what they do.
     window = window._replace(information=window.information * jnp.array([0.3, 0.9, 0.5, 1.0, 0.8])[:, None, None])
     new = window.information[3]
-    place, does = choose(face, window, options.prior, mean_person(face), told_by(window, new), options)
+    place, does = choose(face, window, prior_of(options), mean_person(face), told_by(window, new), options)
     expected = gains(window, new, options, face)
     first = 0 if options.is_published else 1
     assert int(place) == first + int(np.argmax(expected[first:]))
@@ -140,7 +150,9 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
 
 def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
     window = window_of(rig, face, seen, USUAL)
-    _, does = choose(face, window, USUAL.prior, mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL)
+    _, does = choose(
+        face, window, prior_of(USUAL), mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL
+    )
     assert not bool(does)
 
 
@@ -152,7 +164,7 @@ def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landm
     # The first frame faces the middle of all: to let it go gains most.
     poses = window.poses.at[0, 4:].set(jnp.mean(window.poses[1:, 4:], axis=0) + jnp.array([0.1, -0.06]))
     window = window._replace(poses=poses)
-    place, does = choose(face, window, options.prior, mean_person(face), frame, options)
+    place, does = choose(face, window, prior_of(options), mean_person(face), frame, options)
     spreads = []
     for i in range(NUM):
         angles = np.asarray(poses[:, 4:], float)
@@ -169,7 +181,7 @@ def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
     options = replace(USUAL, landmarks=landmarks, selection="latest")
     window = window_of(rig, face, seen, options)
     place, does = choose(
-        face, window, options.prior, mean_person(face), told_by(window, window.information[3]), options
+        face, window, prior_of(options), mean_person(face), told_by(window, window.information[3]), options
     )
     assert int(place) == oldest
     assert bool(does)
@@ -189,9 +201,9 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     x = jnp.concatenate([true.poses[2], jnp.zeros(face.num_expressions)])
     state = state_of(rig, face, seen, USUAL)
     x = x.at[6:].set(state.modes.coefficients(face, true.expressions[2]))
-    frame = jax.jit(frame_of)(face, rig, alone, true.person, x, state.modes, USUAL.prior)
+    frame = jax.jit(frame_of)(face, rig, alone, true.person, x, state.modes, prior_of(USUAL))
     response = frame.about_person.response
-    found = np.asarray(jax.jit(uncertainty)(face, window, USUAL.prior, mean_person(face), response), float)
+    found = np.asarray(jax.jit(uncertainty)(face, window, prior_of(USUAL), mean_person(face), response), float)
 
     units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std)])
     root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T

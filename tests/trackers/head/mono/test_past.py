@@ -14,12 +14,13 @@ from jaxfilters.models.face.remembered import hypotheses, remember
 from jaxfilters.models.face.square_root_prior import joined
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head.mono.adjustment import informed
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame
-from jaxfilters.trackers.head.mono.state import MonoOptions, Window
+from jaxfilters.trackers.head.mono.state import Window, prior_of
 
 NUM, KEPT = 8, 5
 REACH = Reach(np.array([60.0, 60, 100, 0.5, 0.5, 0.5]), 4.0, 4.0, 4.0)
-OPTIONS = MonoOptions(offset_std=0.7, past="marginalised")
+OPTIONS = MonoConfig(offset_std=0.7, past="marginalised")
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +62,11 @@ def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     """
     unknown, known, views, truth = scene
     face = unknown if who == "unknown" else known
-    prior = OPTIONS.prior
+    prior = prior_of(OPTIONS)
     together = best(face, rig, views, truth, prior)
     window = window_of(face, rig, views, together, prior)
     left = partial(marginalize_frame, unknown, face, window, together.person)
-    gone = [left(jnp.asarray(i), OPTIONS.prior) for i in range(KEPT, NUM)]
+    gone = [left(jnp.asarray(i), prior_of(OPTIONS)) for i in range(KEPT, NUM)]
     past = about_face(joined(joined(*gone[:2]), gone[2]), unknown, face)
     few = jax.tree.map(lambda leaf: leaf[:KEPT], views)
     start = together._replace(poses=together.poses[:KEPT], expressions=together.expressions[:KEPT])
@@ -84,7 +85,7 @@ def test_a_past_is_about_the_same_faces_whoever_it_is_told_to(x64, rig, scene):
     """Differences of its energy, for two faces written once about the unknown and once about the other."""
     unknown, known, views, truth = scene
     window = window_of(unknown, rig, views, truth, Prior(1.0, 0.7))
-    past = marginalize_frame(unknown, unknown, window, truth.person, jnp.asarray(2), OPTIONS.prior)
+    past = marginalize_frame(unknown, unknown, window, truth.person, jnp.asarray(2), prior_of(OPTIONS))
     other = about_face(past, unknown, known)
     rng = np.random.default_rng(1)
     about_stranger = rng.normal(0, 0.3, (2, 40))

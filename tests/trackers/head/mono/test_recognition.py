@@ -9,9 +9,9 @@ from jaxfilters.models.face.multilinear import learn
 from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.synthetic.face import make_identity
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
+from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
 from jaxfilters.trackers.head.mono.recognition import people, recognised
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
 
 START, IDENTITIES = 17, 15
 
@@ -99,7 +99,7 @@ def test_frames_of_a_camera_need_not_wait_for_a_face_that_comes_back(rig, face, 
     """What asks whether it is the same one is compiled by then."""
     made, images = talking
     recognised.clear_cache()
-    session = MonoSession(rig, face, MonoOptions(live=True), detections=detected)
+    session = MonoSession(rig, face, MonoConfig(live=True), detections=detected)
     process(session, images[:32], made.times[:32])
     tracker, state = session._tracker, session._following.state
     tracker._ready.result()

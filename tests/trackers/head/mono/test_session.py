@@ -11,10 +11,11 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, INITIALISING, LOST, PATIENCE
+from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
 from jaxfilters.trackers.head.mono.estimate import UNMODELLED_MM
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.start import initialise
-from jaxfilters.trackers.head.mono.state import PUBLISHED, MonoOptions
+from jaxfilters.trackers.head.mono.state import prior_of
 from jaxfilters.trackers.io import checkpoint
 
 DEGREES = np.array([1.0, 1, 1, *np.rad2deg(np.ones(3))])
@@ -153,7 +154,7 @@ def test_a_patch_over_nose_and_mouth_does_not_drag_the_head_along(rig, face, tal
 def test_a_known_distance_of_the_eyes_sets_the_scale(rig, face, detected):
     """The same landmarks with the eyes said to be 5 % farther apart: a face so much larger and farther away."""
     points = jnp.asarray(detected.points, float)
-    starts = [initialise(face, rig, points, MonoOptions(eyes_apart_mm=apart).prior) for apart in (60.0, 63.0)]
+    starts = [initialise(face, rig, points, prior_of(MonoConfig(eyes_apart_mm=apart))) for apart in (60.0, 63.0)]
     depths = [np.asarray(start.bundle.poses[:, 2]) for start in starts]
     assert np.median(depths[1] / depths[0]) == pytest.approx(1.05, abs=0.015)
     for start, apart in zip(starts, (60.0, 63.0), strict=True):
@@ -232,4 +233,4 @@ def test_wrong_arguments_are_named(rig, face):
 )
 def test_options_are_checked(wrong, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(MonoOptions(), **wrong)
+        dataclasses.replace(MonoConfig(), **wrong)

@@ -8,8 +8,9 @@ import pytest
 from jaxfilters.models.face.misplacement import misplacement
 from jaxfilters.models.face.person_prior import Person, posed_shape
 from jaxfilters.models.face.rig import project_shape
+from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.start import initialise
-from jaxfilters.trackers.head.mono.state import MonoOptions
+from jaxfilters.trackers.head.mono.state import prior_of
 from jaxfilters.trackers.io.detector_errors import default_detector_errors
 
 PEOPLE, FRAMES, NOISE_PX = 12, 5, 0.5
@@ -24,7 +25,7 @@ def test_what_a_detector_misplaces_does_not_turn_the_head(rig, face):
     The mean over twelve people of a pitch that differs by three degrees between them has a standard error below one.
     """
     errors, rng = default_detector_errors()["cascades"], np.random.default_rng(0)
-    prior = MonoOptions().prior
+    prior = prior_of(MonoConfig())
     known = prior._replace(misplaced=misplacement(errors.mean, errors.covariance, prior.offset_std))
     root = np.linalg.cholesky(np.asarray(face.identity_covariance, float) + 1e-9 * np.eye(face.num_identities))
     own = np.linalg.cholesky(errors.covariance + 1e-6 * np.eye(30))

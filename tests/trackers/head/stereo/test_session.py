@@ -11,8 +11,9 @@ from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic.face_sequence import sequence
 from jaxfilters.trackers.head.common import following, mesh
+from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, Detection
-from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST, NUM_MODES, RIGID, HeadOptions
+from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST, NUM_MODES, RIGID
 from jaxfilters.trackers.head.stereo import session as module
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.head.stereo.tracking import PATIENCE
@@ -243,7 +244,7 @@ def test_a_track_that_the_detector_contradicts_is_given_up(drawn, monkeypatch):
 def test_a_live_session_follows_and_registers_anew_beside_the_frames(drawn):
     """Frame by frame: lost behind noise, found elsewhere by a search whose answer comes some frames later."""
     start, points = drawn(4)
-    session = HeadSession(nominal(), HeadOptions(live=True), points=points)
+    session = HeadSession(nominal(), HeadConfig(live=True), points=points)
     rows = [session.process(start[i : i + 1], times(1, i)) for i in range(4)]
     assert [row.status[0] for row in rows] == [INITIALISING] + [RIGID] * 3
     np.testing.assert_allclose(rows[-1].image_points[0, 0, :4].mean(axis=0), MIDDLE, atol=1)
@@ -269,7 +270,7 @@ def test_a_detector_that_is_not_installed_is_refused(monkeypatch):
 
     monkeypatch.setattr(mesh, "import_module", missing)
     with pytest.raises(ImportError, match=r"mediapipe==0\.10\.14"):
-        HeadSession(nominal(), HeadOptions(detector="mediapipe"))
+        HeadSession(nominal(), HeadConfig(detector="mediapipe"))
 
 
 @pytest.mark.system
@@ -283,7 +284,7 @@ def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
 
     monkeypatch.setattr(module, "begin", begin)
     images, _ = drawn(1)
-    session = HeadSession(nominal(), HeadOptions(live=True, chunk=1))
+    session = HeadSession(nominal(), HeadConfig(live=True, chunk=1))
     for i in range(1000):
         # Frames differ by one grey level in a corner, which tells them apart.
         images[0, 1, 0, 0] = i % 256
@@ -322,9 +323,9 @@ def test_images_that_do_not_fit_the_rig_are_refused():
         ({"chunk": 0}, "chunk must be at least 1"),
         ({"fixed_diffusion": 0.0}, "fixed_diffusion must be positive"),
         ({"fixed_diffusion": float("nan")}, "fixed_diffusion must be positive"),
-        ({"rigid_frames": -1}, "rigid_frames must be 0 or more"),
+        ({"rigid_frames": -1}, "rigid_frames must be at least 0"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
-        HeadOptions(**options)
+        HeadConfig(**options)

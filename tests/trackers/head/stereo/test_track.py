@@ -8,16 +8,17 @@ import pytest
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
+from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
-from jaxfilters.trackers.head.common.state import LOST, NUM_MODES, RIGID, UNITS, HeadOptions, compiled
+from jaxfilters.trackers.head.common.state import LOST, NUM_MODES, RIGID, UNITS
 from jaxfilters.trackers.head.stereo import tracking as module
 from jaxfilters.trackers.head.stereo.registration import register
 
 pytestmark = pytest.mark.optimised
 
 CHUNK = 8
-MODERN, PAPER = HeadOptions(), HeadOptions(mode="paper")
-FIXED = HeadOptions(mode="paper", diffusion="fixed", fixed_diffusion=1.0)
+MODERN, PAPER = HeadConfig(), HeadConfig(mode="paper")
+FIXED = HeadConfig(mode="paper", diffusion="fixed", fixed_diffusion=1.0)
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Published errors of the adaptive tracker, millimetres and degrees (P, tables 3 and 4)."""
 
