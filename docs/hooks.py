@@ -1,9 +1,10 @@
-"""What the site does beside Markdown: pages from the repository's root, and formulas as MathML, without scripts."""
+"""What the site does beside Markdown: pages from the repository's root, notebooks, and formulas as MathML."""
 
 import re
 from pathlib import Path
 from typing import Any
 
+import jupytext
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files, InclusionLevel
 
@@ -15,7 +16,7 @@ _LINK = re.compile(r"\]\((?:\.\./)*\.\./([A-Z]+\.md|jaxfilters/__init__\.pyi)(#[
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that lie beside `docs/`."""
+    """Add the pages that lie beside `docs/`, and each script of the gallery as a page and as a notebook."""
     for name, page in FROM_ROOT.items():
         text = (
             (ROOT / name).read_text().replace("](docs/", "](").replace("](jaxfilters/__init__.pyi", "](api/running.md")
@@ -27,6 +28,8 @@ def on_files(files: Files, config: Any) -> Files:
                 config, f"examples/{script.stem}.md", content=_page_of(script), inclusion=InclusionLevel.NOT_IN_NAV
             )
         )
+        notebook = jupytext.writes(jupytext.read(script), fmt="ipynb")
+        files.append(File.generated(config, f"examples/{script.stem}.ipynb", content=notebook))
     return files
 
 
@@ -40,15 +43,15 @@ def _page_of(script: Path) -> str:
         else:
             title = f"# {kind.strip()}\n" if kind.strip() else ""
             parts.append(f"```python\n{title}{body.strip()}\n```")
-    return "\n\n".join([*parts, f"![The picture that the script draws](images/{script.stem}.webp)\n"])
+    picture = f"![The picture that the script draws](images/{script.stem}.webp)"
+    return "\n\n".join([*parts, picture, f"[This page as a notebook]({script.stem}.ipynb)\n"])
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Let links out of `docs/` lead to the pages of the site that stand for them."""
     up = "../" * page.file.src_uri.count("/")
     pages = FROM_ROOT | {"README.md": "index.md", "jaxfilters/__init__.pyi": "api/running.md"}
-    if page.file.src_uri == "gallery.md":  # scripts are pages of the site
-        markdown = re.sub(r"\]\((examples/\w+)\.py\)", r"](\1.md)", markdown)
+    markdown = re.sub(r"\]\((examples/\w+)\.py\)", r"](\1.md)", markdown)  # scripts are pages of the site
     return _LINK.sub(lambda found: f"]({up}{pages[found[1]]}{found[2] or ''})", markdown)
 
 

@@ -164,6 +164,12 @@ def test_every_page_can_be_reached_from_the_index():
     assert not set(PAGES) - reached
 
 
+def test_every_page_is_in_the_navigation_of_the_site():
+    listed = re.findall(r"([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    from_the_root = {"changelog.md", "contributing.md"}
+    assert set(listed) - from_the_root == {str(page.relative_to(DOCS)) for page in PAGES}
+
+
 def test_the_reference_has_every_public_name_once():
     pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
     entries = re.findall(r"^::: (\S+)$", pages, re.MULTILINE)

@@ -55,6 +55,8 @@ class Task(NamedTuple):
     """Ascending."""
     quick: int
     """A size that any processor computes in a second."""
+    float64: bool = False
+    """Whether it is made, compiled and called in double precision."""
 
 
 def _depth(kind: str, seed: int, count: int) -> Work:
@@ -180,7 +182,9 @@ def tasks(seed: int) -> dict[str, Task]:
         "rao_blackwell_shared": Task(partial(_rao_blackwell, seed, shared=True), (1000, 100_000), 50),
         "tracks": Task(partial(_tracks, seed), (1000, 100_000), 20),
         "tracks_gradient": Task(partial(_tracks, seed, gradient=True), (1000, 100_000), 20),
-        "resampling": Task(partial(_resampling, seed), (10**6, 10**7), 1000),
+        "resampling": Task(partial(_resampling, seed), (10**6, 8 * 10**6), 1000),
+        # In float32, sums of more than 2**23 weights are not exact, and are refused.
+        "resampling_float64": Task(partial(_resampling, seed), (10**6, 10**7), 1000, float64=True),
         "in_turn": Task(partial(_in_time, seed, parallel=False), (100, 1000, 10_000, 100_000, 1_000_000), 50),
         "in_parallel": Task(partial(_in_time, seed, parallel=True), (100, 1000, 10_000, 100_000, 1_000_000), 50),
         "hidden_markov": Task(partial(_hidden_markov, seed), (1000, 10_000), 50),

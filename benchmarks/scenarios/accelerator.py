@@ -52,7 +52,8 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     del out
     found: dict[str, Metric] = {}
     for name, task in tasks(seed).items():
-        found |= measured(name, task, quick=quick)
+        with jax.enable_x64(task.float64):
+            found |= measured(name, task, quick=quick)
     return found
 
 

@@ -30,13 +30,13 @@ from jaxfilters.benchmarks.timing import Spent, spent, taking_turns
 from jaxfilters.filter import Filter, keep_info
 from jaxfilters.gaussian import arithmetic
 from jaxfilters.gaussian.belief import GaussianRoot
-from jaxfilters.gaussian.extended import extended_kalman
+from jaxfilters.gaussian.linear import kalman
 from jaxfilters.gaussian.parallel_in_time import LinearModel, parallel_kalman, parallel_rts
 from jaxfilters.gaussian.smoothing import filter_and_smooth
 from jaxfilters.particle.differentiable_resampling import transport
 from jaxfilters.particle.sharding import sharded
 
-LENGTHS, QUICK_LENGTHS = (100, 1000), (50,)
+LENGTHS, QUICK_LENGTHS = (100, 1000, 10_000, 100_000), (50,)
 ENSEMBLES, QUICK_ENSEMBLES = (100_000, 1_000_000), (2_000,)
 TRANSPORTED, QUICK_TRANSPORTED = (100, 200, 400, 800), (20,)
 ROUNDS, QUICK_ROUNDS = 9, 2
@@ -67,8 +67,7 @@ def in_time(seed: int, length: int, rounds: int) -> dict[str, Metric]:
     prior = GaussianRoot(jnp.zeros(STATES), jnp.eye(STATES))
     root_Q, root_R = 0.3 * jnp.eye(STATES), 0.5 * jnp.eye(READINGS)
     model = LinearModel(F, root_Q, H, root_R)
-    transition, observe = jax.tree_util.Partial(_moved, F), jax.tree_util.Partial(jnp.matmul, H)
-    filter = extended_kalman(prior, transition, root_Q, observe, root_R, arithmetic=arithmetic.square_root)
+    filter = kalman(prior, F, root_Q, H, root_R, arithmetic=arithmetic.square_root)
     key = jax.random.key(0)
     both = jax.jit(lambda ys: parallel_rts(parallel_kalman(prior, model, ys)[0], model).mean)
     calls: dict[str, Callable[[], Any]] = {
@@ -146,11 +145,6 @@ def _from_a_start(filter: Filter, readings: Float[Array, "t 3"]) -> Callable[[],
 
 def _log_evidences(prior, model, ys):
     return parallel_kalman(prior, model, ys)[1]
-
-
-def _moved(F, x, inputs):
-    del inputs
-    return F @ x
 
 
 def _milliseconds(times: list[Spent]) -> float:

@@ -1,0 +1,202 @@
+"""The simplest thing that follows what each of the six systems follows: no filter, no model of motion."""
+
+from collections.abc import Iterable, Sequence
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.models.hand.observation import crop
+from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
+from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, hand_center
+from jaxfilters.models.synthetic.articulated import ArticulatedSequence, paper_hand
+
+WINDOW = ((32, 32), 4)
+"""Rows and columns about a hand, and how many pixels apart."""
+PATCH = {"winSize": (15, 15), "maxLevel": 3}
+"""Of the optical flow of landmarks, pixels."""
+POINTS = 32
+"""Of a stroke that is compared."""
+GATE_M = 1.0
+DIFFERENCE, SMALLEST_BLOB = 30, 0.002
+"""Grey levels from the background, and share of the image of a blob that counts."""
+
+
+def registered_hands(
+    camera: Pinhole, frames: Float[np.ndarray, "t rows cols"], start: Float[np.ndarray, " 22"], geometry: HandGeometry
+) -> Float[np.ndarray, "t 21 3"]:
+    """Joints by registration of the hand to each depth image alone, from the pose of the frame before.
+
+    Args:
+        camera: Of the frames.
+        frames: Metres, NaN where there is background or no reading.
+        start: Pose from which the first frame is registered.
+        geometry: Of the hand.
+    """
+    wide = jnp.asarray(np.diag(np.r_[3 * [0.1], 3 * [0.5], (TANGENT_SIZE - 6) * [1.0]]), jnp.float32)
+
+    @jax.jit
+    def step(pose: Array, frame: Array) -> tuple[Array, Array]:
+        window, observed = crop(camera, jnp.where(jnp.isnan(frame), jnp.inf, frame), hand_center(pose), *WINDOW)
+        target = target_from_image(window, observed)
+        pose = register(window, target, geometry, pose, PosePrior(pose, wide), RegistrationConfig()).pose
+        return pose, forward_kinematics(pose, geometry).joints
+
+    pose, joints = jnp.asarray(start, jnp.float32), []
+    for frame in frames:
+        pose, found = step(pose, jnp.asarray(frame, jnp.float32))
+        joints.append(np.asarray(found))
+    return np.stack(joints)
+
+
+def reprojected_hand(sequence: ArticulatedSequence, num_states: int) -> Float[np.ndarray, "t n"]:
+    """States of an articulated hand by least squares of each frame's features, from the estimate of the frame before.
+
+    The belief at the start is a prior on everything in the first frame, and on lengths and palm in all of them; rates
+    (states from `num_states` on) are not estimated.
+    """
+    hand = paper_hand()
+    mean = np.asarray(sequence.initial_mean, float)
+    std = np.sqrt(np.maximum(np.diagonal(np.asarray(sequence.initial_covariance, float)), 1e-12))
+    noise = np.asarray(sequence.noise_std, float)
+
+    @jax.jit
+    def residuals(x: Array, y: Array, mask: Array) -> Array:
+        of_image = jnp.where(mask, hand.residual(jnp.where(mask, y, 0.0), hand.observe(x)) / noise, 0.0)
+        return jnp.concatenate([of_image, (x - mean)[:num_states] / jnp.maximum(std, 1e-3)[:num_states]])
+
+    jacobian = jax.jit(jax.jacfwd(residuals))
+    full = lambda x: jnp.concatenate([jnp.asarray(x), jnp.asarray(mean[num_states:])])
+    x, states = mean[:num_states], []
+    for y, mask in zip(np.asarray(sequence.features), np.asarray(sequence.masks), strict=True):
+        found = least_squares(
+            lambda x: np.asarray(residuals(full(x), y, mask), float),  # noqa: B023
+            x,
+            lambda x: np.asarray(jacobian(full(x), y, mask), float)[:, :num_states],  # noqa: B023
+            method="lm" if len(noise) >= num_states else "trf",
+            max_nfev=200,
+        )
+        x = found.x
+        states.append(np.r_[x, mean[num_states:]])
+    return np.stack(states)
+
+
+def followed_blobs(
+    images: Sequence[UInt8[np.ndarray, "rows cols 3"]], camera: FloorCamera
+) -> list[tuple[int, int, Float[np.ndarray, " 2"]]]:
+    """Frame, identity and place on the floor of blobs that differ from the median image.
+
+    The middle of the lower edge of a blob is projected back to the floor, and takes the identity of the nearest blob of
+    the frame before within a metre.
+    """
+    empty = np.median(np.stack(images), axis=0).astype(np.uint8)
+    kernel = np.ones((5, 5), np.uint8)
+    rows, last, next_identity = [], {}, 0
+    for index, image in enumerate(images):
+        mask = (cv2.absdiff(image, empty).max(axis=2) > DIFFERENCE).astype(np.uint8)
+        mask = cv2.morphologyEx(cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel, iterations=2)
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask)
+        boxes = stats[1:][stats[1:, cv2.CC_STAT_AREA] > SMALLEST_BLOB * mask.size]
+        feet = np.stack([boxes[:, 0] + boxes[:, 2] / 2, boxes[:, 1] + boxes[:, 3]], axis=-1).astype(np.float32)
+        places = np.asarray(camera.floor_points(jnp.asarray(feet.reshape(-1, 2)))[0], float)
+        here = {}
+        for place in places:
+            near = {who: np.linalg.norm(place - at) for who, at in last.items() if who not in here}
+            who = min(near, key=near.__getitem__, default=-1)
+            if who < 0 or near[who] > GATE_M:
+                who, next_identity = next_identity, next_identity + 1
+            here[who] = place
+            rows.append((index, who, place))
+        last = here
+    return rows
+
+
+def flowed_points(
+    images: Iterable[UInt8[np.ndarray, "rows cols"]], start: Float[np.ndarray, "K 2"]
+) -> Float[np.ndarray, "t K 2"]:
+    """Landmarks carried from image to image by optical flow, the first ones included."""
+    points, before, found = np.asarray(start, np.float32)[:, None], None, []
+    for image in images:
+        if before is not None:
+            points, _, _ = cv2.calcOpticalFlowPyrLK(before, image, points, None, **PATCH)
+        found.append(points[:, 0].astype(float))
+        before = image
+    return np.stack(found)
+
+
+def pose_by_pnp(shape: Float[np.ndarray, "K 3"], uv: Float[np.ndarray, "t K 2"], rig: CameraRig) -> np.ndarray:
+    """(t, 6) millimetres and radians of a rigid shape before one camera, by `solvePnP` from the frame before."""
+    (fx, fy), (cx, cy) = np.asarray(rig.focal[0], float), np.asarray(rig.center[0], float)
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    turn, place = np.zeros((3, 1)), np.array([[0.0], [0.0], [700.0]])
+    poses = []
+    for points in uv:
+        _, turn, place = cv2.solvePnP(shape, points, K, np.zeros(5), turn, place, useExtrinsicGuess=True)
+        poses.append(np.r_[place.ravel(), Rotation.from_rotvec(turn.ravel()).as_euler("ZYX")])
+    return np.stack(poses)
+
+
+def pose_by_triangulation(
+    shape: Float[np.ndarray, "K 3"], uv: Float[np.ndarray, "t 2 K 2"], projections: Float[np.ndarray, "2 3 4"]
+) -> np.ndarray:
+    """(t, 6) of a rigid shape before two cameras: points from both, then the rotation and translation of `shape`."""
+    poses = []
+    for left, right in uv:
+        homogeneous = cv2.triangulatePoints(*projections, left.T, right.T)
+        points = (homogeneous[:3] / homogeneous[3]).T
+        turn, _ = Rotation.align_vectors(points - points.mean(axis=0), shape - shape.mean(axis=0))
+        place = points.mean(axis=0) - turn.apply(shape.mean(axis=0))
+        poses.append(np.r_[place, turn.as_euler("ZYX")])
+    return np.stack(poses)
+
+
+def fingers_by_hull(mask: np.ndarray) -> int:
+    """How many fingers are out, by the gaps between them in the convex hull of the largest outline."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not contours:
+        return 0
+    outline = max(contours, key=cv2.contourArea)
+    hull = cv2.convexHull(outline, returnPoints=False)
+    defects = cv2.convexityDefects(outline, np.sort(hull, axis=0)[::-1]) if len(hull) > 3 else None
+    if defects is None:
+        return 0
+    first, last, deepest = (outline[defects[:, 0, i], 0].astype(float) for i in range(3))
+    a, b = first - deepest, last - deepest
+    cosine = np.sum(a * b, axis=1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-9)
+    gaps = int(np.sum((cosine > 0) & (defects[:, 0, 3] / 256 > 0.06 * np.sqrt(cv2.contourArea(outline)))))
+    return gaps + 1 if gaps else 1
+
+
+def nearest_by_warping(
+    known: Sequence[Float[np.ndarray, "_ 2"]], labels: Sequence[str], strokes: Sequence[Float[np.ndarray, "_ 2"]]
+) -> list[str]:
+    """Labels of the strokes that are nearest by dynamic time warping, size and place removed."""
+    alike = np.stack([_normalised(path) for path in known])
+    found = []
+    for stroke in strokes:
+        apart = np.linalg.norm(_normalised(stroke)[None, :, None] - alike[:, None], axis=-1)
+        total = np.full((len(alike), POINTS + 1, POINTS + 1), np.inf)
+        total[:, 0, 0] = 0.0
+        for i in range(POINTS):
+            for j in range(POINTS):
+                before = np.minimum(np.minimum(total[:, i, j], total[:, i, j + 1]), total[:, i + 1, j])
+                total[:, i + 1, j + 1] = apart[:, i, j] + before
+        found.append(labels[int(np.argmin(total[:, -1, -1]))])
+    return found
+
+
+def _normalised(path: np.ndarray) -> np.ndarray:
+    """`POINTS` points evenly along the path, about their centroid, with the larger extent 1."""
+    path = np.asarray(path, float)
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
+    even = np.linspace(0.0, along[-1], POINTS)
+    points = np.stack([np.interp(even, along, path[:, k]) for k in range(2)], axis=-1)
+    points = points - points.mean(axis=0)
+    return points / max(np.ptp(points, axis=0).max(), 1e-9)
