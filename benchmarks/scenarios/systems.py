@@ -116,9 +116,7 @@ def stereo_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         made = sequence(jax.random.key(head), "slow", 30 if quick else 300, head)
         errors[""].append(rmse(follow(made, {"": HeadConfig(learn=False)})[""]))
         images = [image for _, part in made.chunks() for image in part]
-        uv = np.stack(
-            [simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1
-        )
+        uv = np.stack([simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1)
         poses = simplest.pose_by_triangulation(np.asarray(made.shapes[0], float), uv, _projections(made.rig))
         errors["_simple"].append(_pose_rms(poses[1:], made.poses[1:]))
     return _pose_metrics("head_stereo", errors, HEAD_PAPER)

@@ -6,6 +6,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +15,7 @@ from jaxfilters.trackers.app.output_folder import check_free, reason
 from jaxfilters.trackers.app.progress import note
 from jaxfilters.trackers.batch.claims import Claim, Claims
 from jaxfilters.trackers.batch.manifest import Entry, read_manifest
+from jaxfilters.trackers.batch.over_ray import run_on_cluster
 from jaxfilters.trackers.batch.report import DONE, FAILED, Result, Results, aligned, error_in, report_of
 from jaxfilters.trackers.io.errors import InputError, OutputError
 
@@ -47,16 +50,17 @@ def batch(options: argparse.Namespace) -> str:
     """
     entries = read_manifest(options.manifest)
     try:
-        return _finish(Batch(entries, options))
+        run = Batch(entries, options)
+        return _finish(run, run.work if options.ray is None else partial(run_on_cluster, options))
     except OSError as error:
         if isinstance(error, OutputError):
             raise
         raise OutputError(f"cannot write into {options.out}: {reason(error)}.") from None
 
 
-def _finish(run: "Batch") -> str:
+def _finish(run: "Batch", work: Callable[[], None]) -> str:
     try:
-        run.work()
+        work()
     except KeyboardInterrupt as interrupt:
         results = run.results.write_report()
         count = sum(result.status == DONE for result in results.values())

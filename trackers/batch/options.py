@@ -39,3 +39,8 @@ def add_batch(commands: Any) -> None:
         help="end when no recording is left to start; otherwise wait for those of other processes, to take over",
     )
     parser.add_argument("--retry", action="store_true", help="track the recordings again that have failed")
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="run on the machines of a Ray cluster: 'auto', host:port, or 'local' (needs the extra ray)",
+    )
