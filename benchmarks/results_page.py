@@ -25,6 +25,29 @@ Times in seconds hold for the machine and the load of the run: these machines we
 
 ![Share of truths within two standard deviations, by system](results/coverage.webp)
 """
+_SYSTEMS = {
+    "hand_depth_joints_mm": ("hand in depth images", "joints", "registration alone"),
+    "articulated_angles_deg": ("articulated hand", "angles", "least squares of each frame"),
+    "articulated_lengths_px": ("articulated hand", "lengths", "least squares of each frame"),
+    "people_mota": ("people on a floor", "MOTA, higher is better", "blobs, projected back"),
+    "people_error_m": ("people on a floor", "places", "blobs, projected back"),
+    "head_stereo_z_mm": ("head before two cameras", "distance", "optical flow, triangulated"),
+    "head_stereo_yaw_deg": ("head before two cameras", "yaw", "optical flow, triangulated"),
+    "head_mono_z_mm": ("face before one camera", "distance", "optical flow and PnP with the true shape"),
+    "head_mono_yaw_deg": ("face before one camera", "yaw", "optical flow and PnP with the true shape"),
+    "fingertips_count": ("fingertips", "frames with the right number, higher is better", "convex hull"),
+    "symbols_right": ("symbols", "right, higher is better", "nearest by dynamic time warping"),
+}
+"""Of the metrics of `bench systems`: the system, the quantity, and the simplest thing beside it."""
+_OF_SYSTEMS = """## The six systems
+
+Each tracker on synthetic recordings whose truth is known, beside the simplest thing that follows the same, without a
+filter, and beside what its paper prints of data of its own: a comparison of size only. `jaxfilters bench systems` says
+how each was measured.
+
+| system | quantity | jaxfilters | simplest | which is | paper |
+|---|---|---:|---:|---|---:|
+"""
 
 
 def read_results(paths: Sequence[Path]) -> list[dict[str, Any]]:
@@ -50,6 +73,7 @@ def results_page(documents: Sequence[Mapping[str, Any]], descriptions: Mapping[s
         descriptions: What scenarios measure, by their names.
     """
     parts = [_INTRODUCTION]
+    parts += [_of_systems(document["metrics"]) for document in documents if document["scenario"] == "systems"]
     for document in documents:
         name = document["scenario"]
         described = f"{descriptions.get(name, '')}\n\n`jaxfilters bench {name}`"
@@ -59,6 +83,18 @@ def results_page(documents: Sequence[Mapping[str, Any]], descriptions: Mapping[s
             title, _, note = _GROUPS[index]
             parts.append(f"### {title}: {name}\n" + (f"\n{note}\n" if note else "") + f"\n{_table(dict(metrics))}")
     return "\n".join(parts)
+
+
+def _of_systems(metrics: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table at the beginning of the page, from the run of `bench systems`."""
+    rows = []
+    for name, (system, quantity, simplest) in _SYSTEMS.items():
+        values = [
+            f"{found['value']:.3g} {found['unit']}" if (found := metrics.get(f"{name}{suffix}")) else "-"
+            for suffix in ("", "_simple", "_paper")
+        ]
+        rows.append(f"| {system} | {quantity} | {values[0]} | {values[1]} | {simplest} | {values[2]} |\n")
+    return _OF_SYSTEMS + "".join(rows)
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.hand.observation import crop
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, hand_center
-from jaxfilters.models.synthetic.articulated import ArticulatedSequence, paper_hand
+from jaxfilters.models.synthetic.articulated import LAYOUT, ArticulatedSequence, paper_hand
 
 WINDOW = ((32, 32), 4)
 """Rows and columns about a hand, and how many pixels apart."""
@@ -56,35 +56,39 @@ def registered_hands(
     return np.stack(joints)
 
 
-def reprojected_hand(sequence: ArticulatedSequence, num_states: int) -> Float[np.ndarray, "t n"]:
+def reprojected_hand(sequence: ArticulatedSequence) -> Float[np.ndarray, "t n"]:
     """States of an articulated hand by least squares of each frame's features, from the estimate of the frame before.
 
-    The belief at the start is a prior on everything in the first frame, and on lengths and palm in all of them; rates
-    (states from `num_states` on) are not estimated.
+    The belief at the start is a prior on pose, lengths and palm in the first frame, and on lengths and palm in all
+    others; rates stay as believed.
     """
-    hand = paper_hand()
-    mean = np.asarray(sequence.initial_mean, float)
-    std = np.sqrt(np.maximum(np.diagonal(np.asarray(sequence.initial_covariance, float)), 1e-12))
+    hand, mean = paper_hand(), np.asarray(sequence.initial_mean, float)
     noise = np.asarray(sequence.noise_std, float)
+    std = np.sqrt(np.maximum(np.diagonal(np.asarray(sequence.initial_covariance, float)), 1e-6))
+    free = np.r_[LAYOUT.moving, LAYOUT.static]
+    constant = free >= LAYOUT.static.start
 
     @jax.jit
-    def residuals(x: Array, y: Array, mask: Array) -> Array:
-        of_image = jnp.where(mask, hand.residual(jnp.where(mask, y, 0.0), hand.observe(x)) / noise, 0.0)
-        return jnp.concatenate([of_image, (x - mean)[:num_states] / jnp.maximum(std, 1e-3)[:num_states]])
+    def residuals(x: Array, y: Array, mask: Array, believed: Array) -> Array:
+        state = jnp.asarray(mean).at[free].set(x)
+        off = jnp.where(mask, hand.residual(jnp.where(mask, y, 0.0), hand.observe(state)) / noise, 0.0)
+        return jnp.concatenate([off, believed * (x - mean[free]) / std[free]])
 
     jacobian = jax.jit(jax.jacfwd(residuals))
-    full = lambda x: jnp.concatenate([jnp.asarray(x), jnp.asarray(mean[num_states:])])
-    x, states = mean[:num_states], []
+    x, states, believed = mean[free], [], np.ones(len(free))
     for y, mask in zip(np.asarray(sequence.features), np.asarray(sequence.masks), strict=True):
+        of_frame = (y, mask, believed)
         found = least_squares(
-            lambda x: np.asarray(residuals(full(x), y, mask), float),  # noqa: B023
+            lambda x: np.asarray(residuals(x, *of_frame), float),  # noqa: B023
             x,
-            lambda x: np.asarray(jacobian(full(x), y, mask), float)[:, :num_states],  # noqa: B023
-            method="lm" if len(noise) >= num_states else "trf",
+            lambda x: np.asarray(jacobian(x, *of_frame), float),  # noqa: B023
+            method="lm",
             max_nfev=200,
         )
-        x = found.x
-        states.append(np.r_[x, mean[num_states:]])
+        x, believed = found.x, constant.astype(float)
+        state = mean.copy()
+        state[free] = x
+        states.append(state)
     return np.stack(states)
 
 

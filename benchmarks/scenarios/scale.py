@@ -3,7 +3,8 @@
 `sharded_*`: a step of the bootstrap filter of `bench filters` on one device and spread over two virtual ones, in a
 process of its own on two cores; wall times, of which the least counts: other work on the machine only adds.
 `in_time_*`: filter and smoother of a linear model of four states and two readings by `parallel_in_time`, as a ratio to
-one frame after the other with the same square roots; time of processors. `transport_ms_*`: one resampling by transport
+one frame after the other with the same square roots, and `_to_covariances` with covariances in place of roots; time of
+processors. `transport_ms_*`: one resampling by transport
 of particles of ten numbers, and `transport_gradient_ms_*` with its derivative.
 """
 
@@ -29,7 +30,7 @@ from jaxfilters.benchmarks.scenarios.gaussian import check_agreement
 from jaxfilters.benchmarks.timing import Spent, spent, taking_turns
 from jaxfilters.filter import Filter, keep_info
 from jaxfilters.gaussian import arithmetic
-from jaxfilters.gaussian.belief import GaussianRoot
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.linear import kalman
 from jaxfilters.gaussian.parallel_in_time import LinearModel, parallel_kalman, parallel_rts
 from jaxfilters.gaussian.smoothing import filter_and_smooth
@@ -70,11 +71,13 @@ def in_time(seed: int, length: int, rounds: int) -> dict[str, Metric]:
     filter = kalman(prior, F, root_Q, H, root_R, arithmetic=arithmetic.square_root)
     key = jax.random.key(0)
     both = jax.jit(lambda ys: parallel_rts(parallel_kalman(prior, model, ys)[0], model).mean)
+    in_turn = kalman(Gaussian(prior.mean, prior.root), F, root_Q @ root_Q.T, H, root_R @ root_R.T)
     calls: dict[str, Callable[[], Any]] = {
         "filter": lambda: run_filter(filter, key, ys, collect=keep_info)[1].log_evidence,
         "filter_parallel": jax.jit(partial(_log_evidences, prior, model, ys)),
         "smoother": lambda: filter_and_smooth(filter, key, ys)[0].mean,
         "smoother_parallel": partial(both, ys),
+        "smoother_covariances": lambda: filter_and_smooth(in_turn, key, ys)[0].mean,
     }
     values = {name: call() for name, call in calls.items()}
     check_agreement({name: np.sum(values[name]) for name in ("filter", "filter_parallel")})
@@ -83,6 +86,11 @@ def in_time(seed: int, length: int, rounds: int) -> dict[str, Metric]:
         raise RuntimeError(f"smoothed means in parallel and one after the other differ by {error:.2g}.")
     times = taking_turns(calls, rounds)
     found = {}
+    of_covariances = [
+        a.processor / b.processor
+        for a, b in zip(times["smoother_parallel"], times["smoother_covariances"], strict=True)
+    ]
+    found[f"in_time_smoother_to_covariances_t{length}"] = Metric(statistics.median(of_covariances), "", "lower")
     for name in ("filter", "smoother"):
         ratios = [a.processor / b.processor for a, b in zip(times[f"{name}_parallel"], times[name], strict=True)]
         found[f"in_time_{name}_ratio_t{length}"] = Metric(statistics.median(ratios), "", "lower")

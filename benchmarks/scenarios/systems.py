@@ -3,8 +3,8 @@
 Everything is synthetic, so that anybody can repeat it: the recordings that the commands make by themselves, other seeds
 of them, and rendered faces. `*_simple` is without a filter: registration alone (hand), least squares of each frame's
 features alone (articulated hand), blobs projected back to the floor (people), optical flow of the landmarks that the
-tracker starts with, triangulated (two cameras) or with `solvePnP` and the true shape of the face, which the tracker does
-not know (one camera), the convex hull of a bright hand (fingertips), the nearest neighbour by dynamic time warping
+tracker starts with, triangulated (two cameras) or with `solvePnP` and the true shape of the face, which no tracker has
+(one camera), the convex hull of a bright hand (fingertips), the nearest neighbour by dynamic time warping
 (symbols). `*_paper` is what the paper prints of data of its own, for a comparison of size only; the papers of the hand
 and of the articulated hand print no error.
 """
@@ -79,13 +79,12 @@ def articulated_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Root mean square errors of angles and lengths in the last frames of the paper's sequence."""
     angles: dict[str, list[float]] = {"": [], "_simple": []}
     lengths: dict[str, list[float]] = {"": [], "_simple": []}
-    moving = LAYOUT.size - LAYOUT.num_moving
     for one in range(seed, seed + (1 if quick else 10)):
         made = simulate_paper(jax.random.key(one))
         mean = articulated.track(articulated.synthetic_sequence(one)).mean
-        for name, states in (("", mean), ("_simple", simplest.reprojected_hand(made, moving))):
+        for name, states in (("", mean), ("_simple", simplest.reprojected_hand(made))):
             off = (np.asarray(states, float) - np.asarray(made.states, float))[-LAST:]
-            angles[name].append(_rms(np.rad2deg(off[:, LAYOUT.angles])))
+            angles[name].append(_rms((np.rad2deg(off[:, LAYOUT.angles]) + 180) % 360 - 180))
             lengths[name].append(_rms(off[:, LAYOUT.lengths]))
     found = {f"articulated_angles_deg{name}": _mean(values, "deg") for name, values in angles.items()}
     return found | {f"articulated_lengths_px{name}": _mean(values, "px") for name, values in lengths.items()}
