@@ -1,7 +1,8 @@
 """Log weights of an ensemble: normalisation, effective sample size, moments, quantiles, tempering.
 
-The ensemble axis is the last one of every leaf. Everywhere in this module a log weight of NaN counts as `-inf`,
-`+inf` as the largest finite number, and an ensemble in which no particle has any weight counts as evenly weighted.
+The ensemble axis is the last one of every leaf. Everywhere in this module a log weight of NaN counts as `-inf` (the log
+sum of `normalize` is NaN then, so that a log evidence shows it), `+inf` as the largest finite number, and an ensemble
+in which no particle has any weight counts as evenly weighted.
 Particles without weight contribute nothing, whatever their values are, NaN included. Every function raises a
 `ValueError` where `log_weights` is not a vector, and a `TypeError` where it does not hold floating-point numbers.
 
@@ -33,11 +34,12 @@ def uniform(num: int, dtype: DTypeLike = float) -> Float[Array, " n"]:
 def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return log weights that sum to one, and the logarithm of the sum of the given ones.
 
-    Where all are `-inf` the weights become equal and the log sum is `-inf`.
+    Where all are `-inf` the weights become equal and the log sum is `-inf`. Where one is NaN it gets no weight and the
+    log sum is NaN.
     """
     shifted, peak = _below_peak(log_weights)
     log_sum = jnp.log(jnp.sum(jnp.exp(shifted)))
-    return shifted - log_sum, peak + log_sum
+    return shifted - log_sum, jnp.where(jnp.any(jnp.isnan(log_weights)), jnp.nan, peak + log_sum)
 
 
 def relative(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -231,10 +231,13 @@ def log_likelihoods_of_ensemble(value: Any, count: int) -> Any:
 
 
 def check_log_weights(log_weights: Any) -> None:
-    """Require a vector of floating-point numbers."""
+    """Require a vector of floating-point numbers, none of them NaN where they are concrete."""
     if jnp.ndim(log_weights) != 1:
         raise ValueError(f"log_weights must have the shape (n,); got {jnp.shape(log_weights)}.")
     check_floating("log_weights", log_weights)
+    known = concrete(log_weights)
+    if known is not None and np.isnan(known).any():
+        raise ValueError(f"log_weights must not be NaN; {np.isnan(known).sum()} of {known.size} are.")
 
 
 def check_ancestors(ancestors: Any, count: int) -> None:

@@ -2,12 +2,14 @@
 
 Every scheme takes `(key, log_weights (n,))` and returns n int32 indices in [0, n). The expected number of copies of a
 particle is n times its normalised weight, but for `metropolis`, which approximates it. Log weights need not be
-normalised; NaN counts as `-inf`, and if no particle has any weight all are equally likely. Otherwise a particle without
-weight is never drawn (`metropolis` has exceptions). Every scheme raises a `ValueError` where `log_weights` is not a
-vector, and a `TypeError` where it does not hold floating-point numbers. `systematic`, `stratified`, `multinomial` and
-`residual` are those of A. Doucet and A. Johansen, "A tutorial on particle filtering and smoothing: fifteen years
-later", 2009, section 3.4; they and `ssp` return sorted indices, and draw another number than n of them where
-`num_samples` says so: on average `num_samples` times the normalised weight.
+normalised; if no particle has any weight all are equally likely. Otherwise a particle without weight is never drawn
+(`metropolis` has exceptions). Every scheme raises a `ValueError` where `log_weights` is not a vector or holds NaN, and
+a `TypeError` where it does not hold floating-point numbers. Under `jit` and `vmap`, where values are not known, NaN
+counts as `-inf`: indices cannot be NaN, and filters report it in their infos.
+
+`systematic`, `stratified`, `multinomial` and `residual` are those of A. Doucet and A. Johansen, "A tutorial on particle
+filtering and smoothing: fifteen years later", 2009, section 3.4; they and `ssp` return sorted indices, and draw another
+number than n of them where `num_samples` says so: on average `num_samples` times the normalised weight.
 
 `optimal` differs: it reduces a larger number of weighted particles to n different ones with weights of their own.
 
@@ -228,15 +230,15 @@ def optimal(key: Key, log_weights: Float[Array, " m"], num_survivors: int) -> Su
 
     Args:
         key: Random key.
-        log_weights: Log weights (m,), not necessarily normalised; NaN counts as `-inf`. If no particle has any weight,
-            none survives with any.
+        log_weights: Log weights (m,), not necessarily normalised. If no particle has any weight, none survives with
+            any.
         num_survivors: Number n of places, from 1 to m.
 
     Returns:
         The survivors, in n places.
 
     Raises:
-        ValueError: If `num_survivors` is not an integer from 1 to m, or `log_weights` no vector.
+        ValueError: If `num_survivors` is not an integer from 1 to m, or `log_weights` no vector or NaN.
         TypeError: If `log_weights` holds no floating-point numbers.
 
     Examples:

@@ -26,7 +26,7 @@ class ParticleInfo(NamedTuple):
     resampled: Bool[Array, ""]
     """Whether the prediction before this update began by resampling."""
     num_invalid: Int32[Array, ""]
-    """Number of particles whose log-likelihood was NaN or `+inf`; they were given weight zero."""
+    """Number of particles whose log-likelihood or log weight was NaN or `+inf`; they were given weight zero."""
 
 
 def resample(
@@ -90,7 +90,8 @@ def reweight(
     """Multiply the weights by the factors of an update, which are tempered first.
 
     A factor whose logarithm is NaN or `+inf` counts as zero and is reported. If no factor is left, the weights become
-    equal and the log evidence is `-inf`.
+    equal and the log evidence is `-inf`. A log weight before the update that is NaN is reported likewise, and the log
+    evidence is NaN.
 
     Args:
         log_weights: Log weights `(n,)` before the update.
@@ -105,7 +106,9 @@ def reweight(
     Raises:
         ValueError: If `temper` returns another shape than `(n,)`.
     """
-    invalid = jnp.isnan(log_factor) | jnp.isposinf(log_factor)
+    # A weight before the update that is NaN makes the sum so, and the log evidence, too.
+    product = log_weights + log_factor
+    invalid = jnp.isnan(product) | jnp.isposinf(product)
     usable = jnp.where(invalid, -jnp.inf, log_factor)
     tempered = temper(usable, log_weights)
     checks.check_shape("the result of temper", tempered, log_weights.shape, "that of its arguments")

@@ -230,6 +230,7 @@ PARTICLE = [
     Case("integer weights", lambda: jf.weights.normalize(jnp.arange(3)), ("log_weights",)),
     Case("square weights", lambda: jf.weights.linear(jnp.zeros((3, 3))), ("log_weights", "3")),
     Case("resampling, integers", lambda: jf.resampling.stratified(KEY, jnp.arange(3)), ("log_weights",)),
+    Case("resampling, NaN", lambda: jf.resampling.ssp(KEY, jnp.array([0.0, NAN])), ("log_weights", "NaN", "1 of 2")),
     Case("resampling, square", lambda: jf.resampling.systematic(KEY, jnp.zeros((3, 3))), ("log_weights", "3")),
     Case("soft share 1", lambda: jf.differentiable_resampling.soft(1.0), ("share", "1.0")),
     Case("transport 0", lambda: jf.differentiable_resampling.transport(0.0), ("regularization", "0.0")),

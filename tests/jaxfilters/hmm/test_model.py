@@ -106,6 +106,14 @@ def test_an_impossible_observation_leaves_the_online_filter_where_it_was():
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
+def test_a_log_likelihood_that_is_nan_shows_in_the_evidence_of_the_online_filter():
+    filter = hmm.online(hmm.from_probabilities(INITIAL, TRANSITION))
+    readings = jnp.zeros((3, len(INITIAL))).at[1, 0].set(jnp.nan)
+    _, (states, infos) = jaxfilters.run(filter, jax.random.key(0), readings)
+    np.testing.assert_array_equal(np.isnan(infos.log_evidence), [False, True, False])
+    assert np.all(np.isfinite(states.log_probabilities))
+
+
 def test_a_model_without_emission_says_so():
     with pytest.raises(ValueError, match="no emission"):
         hmm.from_probabilities(INITIAL, TRANSITION).log_likelihoods(jnp.zeros(3))

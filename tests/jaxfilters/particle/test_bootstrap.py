@@ -120,6 +120,17 @@ def test_nan_and_infinite_likelihoods_are_dropped_and_counted():
     assert not info.resampled
 
 
+def test_weights_that_are_nan_show_in_the_evidence_and_are_counted():
+    filter = make_filter()
+    state = filter.init(filter.params, jax.random.key(0))
+    state = state._replace(log_weights=state.log_weights.at[3].set(jnp.nan))
+    state, infos = run(filter, jax.random.key(1), jnp.array([0.0, 0.0]), state=state, collect=keep_info)
+    assert np.isnan(infos.log_evidence[0])
+    assert infos.num_invalid[0] > 0
+    assert np.isfinite(infos.log_evidence[1])
+    assert np.all(np.isfinite(state.log_weights))
+
+
 def test_when_nothing_explains_the_observation_weights_become_equal_and_evidence_says_so():
     state, infos = run(make_filter(), jax.random.key(0), jnp.array([0.0, 1e30, 0.0]), collect=keep_info)
     assert infos.log_evidence[1] == -jnp.inf

@@ -68,7 +68,7 @@ def test_few_particles_stay_as_they_are():
 
 def test_no_weight_and_nan_leave_nothing():
     for value in (-jnp.inf, jnp.nan):
-        assert (resampled(jnp.full(COUNT, value))[1] == -jnp.inf).all()
+        assert (jax.jit(resampled)(jnp.full(COUNT, value))[1] == -jnp.inf).all()
 
 
 def test_the_weights_keep_their_derivative():

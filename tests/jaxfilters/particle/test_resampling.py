@@ -154,7 +154,7 @@ def test_even_dead_and_undefined_ensembles(scheme, n):
         if scheme is not SCHEMES["multinomial"]:
             np.testing.assert_array_equal(ancestors, np.arange(n))
     for nothing in (-jnp.inf, jnp.nan):
-        dead = scheme(jax.random.key(0), jnp.full(n, nothing))
+        dead = jax.jit(scheme)(jax.random.key(0), jnp.full(n, nothing))
         np.testing.assert_array_equal(dead, scheme(jax.random.key(0), jnp.zeros(n)))
 
 
