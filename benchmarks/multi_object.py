@@ -52,6 +52,9 @@ class MultiObjectScores(NamedTuple):
     """Share of the truth that is found under the right identity, in percent."""
     id_switches: int
     """How often a person is matched with another identity than last time."""
+    transfers: int
+    """How often an identity is matched with another person than last time where that person has no other identity so
+    far: one who takes over the identity of another, which `id_switches` does not count."""
     false_positives: int
     """Estimates without a person."""
     misses: int
@@ -144,6 +147,7 @@ def evaluate(
         idp=100 * identified / len(estimate.frame) if len(estimate.frame) else float("nan"),
         idr=100 * identified / len(truth.frame),
         id_switches=switches,
+        transfers=_transfers(truth, estimate, matches),
         false_positives=false_positives,
         misses=misses,
         fragmentations=fragmentations,
@@ -222,6 +226,17 @@ def _identified(truth: FloorTracks, estimate: FloorTracks, gate_m: float) -> int
     for (person, identity), number in common.items():
         counts[who[person], name[identity]] = number
     return int(counts[linear_sum_assignment(counts, maximize=True)].sum())
+
+
+def _transfers(truth: FloorTracks, estimate: FloorTracks, matches: Matches) -> int:
+    """Changes of the person behind an identity that are no switch of that person's identity."""
+    last: dict[int, int] = {}
+    transfers = 0
+    for row, found, is_switch in zip(matches.truth, matches.estimate, matches.is_switch, strict=True):
+        who, name = int(truth.identity[row]), int(estimate.identity[found])
+        transfers += last.get(name, who) != who and not is_switch
+        last[name] = who
+    return transfers
 
 
 def _coverage(truth: FloorTracks, matches: Matches) -> tuple[np.ndarray, int]:

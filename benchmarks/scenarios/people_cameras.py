@@ -9,7 +9,9 @@ narrow views, another camera became the nearest of those that see a person whole
 
 Where JAXFILTERS_DATA names a folder with `pom_lab_2cam`, two real cameras follow, by their silhouettes. There is no
 truth for them: `pom_agreement` is the share of the people that a published method found (Fleuret et al. 2008, on a grid
-of 0.2 m) within 0.5 m of a person who is tracked.
+of 0.2 m) within 0.5 m of a person who is tracked. Where it has `pets09_s2l1_two_views` as well, `_two` are scores of
+two real cameras of a street together and `_one` those of the better one alone, and `_two_refit` and `_one_refit` the
+same with another calibration, each of which is off by some decimetres somewhere.
 """
 
 import sys
@@ -24,6 +26,7 @@ from jaxtyping import Bool
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, evaluate, floor_tracks
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios._pets_two import two_view_metrics
 from jaxfilters.benchmarks.scenarios._pom import pom_metrics
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import walkable
@@ -87,12 +90,18 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     rooms = [demo_room(one, cameras=NUM_CAMERAS, frames=frames) for one in range(seed, seed + len(found))]
     changes = [handovers(room, NARROW) for room in rooms]
     metrics["handovers"] = Metric(float(sum(changes)), "", "higher")
-    try:
-        folder = recording_folder("pom_lab_2cam")
-    except RecordingError as error:
-        sys.stderr.write(f"no real cameras: {error}\n")
-        return metrics
-    return metrics | pom_metrics(folder)
+    real = (
+        lambda: pom_metrics(recording_folder("pom_lab_2cam")),
+        lambda: two_view_metrics(
+            recording_folder("pets09_s2l1_two_views"), recording_folder("pets09_s2l1_view001"), quick=quick
+        ),
+    )
+    for measured in real:
+        try:
+            metrics |= measured()
+        except RecordingError as error:
+            sys.stderr.write(f"no real cameras: {error}\n")
+    return metrics
 
 
 def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTracks]]:

@@ -36,7 +36,7 @@ PRIME_EVERY = 20
 QUICK_FRAMES = 40
 IN_METRES = ("mean_error_m", "radial_error_m", "lateral_error_m", "radial_bias_m", "lateral_bias_m")
 """Biases are best at zero."""
-COUNTED = ("id_switches", "false_positives", "misses", "fragmentations")
+COUNTED = ("id_switches", "transfers", "false_positives", "misses", "fragmentations")
 
 
 class Followed(NamedTuple):

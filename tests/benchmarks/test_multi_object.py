@@ -202,3 +202,16 @@ def test_real_paths_with_one_exchange(data_dir):
     assert (scores.misses, scores.false_positives, scores.mean_error_m) == (0, 0, 0)
     assert scores.id_switches == 2
     assert 100 > scores.idf1 > 100 * (1 - np.isin(truth.identity, [9, 13]).mean())
+
+
+def test_an_identity_that_is_handed_to_another_person_is_a_transfer():
+    """Person 1 leaves while person 2 comes: identity 7 goes over unnoticed by switches. Later 2 takes identity 8."""
+    truth = tracks([(t, 1, 0.0, 0.0) for t in range(3)] + [(t, 2, 0.0, 0.0) for t in range(3, 9)])
+    estimate = tracks([(t, 7, 0.1, 0.0) for t in range(6)] + [(t, 8, 0.1, 0.0) for t in range(6, 9)])
+    scores = evaluate(truth, estimate)
+    assert (scores.id_switches, scores.transfers, scores.misses) == (1, 1, 0)
+    # An exchange of two people is two switches, and nothing more.
+    both = tracks([(t, who, 3.0 * who, 0.0) for t in range(6) for who in (1, 2)])
+    swapped = tracks([(t, who if t < 3 else 3 - who, 3.0 * who, 0.0) for t in range(6) for who in (1, 2)])
+    scores = evaluate(both, swapped)
+    assert (scores.id_switches, scores.transfers) == (2, 0)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from jaxfilters.trackers.background.difference import Difference
-from jaxfilters.trackers.background.gain import without_gain
+from jaxfilters.trackers.background.gain import in_one_light, without_gain
 from jaxfilters.trackers.background.temporal_median import temporal_median
 
 SHADOW_PROBABILITY = 0.3
@@ -16,6 +16,11 @@ SAMPLES = 25
 """Images of which a background is made: enough that a person may stand in each place in almost half of them."""
 DIFFERENCE = 30.0
 """Least difference from the background, of 255, at which foreground is as likely as not."""
+MOST_FOREGROUND = 0.6
+"""Share of an image: more than this is no longer the room that was estimated, but one in another light."""
+LOST_AFTER = 10
+"""Images in a row with so much foreground after which the room is estimated anew."""
+_EVERY_PX = 8
 
 
 class MedianBackground:
@@ -24,7 +29,8 @@ class MedianBackground:
     The background is the exact median of samples first. From then on it follows by steps of one level towards each
     image (McFarlane & Schofield 1995, approximate median), a tenth as often where there is foreground. A camera that
     was not primed starts with its first image and with probabilities near one half, and is sure after `SAMPLES`
-    samples. Every image is compared in the light of the background, by one factor a channel.
+    samples. Every image is compared in the light of the background, by one factor a channel. Where most of an image is
+    foreground for a while, as when half of the lamps go out, the camera settles anew.
     """
 
     def __init__(
@@ -57,6 +63,8 @@ class MedianBackground:
         self._learn_every, self._sample_every = learn_every, sample_every
         self._samples: list[np.ndarray] = []
         self._frames, self._sure = 0, 0.0
+        self._covered, self.restarts = 0, 0
+        """Images in a row that were mostly foreground, and how often the room was therefore estimated anew."""
 
     @property
     def image(self) -> np.ndarray | None:
@@ -79,6 +87,7 @@ class MedianBackground:
         image = self._in_same_light(image)
         probability = self.compare(image)
         self._frames += 1
+        self._watch(probability)
         if self._sure == 1 and self._learn_every and self._frames % self._learn_every == 0:
             is_turn_of_foreground = self._frames // self._learn_every % 10 == 0
             self._difference.follow(image, None if is_turn_of_foreground else probability, keep)
@@ -90,7 +99,7 @@ class MedianBackground:
         """As `Background.state`; empty before the first image."""
         if self.image is None:
             return {}
-        counts = np.array([self._frames, self._sure])
+        counts = np.array([self._frames, self._sure, self._covered, self.restarts])
         return {"background": self.image.copy(), "noise": self._difference.noise.copy(), "counts": counts}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -98,7 +107,8 @@ class MedianBackground:
         if not state:
             return
         self._difference.set_background(state["background"].copy(), state["noise"].copy())
-        self._frames, self._sure = int(state["counts"][0]), float(state["counts"][1])
+        frames, self._sure, covered, restarts = map(float, state["counts"])
+        self._frames, self._covered, self.restarts = int(frames), int(covered), int(restarts)
 
     def _in_same_light(self, image: np.ndarray) -> np.ndarray:
         """Exposure and lamps change within a frame, the background by a level in ten frames."""
@@ -106,6 +116,13 @@ class MedianBackground:
         if background is None or image.shape != background.shape or image.dtype != np.uint8:
             return image  # `compare` says what is wrong.
         return without_gain(image, background)
+
+    def _watch(self, probability: np.ndarray) -> None:
+        is_covered = np.mean(probability[::_EVERY_PX, ::_EVERY_PX] >= 0.5) > MOST_FOREGROUND
+        self._covered = self._covered + 1 if is_covered and self._sure == 1 else 0
+        if self._covered >= LOST_AFTER:
+            self._sure, self._samples, self._covered = 0.0, [], 0
+            self.restarts += 1
 
     def _settle(self, image: np.ndarray) -> None:
         """Samples are costly to combine: as often as it matters, when their number has doubled."""
@@ -119,6 +136,7 @@ class MedianBackground:
             self._samples = []
 
     def _learn_from(self, images: list[np.ndarray]) -> None:
+        images = in_one_light(images)
         background = temporal_median(images)
         deviations = temporal_median([_largest(cv2.absdiff(image, background)) for image in images])
         self._difference.set_background(background, self._difference.noise_of(deviations))

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from jaxfilters.trackers.io.images import check_num_pixels, images_in, read_imag
 from jaxfilters.trackers.io.input_files import check_rate, check_regular
 
 DEFAULT_FPS = 30.0
+_Item = TypeVar("_Item")
 _SLOWEST_FPS, _FASTEST_FPS = 1e-3, 1e6
 SILENT_S = 2.0
 """A live camera that delivers nothing for so long has stopped."""
@@ -66,6 +67,13 @@ def open_video(place: str, *, fps: float | None = None) -> VideoSource:
     return VideoFile(path, fps)
 
 
+def spread(items: Sequence[_Item], most: int) -> list[_Item]:
+    """At most so many of the items, from the first to the last of them at equal distances."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
 class VideoFile:
     """A video that OpenCV can decode."""
 
@@ -99,7 +107,7 @@ class VideoFile:
                 kept.append(image)
             if len(kept) > 2 * most:
                 every, kept = 2 * every, kept[::2]
-        return kept[:most]
+        return spread(kept, most)
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         capture, done = self._open(), 0
@@ -171,7 +179,7 @@ class ImageFolder:
         return found if len(found) == len(ends) and (np.diff(found) > 0).all() else None
 
     def sample(self, most: int) -> list[np.ndarray]:
-        return [read_image(file) for file in self._files[:: max(1, len(self._files) // most)]][:most]
+        return [read_image(file) for file in spread(self._files, most)]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         for i, file in enumerate(self._files):

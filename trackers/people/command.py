@@ -86,6 +86,7 @@ def _tracked(setup: Setup, options: argparse.Namespace, writer: TracksWriter) ->
         write_coco(options.out / "tracks_coco.json", setup.scene, setup.undistortions[0], tracks)
     write_plan(options.out / "plan.png", setup.scene, tracks)
     report = _report(setup, options, result, tracks, not is_live, time.perf_counter() - began)
+    report["trouble"] += session.trouble()
     write_report(options.out / "report.json", report)
     return _summary(report, options)
 

@@ -58,7 +58,10 @@ class Recorder:
                     self.unconfirmed.pop(slot, None)
                 self.unconfirmed.setdefault(slot, []).append(seen)
                 continue
-            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), seen]]
+            # Whoever comes back was perhaps followed anew, unconfirmed, before the old track had ended.
+            before = self.tracks.get(int(identity), [])
+            ended = before[-1].frame if before else -1
+            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), seen] if one.frame > ended]
         for identity, seen in added:
             self.tracks.setdefault(identity, []).append(seen)
         return added

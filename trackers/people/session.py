@@ -11,12 +11,19 @@ from numpy.typing import ArrayLike
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.background.choice import Background, background
+from jaxfilters.trackers.background.median import MedianBackground, evenly
+from jaxfilters.trackers.background.registration import Registration, intrinsics
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
+from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, start, step
 
 PRIMING_IMAGES = 40
 """Images from which the empty room is estimated before a recording is tracked."""
+REFERENCE_EVERY = 500
+"""Frames after which the corners of a camera that is registered are taken from its background again."""
+REPORTED_PX = 2.0
+"""Motion of a corner of the image from which on a camera is reported to have turned."""
 KEPT_BEYOND = 1.4
 """The background does not follow the image within a person's outline of this size."""
 
@@ -137,14 +144,23 @@ class PeopleSession:
         self._backgrounds: list[Background] = (
             [background(subtraction) for _ in scene.cameras] if isinstance(subtraction, str) else list(subtraction)
         )
+        # A detector sees the image as it is; only backgrounds need a camera that stands still.
+        self._registrations = (
+            [Registration(intrinsics(camera.P)) for camera in scene.cameras] if isinstance(subtraction, str) else []
+        )
         self._images = [np.zeros((*camera.shape, 3), np.uint8) for camera in scene.cameras]
         self._outlines: list[Outline] | None = None
         self._estimate: PeopleEstimate | None = None
 
     def prime(self, samples: Sequence[Sequence[np.ndarray]]) -> None:
         """Estimate each camera's background from images spread over its recording; none where it has no samples."""
-        for model, images in zip(self._backgrounds, samples, strict=True):
-            if images:
+        for camera, (model, images) in enumerate(zip(self._backgrounds, samples, strict=True)):
+            if images and self._registrations:
+                straight = self._registrations[camera].prime(evenly(images))
+                scene = self.tracks.scene
+                model.prime(emptied(scene.cameras[camera], np.asarray(scene.floor), straight))
+                self._renew_reference(camera)
+            elif images:
                 model.prime(images)
 
     def process(self, images: Sequence[np.ndarray | None], time_s: float) -> PeopleEstimate:
@@ -170,15 +186,40 @@ class PeopleSession:
         assert self._outlines is not None, "No images were processed yet."
         return self._outlines
 
+    @property
+    def camera_motion_px(self) -> list[float]:
+        """By how much each camera has turned away from its reference at most, at a corner of its image; pixels."""
+        return [one.most_px for one in self._registrations]
+
+    def trouble(self) -> list[str]:
+        """What happened to cameras and light, one line each, for a person; nothing of what needed no remedy."""
+        moved = [
+            f"camera {camera}: turned by up to {moved:.0f} pixels; its images were turned back to the first pose"
+            for camera, moved in enumerate(self.camera_motion_px)
+            if moved > REPORTED_PX
+        ]
+        lost = [
+            f"camera {camera}: the background was estimated anew {model.restarts} times, because most of the image had "
+            "changed; nobody is found there in the meantime"
+            for camera, model in enumerate(self._backgrounds)
+            if isinstance(model, MedianBackground) and model.restarts
+        ]
+        return moved + lost
+
     def state(self) -> dict[str, Any]:
         """What the next images need, but for the tracks: arrays by name."""
-        return self.tracks.state() | {"backgrounds": [model.state() for model in self._backgrounds]}
+        return self.tracks.state() | {
+            "backgrounds": [model.state() for model in self._backgrounds],
+            "registrations": [one.state() for one in self._registrations],
+        }
 
     def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
         """Continue from what `state` gave, with the tracks up to then."""
         self.tracks.restore(state, tracks)
         for model, saved in zip(self._backgrounds, state["backgrounds"], strict=True):
             model.restore(saved)
+        for registration, saved in zip(self._registrations, state["registrations"], strict=True):
+            registration.restore(saved)
         people = jax.device_get(self.tracks.people)
         self._outlines = _on_host(outlines(self.tracks.scene, people))
 
@@ -186,9 +227,21 @@ class PeopleSession:
         if image is None:
             last = self._images[camera]
             return CameraFrame(np.zeros(last.shape[:2], np.uint8), last, np.bool_(False))
-        self._images[camera] = image
-        probability = self._backgrounds[camera].apply(image, keep=self._occupied(camera))
+        if self._registrations and self.tracks.frames % REFERENCE_EVERY == REFERENCE_EVERY - 1:
+            self._renew_reference(camera)
+        image, blank = self._registrations[camera].straightened(image) if self._registrations else (image, None)
+        self._images[camera], keep = image, self._occupied(camera)
+        if blank is not None:
+            keep = blank if keep is None else keep | blank
+        probability = self._backgrounds[camera].apply(image, keep=keep)
+        if blank is not None:
+            probability = np.where(blank > 0, np.float32(0.5), probability)
         return CameraFrame(cv2.convertScaleAbs(probability, alpha=255.0), image, np.bool_(True))
+
+    def _renew_reference(self, camera: int) -> None:
+        empty = self._backgrounds[camera].state().get("background")
+        if empty is not None:
+            self._registrations[camera].refer_to(empty)
 
     def _occupied(self, camera: int) -> np.ndarray | None:
         """Non-zero where people stood after the last images, where the background must not follow."""

@@ -43,6 +43,19 @@ def test_a_video_gives_all_its_frames_with_their_times(tmp_path):
     assert len(source.sample(4)) == 4
 
 
+@pytest.mark.parametrize("claimed", [3, 7, 12])
+def test_samples_reach_the_end_whatever_number_of_frames_a_file_claims(tmp_path, claimed):
+    source = VideoFile(_video(tmp_path / "a.mp4"))
+    source.frames = claimed
+    sampled = source.sample(4)
+    frames = np.round([image.mean() / 20 for image in sampled])
+    assert len(frames) == 4
+    # A pan over 12 frames of growing brightness: from the first to one of the last three, without large gaps.
+    assert frames[0] == 0
+    assert frames[-1] >= 9
+    assert np.diff(frames).max() <= 5
+
+
 def test_a_video_that_is_cut_off_says_so(tmp_path):
     source = VideoFile(_video(tmp_path / "a.mp4"))
     source.frames = 20

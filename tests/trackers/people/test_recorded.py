@@ -8,7 +8,7 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed, spreads
-from jaxfilters.trackers.people.state import FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
+from jaxfilters.trackers.people.state import DORMANT, FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
 
 CONFIG = PeopleConfig(capacity=2)
 
@@ -38,6 +38,19 @@ def test_frames_before_the_confirmation_follow_with_the_identity():
         (5, 1, 2.0, "tentative"),
         (5, 2, 3.0, "tracked"),
     ]
+
+
+def test_a_person_who_comes_back_stands_once_in_each_frame():
+    """Slot 1 follows a person unconfirmed while the old track in slot 0 has not ended yet, and takes its identity."""
+    recorder = Recorder()
+    for i in range(3):
+        people, report = _frame(TRACKED, 5, 1.0)
+        people = people._replace(mode=np.array([TRACKED, TENTATIVE]), log_odds=np.array([1.0, i]))
+        recorder.add(i, 0.1 * i, people, report)
+    people, report = _frame(DORMANT, -1, 2.0)
+    added = recorder.add(3, 0.3, people._replace(mode=np.array([FREE, TRACKED]), identity=np.array([-1, 5])), report)
+    assert [(identity, seen.frame) for identity, seen in added] == [(5, 3)]
+    assert [seen.frame for seen in recorder.tracks[5]] == [0, 1, 2, 3]
 
 
 def test_whoever_is_given_up_leaves_nothing():

@@ -1,0 +1,120 @@
+"""Two real, calibrated, synchronised cameras of one street, PETS 2009 S2.L1 views 1 and 6, beside each of them alone."""
+
+import csv
+import itertools
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, evaluate, floor_tracks
+from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.trackers.io.cameras import open_camera
+from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.scenes import furniture_of, open_scene
+from jaxfilters.trackers.io.video_input import VideoFile
+from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleSession
+from jaxfilters.trackers.people.tracker import people_scene
+
+FRAMES_PER_SECOND = 7.0
+VIEWS = (1, 6)
+CALIBRATIONS = {"": "organisers", "_refit": "refit"}
+"""Which calibration is used, by the suffix of its metrics."""
+QUICK_FRAMES = 40
+
+
+def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool) -> dict[str, Metric]:
+    """Scores with both cameras, and of the better one alone (the one of larger MOTA), for each calibration.
+
+    Args:
+        folder: `pets09_s2l1_two_views`.
+        truth_folder: `pets09_s2l1_view001`, whose annotations hold for all views.
+        quick: Whether only the first frames of the first calibration are tracked.
+
+    Raises:
+        RecordingError: The recordings cannot be read.
+    """
+    area = _area(truth_folder)
+    frames = (0, QUICK_FRAMES - 1) if quick else (0, 399)
+    annotated = _annotated(truth_folder / "gt_0_399.csv", area, frames)
+    metrics: dict[str, Metric] = {}
+    for suffix, calibration in itertools.islice(CALIBRATIONS.items(), 1 if quick else None):
+        scores = {
+            views: evaluate(annotated, follow(folder, views, calibration, area, frames))
+            for views in (VIEWS, *((view,) for view in VIEWS))
+        }
+        for views, found in scores.items():
+            sys.stderr.write(f"  views {views}, {calibration}: {found}\n")
+        better = max((scores[(view,)] for view in VIEWS), key=lambda found: found.mota)
+        metrics |= _metrics(scores[VIEWS], f"_two{suffix}") | _metrics(better, f"_one{suffix}")
+    return metrics
+
+
+def follow(
+    folder: Path, views: tuple[int, ...], calibration: str, area: np.ndarray, frames: tuple[int, int]
+) -> FloorTracks:
+    """Smoothed tracks within the area (2, 2), metres, of a run from the first to the last of the frames.
+
+    Raises:
+        RecordingError: The recordings cannot be read.
+    """
+    try:
+        files = [
+            open_camera(folder / f"cam{view}_{calibration}.json", image_size=(768, 576))  # of both videos
+            for view in views
+        ]
+        described = open_scene(folder / "scene.json")
+        videos = [VideoFile(folder / f"View_{view:03d}.mp4", FRAMES_PER_SECOND) for view in views]
+        # Outlines of furniture are drawn on view 1, camera 0 of the scene.
+        kept = described._replace(outlines=[one for one in described.outlines if VIEWS[one["camera"]] in views])
+        cameras = [file.camera for file in files]
+        scene = people_scene(cameras, kept.floor, furniture=furniture_of(kept, cameras))
+    except InputError as error:
+        raise RecordingError(str(error)) from error
+    session = PeopleSession(scene)
+    pairs = list(zip(videos, files, strict=True))
+    session.prime([[file.undistortion.apply(image) for image in video.sample(PRIMING_IMAGES)] for video, file in pairs])
+    moments: Iterator = zip(*(video.images() for video in videos), strict=False)
+    first, last = frames
+    for i, moment in enumerate(itertools.islice(moments, first, last + 1)):
+        images = [file.undistortion.apply(image) for file, (_, image) in zip(files, moment, strict=True)]
+        session.process(images, i / FRAMES_PER_SECOND)
+    rows = [
+        (first + one.frame, who, *one.mean[:2]) for who, track in session.tracks.smoothed().items() for one in track
+    ]
+    table = np.array(rows, float).reshape(-1, 4)
+    inside = np.all((table[:, 2:] >= area[0]) & (table[:, 2:] <= area[1]), axis=-1)
+    return floor_tracks(table[:, 0], table[:, 1], table[:, 2:], in_area=inside)
+
+
+def _area(folder: Path) -> np.ndarray:
+    try:
+        limits = json.loads((folder / "calibration.json").read_text())["evaluation_area"]
+        return np.array([[limits[f"{axis}{end}"] for axis in "xy"] for end in ("min", "max")])
+    except (OSError, ValueError, KeyError) as error:
+        raise RecordingError(f"{folder / 'calibration.json'} cannot be read: {error!r}") from error
+
+
+def _annotated(path: Path, area: np.ndarray, frames: tuple[int, int]) -> FloorTracks:
+    try:
+        with path.open(newline="") as file:
+            rows = [(int(r["frame"]), int(r["id"]), float(r["x_m"]), float(r["y_m"])) for r in csv.DictReader(file)]
+    except (OSError, KeyError, ValueError) as error:
+        raise RecordingError(f"{path} cannot be read: {error!r}") from error
+    table = np.array(rows, float)
+    counts = np.all((table[:, 2:] >= area[0]) & (table[:, 2:] <= area[1]), axis=-1)
+    counts &= (table[:, 0] >= frames[0]) & (table[:, 0] <= frames[1])
+    return floor_tracks(table[:, 0], table[:, 1], table[:, 2:], in_area=counts)
+
+
+def _metrics(scores: MultiObjectScores, suffix: str) -> dict[str, Metric]:
+    return {
+        f"mota{suffix}": Metric(scores.mota, "%", "higher"),
+        f"idf1{suffix}": Metric(scores.idf1, "%", "higher"),
+        f"mean_error_m{suffix}": Metric(scores.mean_error_m, "m", "lower"),
+        f"id_switches{suffix}": Metric(float(scores.id_switches), "", "lower"),
+        f"transfers{suffix}": Metric(float(scores.transfers), "", "lower"),
+    }
