@@ -20,7 +20,7 @@ from jaxfilters.trackers.head.common.summary import Labels, write_summary
 from jaxfilters.trackers.head.common.table import STATUS_WORDS
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import tracked
-from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
+from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector, best_detector
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres, mono_table
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
@@ -52,13 +52,13 @@ def track(options: argparse.Namespace) -> str:
     face = tracked(model.model)
     known = None if options.known is None else read_people(options.known, face)
     remembered = None if known is None else known.remembered
-    detector = _detector(options)
+    detected_by, detector = _detector(options)
     session = as_input_error(
         lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
     )
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
     with closing(HeadRun(options, place, session, rows, settings)) as run:
-        return _tracked(options, settings, run, session, model, known)
+        return _tracked(options, settings, run, session, model, known, detected_by)
 
 
 def _tracked(
@@ -68,6 +68,7 @@ def _tracked(
     session: MonoSession,
     model: FaceModelFile,
     known: People | None,
+    detected_by: str,
 ) -> str:
     place, face = run.place, tracked(model.model)
     if place.note:
@@ -80,6 +81,7 @@ def _tracked(
         "eyes_apart_mm": None if person is None else finite(float(eyes_apart(face, person))),
         "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
         "taken_for": _taken_for(run, known),
+        "detector": detected_by,
         "face_model": {"source": model.source, "parameters": model.parameters},
         "config": dataclasses.asdict(settings),
         "options": {
@@ -112,10 +114,13 @@ def _model(options: argparse.Namespace) -> FaceModelFile:
     return file
 
 
-def _detector(options: argparse.Namespace) -> Detector:
-    name = options.detector or "cascades"
+def _detector(options: argparse.Namespace) -> tuple[str, Detector]:
+    """Name of the detector, and the detector."""
+    name = options.detector
+    if name is None:
+        return best_detector()
     try:
-        return DETECTORS[name]()
+        return name, DETECTORS[name]()
     except ImportError as error:
         raise InputError(f"--detector {name}: {error}") from error
 

@@ -32,6 +32,8 @@ IRISES = ((469, 471), (474, 476))
 MESH_SHARE, LEAST_PX = 0.01, 0.5
 """Standard deviation of a coordinate of the mesh from frame to frame: a share of the distance between the eyes, and
 never less than so many pixels; twice that at the chin."""
+MOST_FACES = 4
+"""That the mesh looks for in an image."""
 MESH_MM = 1.5
 """Standard deviation by which the mesh's landmarks lie beside the model's in all frames alike."""
 
@@ -88,18 +90,21 @@ class MeshLandmarks:
         Raises:
             ImportError: without MediaPipe, or with one that has no face mesh of its own.
         """
-        self._mesh = MeshDetector(refined=True)
+        self._mesh = MeshDetector(refined=True, most_faces=MOST_FACES)
         self.errors = default_detector_errors()["mediapipe"]
 
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
-        """The most evident face, or why there is none; the mesh looks for one face alone, wherever it is."""
-        del near
-        mesh = self._mesh.mesh(image)
-        if mesh is None:
+        """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+        meshes = [solid[:, :2] for solid in self._mesh.solids(image)]
+        if not meshes:
             return "no face"
+        if near is None:
+            mesh = max(meshes, key=lambda one: float(np.prod(np.ptp(one, axis=0))))
+        else:
+            mesh = min(meshes, key=lambda one: float(np.linalg.norm(one.mean(axis=0) - near)))
         dense = np.array([mesh[list(vertices)].mean(axis=0) if vertices else (np.nan, np.nan) for vertices in MESH_68])
         iris_px = np.array([np.linalg.norm(mesh[a] - mesh[b]) for a, b in IRISES])
-        return Seen(dense[list(FROM_68)], 1, dense, iris_px)
+        return Seen(dense[list(FROM_68)], len(meshes), dense, iris_px)
 
 
 DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {
@@ -107,6 +112,14 @@ DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {
     "mediapipe": MeshLandmarks,
 }
 """By the name that the command line has for them."""
+
+
+def best_detector() -> tuple[str, Detector]:
+    """MediaPipe's face mesh where it is installed, OpenCV's cascades elsewhere: its name, and the detector."""
+    try:
+        return "mediapipe", MeshLandmarks()
+    except ImportError:
+        return "cascades", CascadeDetector()
 
 
 def dense_noise(

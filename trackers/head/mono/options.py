@@ -40,8 +40,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--detector",
         choices=("cascades", "mediapipe"),
-        help="what finds the landmarks: OpenCV's cascades (default), or MediaPipe's face mesh, which with a model of "
-        "68 landmarks gives most of them, and the width of the irises",
+        help="what finds the landmarks: MediaPipe's face mesh (default where it is installed), which with a model of "
+        "68 landmarks gives most of them, and the width of the irises, or OpenCV's cascades",
     )
     add_config(parser, MonoConfig, "eyes_apart_mm", "num_particles")
     parser.add_argument(

@@ -116,6 +116,7 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     assert fake[0].face.num_identities == 15
     report = json.loads((out / "report.json").read_text())
     assert report["is_focal_length_assumed"] is True
+    assert report["detector"] in ("cascades", "mediapipe")
     assert report["focal_length_px"][0] == pytest.approx(1.2 * COLS)
     assert 50 < report["eyes_apart_mm"] < 80
     assert report["events"] == [{"frame": 2, "what": "registered"}]

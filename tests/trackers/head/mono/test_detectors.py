@@ -10,7 +10,15 @@ from jaxfilters.models.face.landmarks import EYES, FROM_68
 from jaxfilters.models.face.mirroring import PAIRS_68
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.mono import detectors as module
-from jaxfilters.trackers.head.mono.detectors import CHIN, DETECTORS, IRISES, MESH_68, CascadeDetector, MeshLandmarks
+from jaxfilters.trackers.head.mono.detectors import (
+    CHIN,
+    DETECTORS,
+    IRISES,
+    MESH_68,
+    CascadeDetector,
+    MeshLandmarks,
+    best_detector,
+)
 
 IMAGE = np.zeros((480, 640), np.uint8)
 
@@ -18,22 +26,58 @@ IMAGE = np.zeros((480, 640), np.uint8)
 def test_vertices_become_landmarks(monkeypatch):
     mesh = np.random.default_rng(0).uniform(0, 400, (478, 2))
 
-    class FrameInformation:
-        def __init__(self, *, refined):
-            assert refined
-
-        def mesh(self, image):
-            return mesh if image.any() else None
-
-    monkeypatch.setattr(module, "MeshDetector", FrameInformation)
-    detector = DETECTORS["mediapipe"]()
+    detector = detector_of(monkeypatch, lambda image: [solid(mesh)] if image.any() else [])
     assert detector.detect(IMAGE, None) == "no face"
     seen = detector.detect(IMAGE + np.uint8(1), None)
+    assert seen.num_faces == 1
     assert np.flatnonzero(np.isnan(seen.dense[:, 0])).tolist() == [k for k in range(17) if k != CHIN]
     np.testing.assert_array_equal(seen.dense[30], mesh[4])
     np.testing.assert_allclose(seen.dense[31], (mesh[97] + mesh[98]) / 2)
     np.testing.assert_array_equal(seen.points, seen.dense[list(FROM_68)])
     assert seen.iris_px[1] == np.linalg.norm(mesh[474] - mesh[476])
+
+
+def test_of_two_faces_the_nearest_or_largest_is_taken(monkeypatch):
+    small = np.random.default_rng(0).uniform(0, 100, (478, 2))
+    large = np.random.default_rng(1).uniform(200, 400, (478, 2))
+    detector = detector_of(monkeypatch, lambda image: [solid(small), solid(large)])
+    alone, beside = detector.detect(IMAGE, None), detector.detect(IMAGE, np.array([60.0, 60.0]))
+    assert alone.num_faces == beside.num_faces == 2
+    np.testing.assert_array_equal(alone.dense[30], large[4])
+    np.testing.assert_array_equal(beside.dense[30], small[4])
+
+
+def test_the_mesh_is_the_default_where_it_can_be_loaded(monkeypatch):
+    detector_of(monkeypatch, lambda image: [])
+    assert isinstance(best_detector()[1], MeshLandmarks)
+    assert best_detector()[0] == "mediapipe"
+
+    def missing(**options):
+        raise ImportError("not installed")
+
+    monkeypatch.setattr(module, "MeshDetector", missing)
+    assert isinstance(best_detector()[1], CascadeDetector)
+    assert best_detector()[0] == "cascades"
+
+
+def detector_of(monkeypatch, solids):
+    """The detector on a mesh whose faces in an image are those of a function."""
+
+    class FakeMesh:
+        def __init__(self, *, refined, most_faces):
+            assert refined
+            assert most_faces > 1
+
+        def solids(self, image):
+            return solids(image)
+
+    monkeypatch.setattr(module, "MeshDetector", FakeMesh)
+    return DETECTORS["mediapipe"]()
+
+
+def solid(mesh):
+    """The mesh in a plane."""
+    return np.pad(mesh, ((0, 0), (0, 1)))
 
 
 def test_no_vertex_is_two_landmarks_of_one_side():
