@@ -3,6 +3,7 @@
 import argparse
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -15,6 +16,9 @@ from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, TrackTable, open
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.video_input import Moment, VideoSource, continued
+
+_MOST_COSTS = 10_000
+"""Times of the session that count for their median; the last ones, so that a long run needs no more memory."""
 
 
 @runtime_checkable
@@ -112,7 +116,8 @@ class StreamRun:
         self._saved_at = time.monotonic()
         self._video: OverlayVideo | None = None
         self._failure: InputError | None = None
-        self._ends, self._costs = list[tuple[float, int]](), list[float]()
+        self._ends: list[tuple[float, int]] = []
+        self._costs: deque[float] = deque(maxlen=_MOST_COSTS)
 
     def follow(self) -> RunResult:
         """Track until the sources end, the time is over, or Ctrl-C.
@@ -139,7 +144,8 @@ class StreamRun:
             raise self._failure or InputError("; ".join(trouble or ["the sources hold no images"]) + ".")
         seconds = self._ends[-1][0] - self._ends[0][0] if self._ends else 0.0
         rate = (self._ends[-1][1] - self._ends[0][1]) / seconds if seconds else math.nan
-        cost = float(np.median(self._costs[1:])) if len(self._costs) > 1 else math.nan
+        costs = [cost for cost in self._costs if not math.isnan(cost)]
+        cost = float(np.median(costs)) if costs else math.nan
         return RunResult(rate, 1000 * cost, interrupted, self._failure, trouble)
 
     def conclude(self, result: RunResult) -> None:
@@ -191,7 +197,7 @@ class StreamRun:
     def _advance(self, moments: Sequence[Moment]) -> None:
         began = time.perf_counter()
         rows = self.spec.session.process(moments)
-        self._costs.append((time.perf_counter() - began) / len(moments))
+        self._costs.append((time.perf_counter() - began) / len(moments) if self._ends else math.nan)
         first = self.writer.frames
         self.writer.append_rows(len(moments), rows)
         self._last_s = moments[-1].time_s
@@ -200,7 +206,7 @@ class StreamRun:
         if self._options.video or self._log is not None:
             for i, picture in enumerate(self.spec.session.pictures(moments, rows)):
                 self._draw(picture, first + i, moments[i].time_s)
-        self._ends.append((time.perf_counter(), self.writer.frames))
+        self._ends = [*self._ends[:1], (time.perf_counter(), self.writer.frames)]
 
     def _checkpoint(self, *, complete: bool = False) -> None:
         """Save what the next images need, unless that was done a moment ago."""
