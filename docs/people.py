@@ -23,7 +23,7 @@ def main(results: Path, picture: Path) -> None:
     left = cv2.resize(
         np.vstack([np.hstack([a, b]), np.hstack([c, d])]), None, fx=2 / 3, fy=2 / 3, interpolation=cv2.INTER_AREA
     )
-    plan = cv2.imread(str(results / "plan.png"))
+    plan = cv2.imread(str(results / "summary.png"))
     plan = cv2.resize(plan, (round(plan.shape[1] * HEIGHT / len(plan)), HEIGHT), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(picture), np.hstack([left, plan]), [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

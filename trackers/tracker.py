@@ -10,6 +10,9 @@ from jaxtyping import Array, Float, Int
 
 STATUS_NAMES = ("searching", "tracking", "lost", "doubtful")
 """Words for the integers in `status` of a track."""
+STATUS_WORDS = (*STATUS_NAMES, "predicted", "tentative", "skipped")
+"""All words that a table of results has for the state of what is followed: not found yet; observed; not found any more;
+observed, but not surely; not observed, and moved on by the model; observed too shortly to count; without a frame."""
 CHUNK = 16
 """Frames in one compiled call: enough to hide the call, few enough to report progress several times a second."""
 _PACE_S = 1 / 30

@@ -1,6 +1,5 @@
 """What every system of the registry keeps: killed at any moment it goes on, and it shares no folder."""
 
-import importlib
 import os
 import random
 import shutil
@@ -8,26 +7,23 @@ import shutil
 import pytest
 
 from jaxfilters.models.synthetic.hand import MOTIONS
+from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.registry import SYSTEMS
 
-TABLES = {"people": "tracks.csv", "fingertips": "tips.csv"}
-"""Of the systems whose table is not `track.csv`."""
 OPTIONS = dict.fromkeys(("head-stereo", "head-mono", "people", "fingertips"), ("--seconds", "3"))
 """That shorten the synthetic recordings."""
 HAND_FRAMES = 40
 """Of the depth recording, which no option shortens."""
-TIMED = ("fingertips.files", "head.common.run", "people.files")
-"""Modules that write a checkpoint every few seconds; the other systems write one with every chunk."""
 
 
 def arguments(name, out):
     return ["track", name, "--out", str(out), "--no-video", *OPTIONS.get(name, ())]
 
 
-def table(name, folder):
-    return (folder / TABLES.get(name, "track.csv")).read_bytes()
+def table(folder):
+    return (folder / "track.csv").read_bytes()
 
 
 class KilledRuns:
@@ -53,16 +49,15 @@ def test_what_a_killed_run_leaves_gives_the_table_of_a_whole_one(name, tmp_path,
     """Its synthetic recording, once; continued from what lay in the folder at a random moment before the end."""
     monkeypatch.setenv("XLA_FLAGS", "")  # `main` sets it
     monkeypatch.setitem(MOTIONS, "B", MOTIONS["B"]._replace(num_frames=HAND_FRAMES))
-    for module in TIMED:
-        monkeypatch.setattr(importlib.import_module(f"jaxfilters.trackers.{module}"), "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
     whole = tmp_path / "whole"
     killed = KilledRuns(whole, tmp_path / "copies")
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint.os, "replace", killed.replace)
         assert main(arguments(name, whole)) == 0
-    unfinished = [out for out in killed.taken if table(name, out) != table(name, whole)]
+    unfinished = [out for out in killed.taken if table(out) != table(whole)]
     out = random.Random(name).choice(unfinished)
     capsys.readouterr()
     assert main([*arguments(name, out), "--resume"]) == 0
     assert "continuing after frame" in capsys.readouterr().err
-    assert table(name, out) == table(name, whole)
+    assert table(out) == table(whole)

@@ -26,8 +26,17 @@ def track_recording(
     state: Any,
     writer: TrackWriter,
     on_progress: Callable[[Progress], None],
+    on_chunk: Callable[[int, list[Any], Any], None] = lambda first, frames, track: None,  # noqa: ARG005
 ) -> float:
     """Track the frames that `writer` does not have yet; frames per second, NaN if all of them compiled.
+
+    Args:
+        recording: The frames.
+        tracker: What tracks them.
+        state: Of the tracker, before the first of these frames.
+        writer: Where rows go.
+        on_progress: Called after every chunk.
+        on_chunk: Called with the number of the first frame, the frames, and their rows.
 
     Raises:
         InputError: a frame cannot be read. The frames before it are in `track.csv`, the chunks before it saved.
@@ -40,7 +49,7 @@ def track_recording(
             times_s = recording.times_s[first : first + len(frames)]
             state, track = step_chunk(tracker, state, frames, times_s - recording.times_s[0])
             chunk_ends.append(time.perf_counter())
-            writer.append(times_s, track)
+            on_chunk(first, frames, writer.append(times_s, track))
             status = STATUS_NAMES[int(track.status[-1])]
             on_progress(Progress(writer.frames, len(recording), _rate(chunk_ends), status))
         if failure is not None:

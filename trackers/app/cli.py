@@ -12,6 +12,7 @@ from jaxfilters.trackers.app.argument_types import image_size, seed
 from jaxfilters.trackers.app.compiled import keep_compiled_programs
 from jaxfilters.trackers.app.devices import use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
+from jaxfilters.trackers.app.options import add_picture_options
 from jaxfilters.trackers.app.output_folder import check_free
 from jaxfilters.trackers.batch.options import add_batch
 from jaxfilters.trackers.calibration.options import add_calibrate
@@ -106,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser("demo", help="follow a synthetic hand and draw what was found")
     demo.add_argument("--out", type=Path, default=Path("jaxfilters-demo"), metavar="DIR", help="default: %(default)s")
-    demo.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+    add_picture_options(demo)
     demo.set_defaults(input=None, resume=False, overwrite=True)
     add_tracker_options(demo)
 

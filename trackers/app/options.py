@@ -9,6 +9,8 @@ from typing import TypeVar
 from jaxfilters.trackers.app.argument_types import positive_number, seed
 from jaxfilters.trackers.configuration import settings_of
 
+VIEWER = "viewer"
+"""The value of `--rerun` without a file."""
 Made = TypeVar("Made")
 _SHORT = {"num_particles": "--particles"}
 """Further names of options."""
@@ -63,7 +65,19 @@ def add_resume(parser: argparse.ArgumentParser) -> None:
 def add_results_options(parser: argparse.ArgumentParser) -> None:
     """Where a run writes, and whether it draws a video."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    add_picture_options(parser)
+
+
+def add_picture_options(parser: argparse.ArgumentParser) -> None:
+    """Whether a run draws a video, and whether it can be watched."""
     parser.add_argument("--no-video", action="store_false", dest="video", help="do not write overlay.mp4")
+    parser.add_argument(
+        "--rerun",
+        nargs="?",
+        const=VIEWER,
+        metavar="FILE.rrd",
+        help="show the run in the Rerun viewer while it goes on, or write it into a file for it (needs rerun-sdk)",
+    )
 
 
 def add_video_options(parser: argparse.ArgumentParser) -> None:

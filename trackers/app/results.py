@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+import math
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -22,6 +23,8 @@ from jaxfilters.trackers.tracker import STATUS_NAMES
 
 CHECKPOINT_EVERY_S = 2.0
 """Seconds between checkpoints of what has no chunks; what was tracked since the last is tracked again after a crash."""
+_NUM_FRAMES = "num_frames"
+"""Of the rows in a file of a checkpoint, beside the fields of the track."""
 
 
 class Columns(NamedTuple):
@@ -30,83 +33,122 @@ class Columns(NamedTuple):
     names: tuple[str, ...]
     """With their units: `x_m`, `yaw_std_rad`."""
     values: Callable[[Any], np.ndarray]
-    """`track -> (frames,)` or `(frames, len(names))`."""
+    """`track -> (rows,)` or `(rows, len(names))` numbers or words."""
 
 
 class TrackTable(NamedTuple):
     """How the track of one kind of tracker becomes rows of `track.csv` and arrays of `track.npz`."""
 
     track: Callable[..., Any]
-    """A named tuple of arrays, frames first, that begins with `times_s` and ends with `status`. Between these two are
-    the fields of what the tracker returns, in order."""
+    """A named tuple of arrays, rows first, with `times_s`, and with `status` last. A tracker of one object has a row a
+    frame. One of several has a row an object and frame, and the frame of each row in the field `frame`."""
     parts: tuple[Columns, ...]
-    """Of the numbers of a row, between the time and the status."""
+    """Of a row, between the time and the status."""
     status_names: tuple[str, ...] = STATUS_NAMES
     """Words for the integers in `status`."""
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the numbers of a row."""
+        """Names of the columns between the time and the status."""
         return tuple(name for part in self.parts for name in part.names)
 
-    def numbers(self, track: Any) -> np.ndarray:
-        """(frames, columns) of a track."""
-        return np.concatenate([part.values(track).reshape(len(track.times_s), -1) for part in self.parts], axis=1)
+    def rows(self, first: int, track: Any) -> Iterator[tuple[Any, ...]]:
+        """Rows of `track.csv`; `first` is the number of the first frame."""
+        frames = getattr(track, "frame", first + np.arange(len(track.times_s)))
+        cells = [part.values(track).reshape(len(frames), len(part.names)) for part in self.parts]
+        for i, (frame, time_s, status) in enumerate(zip(frames, track.times_s, track.status, strict=True)):
+            texts = (_text(value) for part in cells for value in part[i])
+            yield (int(frame), f"{time_s:.6f}", *texts, self.status_names[int(status)])
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.9g}"
+
+
+class _Part(NamedTuple):
+    """Rows of neighbouring frames."""
+
+    first: int
+    frames: int
+    track: Any
 
 
 class TrackWriter:
     """Appends rows to `track.csv` as frames are done, and saves the state with them at checkpoints.
 
-    The cost of a checkpoint does not depend on how many came before it: rows are saved once, in a file a checkpoint.
-    `begin` and `resume` make one; `close` lets go of its folder.
+    Neither the cost of a checkpoint nor the memory depends on how many came before it: rows are saved once, in a file a
+    checkpoint, and are read again at the end. `begin` and `resume` make a writer; `close` lets go of its folder.
     """
 
-    def __init__(self, folder: OutputFolder, run: dict[str, Any], table: TrackTable, done: list[Any]):
+    def __init__(self, folder: OutputFolder, run: dict[str, Any], table: TrackTable, done: list[_Part]):
         self._folder, self._path, self._run, self._table = folder, folder.path, run, table
-        self._parts, self._saved = done, len(done)
-        self.frames_saved = self.frames
+        self._saved, self._unsaved = [part.first for part in done], list[_Part]()
+        self.frames = self.frames_saved = sum(part.frames for part in done)
+        """How many frames were appended so far, and how many of them are in a checkpoint."""
         rows = [("frame", "time_s", *table.columns, "status")]
-        self._write_rows(rows + [row for part in self._with_first_frames() for row in self._rows(*part)], "w")
-
-    @property
-    def frames(self) -> int:
-        """How many frames were appended so far."""
-        return sum(len(part.times_s) for part in self._parts)
+        self._write_rows(rows + [row for part in done for row in table.rows(part.first, part.track)], "w")
 
     @property
     def results(self) -> Any:
-        """All frames so far, at least one."""
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *self._parts)
+        """The rows of all frames so far, at least one frame.
 
-    def append(self, times_s: np.ndarray, track: Any) -> None:
-        """Add frames: one row each in `track.csv`, on disk when this returns."""
-        part = jax.tree.map(np.asarray, self._table.track(np.asarray(times_s), *track))
-        self._write_rows(self._rows(self.frames, part), "a")
-        self._parts.append(part)
+        Raises:
+            CheckpointError: a file of the checkpoint is gone or damaged.
+        """
+        parts = [_read_part(self._path, first, self._table).track for first in self._saved]
+        return _joined([*parts, *(part.track for part in self._unsaved)])
+
+    def append(self, times_s: np.ndarray, track: Any) -> Any:
+        """Add frames of a tracker of one object: a row each in `track.csv`, on disk when this returns; the rows."""
+        rows = jax.tree.map(np.asarray, self._table.track(np.asarray(times_s), *track))
+        self.append_rows(len(times_s), rows)
+        return rows
+
+    def append_rows(self, frames: int, track: Any) -> None:
+        """Add any number of rows, of so many further frames."""
+        self._write_rows(self._table.rows(self.frames, track), "a")
+        self._unsaved.append(_Part(self.frames, frames, track))
+        self.frames += frames
 
     def checkpoint(self, state: Any, *, complete: bool = False) -> None:
         """Save `state` with everything appended so far; `complete` marks the last one of a recording."""
         meta = {"run": self._run, "frames": self.frames, "complete": complete}
         with self._explained(folder := _checkpoint_folder(self._path)):
             folder.mkdir(exist_ok=True)
-            for first, part in list(self._with_first_frames())[self._saved :]:
-                checkpoint.write_npz(_part_path(self._path, first), part._asdict())
+            if self.frames > self.frames_saved:
+                rows = _joined([part.track for part in self._unsaved])
+                _write_part(self._path, _Part(self.frames_saved, self.frames - self.frames_saved, rows))
             # The state comes last: rows without it are written again.
             checkpoint.save(checkpoint.state_path(self._path), state, meta)
-        self.frames_saved, self._saved = self.frames, len(self._parts)
+        if self.frames > self.frames_saved:
+            self._saved.append(self.frames_saved)
+        self.frames_saved, self._unsaved = self.frames, []
 
-    def finish(self, report: dict[str, Any], **arrays: np.ndarray) -> None:
-        """Write `track.npz`, with other `arrays` beside the track, and `report.json`."""
+    def finish(self, report: dict[str, Any], track: Any = None, **arrays: np.ndarray) -> None:
+        """Write `track.npz`, with other `arrays` beside the track, and `report.json`.
+
+        Args:
+            report: JSON-able.
+            track: Rows that replace those in `track.csv`, all or nothing; None keeps them.
+            arrays: By name.
+        """
         results = self.results
+        if track is not None:
+            header = ("frame", "time_s", *self._table.columns, "status")
+            partial = self._path / "track.csv.partial"
+            self._write_rows([header, *self._table.rows(0, track)], "w", partial)
+            with self._explained(self._path / "track.csv"):
+                partial.replace(self._path / "track.csv")
         with self._explained(self._path / "track.npz"):
-            checkpoint.write_npz(self._path / "track.npz", results._asdict() | arrays)
+            checkpoint.write_npz(self._path / "track.npz", (results if track is None else track)._asdict() | arrays)
         with self._explained(self._path / "report.json"):
             (self._path / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
-        if self.frames_saved == self.frames and len(self._parts) > 1:
+        if self.frames_saved == self.frames and len(self._saved) > 1:
             with self._explained(_checkpoint_folder(self._path)):
-                checkpoint.write_npz(_part_path(self._path, 0), results._asdict())
-                for first, _ in list(self._with_first_frames())[1:]:
+                _write_part(self._path, _Part(0, self.frames, results))
+                for first in self._saved[1:]:
                     _part_path(self._path, first).unlink(missing_ok=True)
+                self._saved = [0]
 
     def kept(self) -> str:
         """A sentence for people: what of this run is safe, and how to go on."""
@@ -121,20 +163,9 @@ class TrackWriter:
         """Let other runs write into the folder."""
         self._folder.close()
 
-    def _with_first_frames(self) -> Iterator[tuple[int, Any]]:
-        first = 0
-        for part in self._parts:
-            yield first, part
-            first += len(part.times_s)
-
-    def _rows(self, first: int, part: Any) -> Iterator[tuple[Any, ...]]:
-        numbers = self._table.numbers(part)
-        for i, time_s in enumerate(part.times_s):
-            texts = (f"{x:.9g}" for x in numbers[i])
-            yield (first + i, f"{time_s:.6f}", *texts, self._table.status_names[int(part.status[i])])
-
-    def _write_rows(self, rows: Iterable[tuple[Any, ...]], mode: str) -> None:
-        with self._explained(path := self._path / "track.csv"), path.open(mode, newline="") as file:
+    def _write_rows(self, rows: Iterable[tuple[Any, ...]], mode: str, path: Path | None = None) -> None:
+        path = path or self._path / "track.csv"
+        with self._explained(path), path.open(mode, newline="") as file:
             csv.writer(file).writerows(rows)
 
     @contextmanager
@@ -224,27 +255,49 @@ def versions() -> dict[str, str]:
     }
 
 
+def finite(value: float) -> float | None:
+    """A number for JSON; None for one that is not finite."""
+    return round(value, 3) if math.isfinite(value) else None
+
+
 def can_resume(folder: Path) -> bool:
     """Whether `folder` holds a checkpoint."""
     return checkpoint.state_path(folder).exists()
 
 
-def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[Any]:
+def _saved_parts(folder: Path, table: TrackTable, frames: int) -> list[_Part]:
     """The rows of the first `frames` frames; files of later ones were written without a state, and are ignored."""
-    parts: list[Any] = []
+    parts: list[_Part] = []
     done = 0
     while done < frames:
-        arrays = checkpoint.read_arrays(path := _part_path(folder, done))
-        try:
-            part = table.track(**arrays)
-        except TypeError:
-            raise CheckpointError(f"{path}: arrays of another tracker, {sorted(arrays)}.") from None
-        lengths = {len(array) for array in part}
-        if len(lengths) != 1 or not 0 < min(lengths) <= frames - done:
-            raise CheckpointError(f"{path}: expected at most {frames - done} frames in all arrays; got {lengths}.")
-        parts.append(part)
-        done += len(part.times_s)
+        parts.append(part := _read_part(folder, done, table))
+        if not 0 < part.frames <= frames - done:
+            path = _part_path(folder, done)
+            raise CheckpointError(f"{path}: expected at most {frames - done} frames; got {part.frames}.")
+        done += part.frames
     return parts
+
+
+def _write_part(folder: Path, part: _Part) -> None:
+    checkpoint.write_npz(_part_path(folder, part.first), part.track._asdict() | {_NUM_FRAMES: np.asarray(part.frames)})
+
+
+def _read_part(folder: Path, first: int, table: TrackTable) -> _Part:
+    arrays = checkpoint.read_arrays(path := _part_path(folder, first))
+    frames = arrays.pop(_NUM_FRAMES, np.asarray(-1))
+    try:
+        track = table.track(**arrays)
+    except TypeError:
+        raise CheckpointError(f"{path}: arrays of another tracker, {sorted(arrays)}.") from None
+    lengths = {len(array) if array.ndim else 0 for array in track}
+    has_row_a_frame = "frame" not in arrays
+    if len(lengths) != 1 or frames.ndim or (has_row_a_frame and lengths != {int(frames)}):
+        raise CheckpointError(f"{path}: expected rows of {frames} frames in all arrays; got {lengths}.")
+    return _Part(first, int(frames), track)
+
+
+def _joined(tracks: list[Any]) -> Any:
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *tracks)
 
 
 def _checkpoint_folder(folder: Path) -> Path:

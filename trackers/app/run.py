@@ -5,7 +5,7 @@ import dataclasses
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxfilters.trackers.app.chunks import Progress, track_recording
 from jaxfilters.trackers.app.progress import ProgressLine
+from jaxfilters.trackers.app.rerun_log import RerunLog, open_log
 from jaxfilters.trackers.app.results import TrackTable, TrackWriter, open_writer, versions
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.recording import Recording
@@ -36,6 +37,8 @@ class RunSpec(NamedTuple):
     """`(path, results)`; raises `OutputError`."""
     draw_overlay: Callable[..., None]
     """`(path, results, frames_per_second, on_progress)`; raises `OutputError`."""
+    pictures: Callable[..., Iterable[np.ndarray]]
+    """`(first, frames, rows)`: pictures (rows, cols, 3) of a chunk of frames and their rows."""
 
 
 def run(spec: RunSpec, options: argparse.Namespace) -> str:
@@ -49,9 +52,11 @@ def run(spec: RunSpec, options: argparse.Namespace) -> str:
     """
     began = time.perf_counter()
     writer, saved = open_writer(options, _identity(spec), spec.table)
+    log = None
     try:
+        log = open_log(options, spec.table)
         state = spec.tracker.init(jax.random.key(spec.config.seed), spec.recording[0]) if saved is None else saved
-        rate = _track(spec, state, writer)
+        rate = _track(spec, state, writer, log)
         errors = spec.errors(writer.results)
         report = _report(spec, writer.results, errors, rate, time.perf_counter() - began)
         writer.finish(report)
@@ -61,6 +66,8 @@ def run(spec: RunSpec, options: argparse.Namespace) -> str:
     except KeyboardInterrupt as interrupt:
         raise type(interrupt)(writer.kept()) from None
     finally:
+        if log is not None:
+            log.close()
         writer.close()
     return _summary(report, errors, options)
 
@@ -74,14 +81,21 @@ def _identity(spec: RunSpec) -> dict[str, Any]:
     }
 
 
-def _track(spec: RunSpec, state: Any, writer: TrackWriter) -> float:
+def _track(spec: RunSpec, state: Any, writer: TrackWriter, log: RerunLog | None) -> float:
     with ProgressLine("tracking", len(spec.recording), done=writer.frames) as line:
 
         def show(progress: Progress) -> None:
             speed = "" if math.isnan(progress.frames_per_second) else f"{progress.frames_per_second:.0f} frames/s  "
             line.show(progress.done, speed + progress.status)
 
-        return track_recording(spec.recording, spec.tracker, state, writer, show)
+        def send(first: int, frames: list[Any], rows: Any) -> None:
+            if log is None:
+                return
+            log.rows(first, rows)
+            for i, picture in enumerate(spec.pictures(first, frames, rows)):
+                log.picture(first + i, rows.times_s[i], picture)
+
+        return track_recording(spec.recording, spec.tracker, state, writer, show, send)
 
 
 def _write_pictures(options: argparse.Namespace, spec: RunSpec, writer: TrackWriter, rate: float) -> None:

@@ -19,11 +19,10 @@ from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.input_files import read_text
 from jaxfilters.trackers.io.json_files import parse_json
 
-TABLES = ("track.csv", "tracks.csv", "tips.csv")
-"""What trackers call the table of their results."""
+TABLE = "track.csv"
 MOST_PICTURES, MOST_WIDTH, QUALITY = 900, 720, 60
 """Of a page: longer videos are thinned out, wider pictures made smaller; quality of WebP."""
-_UNIT = re.compile(r"_((?:m|mm|rad|px|s)(?:_per_frame)?|per_frame)$")
+_UNIT = re.compile(r"_((?:m|mm|rad|px|s)(?:_per_(?:frame|s))?|per_frame)$")
 _NOT_DRAWN = {"frame", "time_s", "hand", "id", "slot"}
 _FALLBACK_FPS = 30.0
 
@@ -90,9 +89,8 @@ def page_of(folder: Path) -> str:
 
 
 def _read_rows(folder: Path) -> _Rows:
-    found = next((folder / name for name in TABLES if (folder / name).is_file()), None)
-    wanted = f"expected a folder of results, with {', '.join(TABLES)}"
-    if found is None:
+    found, wanted = folder / TABLE, f"expected a folder of results, with {TABLE}"
+    if not found.is_file():
         raise InputError(f"{folder}: {wanted}.")
     try:
         table = list(csv.reader(read_text(found, wanted).splitlines(), strict=True))
@@ -164,7 +162,7 @@ def _drawn(rows: _Rows, frames: Sequence[int], times_s: Sequence[float]) -> dict
     charts: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name in rows.names:
         values = rows.numbers(name)
-        if name in _NOT_DRAWN or "_std" in name or name in ("sd",) or all(value is None for value in values):
+        if name in _NOT_DRAWN or "_std" in name or all(value is None for value in values):
             continue
         stds = rows.numbers(std) if (std := _std_of(name, rows.names)) else None
         for one, places in members.items():

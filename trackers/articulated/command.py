@@ -1,16 +1,19 @@
 """`jaxfilters track articulated`."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.articulated import tracker as articulated_hand
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
-from jaxfilters.trackers.articulated.drawing import scene, write_overlay
+from jaxfilters.trackers.articulated.drawing import draw_frame, scene, write_overlay
 from jaxfilters.trackers.articulated.recording import FeatureSequence
 from jaxfilters.trackers.articulated.summary import errors_of, write_summary
 from jaxfilters.trackers.articulated.table import TimedArticulatedTrack, articulated_table
@@ -46,6 +49,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
         partial(_errors, sequence, hand),
         partial(_draw_summary, sequence, hand),
         partial(_draw_overlay, sequence, hand),
+        partial(_pictures, sequence, hand),
     )
 
 
@@ -88,3 +92,10 @@ def _draw_overlay(
     on_progress: Callable[[int], None],
 ) -> None:
     write_overlay(path, scene(sequence, hand, results), results, rate, on_progress)
+
+
+def _pictures(
+    sequence: FeatureSequence, hand: ArticulatedHand, first: int, frames: list[Any], rows: TimedArticulatedTrack
+) -> Iterator[np.ndarray]:
+    drawn = scene(sequence, hand, rows, first=first)
+    return (draw_frame(drawn, i) for i in range(len(frames)))

@@ -75,17 +75,17 @@ class Scene(NamedTuple):
     """(2,) that distances of lines are measured from."""
 
 
-def scene(sequence: FeatureSequence, hand: ArticulatedHand, results: TimedArticulatedTrack) -> Scene:
-    """What is to be drawn of the frames in `results`."""
-    measured = _measured(sequence, len(results.times_s))
+def scene(sequence: FeatureSequence, hand: ArticulatedHand, results: TimedArticulatedTrack, *, first: int = 0) -> Scene:
+    """What is to be drawn of the frames in `results`, of which `first` is the number of the first one."""
+    frames = slice(first, first + len(results.times_s))
     joints = results.image_points.astype(float)
     return Scene(
-        canvas=_canvas(sequence.image_shape, measured, joints),
-        measured=measured,
+        canvas=_canvas(sequence.image_shape, _measured(sequence, slice(None)), joints),
+        measured=_measured(sequence, frames),
         wrist=results.mean[:, hand.layout.position].astype(float),
         joints=joints,
         palm=np.asarray(_palm_corners(jnp.asarray(results.mean), hand), float),
-        true_joints=_true_joints(sequence, hand, len(results.times_s)),
+        true_joints=_true_joints(sequence, hand, frames),
         origin=np.asarray(hand.origin, float),
     )
 
@@ -138,12 +138,12 @@ def _captioned(scene: Scene, results: TimedArticulatedTrack, frames_per_second: 
         yield image
 
 
-def _measured(sequence: FeatureSequence, frames: int) -> Measured:
+def _measured(sequence: FeatureSequence, frames: slice) -> Measured:
     names = sequence.features.names(sequence.num_fingers)
-    rows = dict(zip(names, sequence.y[:frames].T, strict=True))
+    rows = dict(zip(names, sequence.y[frames].T, strict=True))
 
     def columns(*wanted: str) -> np.ndarray:
-        return np.stack([rows.get(name, np.full(frames, np.nan)) for name in wanted], axis=-1)
+        return np.stack([rows.get(name, np.full(len(sequence.y[frames]), np.nan)) for name in wanted], axis=-1)
 
     fingers = range(1, sequence.num_fingers + 1)
     joints = [f"p_{finger}{joint}" for finger in fingers for joint in range(LINKS + 1)]
@@ -191,10 +191,10 @@ def _joints(states: jax.Array, hand: ArticulatedHand) -> jax.Array:
     return jax.vmap(hand.image_points)(states)
 
 
-def _true_joints(sequence: FeatureSequence, hand: ArticulatedHand, frames: int) -> np.ndarray | None:
+def _true_joints(sequence: FeatureSequence, hand: ArticulatedHand, frames: slice) -> np.ndarray | None:
     if sequence.truth is None:
         return None
-    return np.asarray(_joints(jnp.asarray(sequence.truth[:frames], dtype=float), hand), float)
+    return np.asarray(_joints(jnp.asarray(sequence.truth[frames], dtype=float), hand), float)
 
 
 def _draw_measured(image: np.ndarray, scene: Scene, index: int, fine: int) -> None:

@@ -6,39 +6,28 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
+from contextlib import closing
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxfilters.models.gesture import coded
-from jaxfilters.trackers.app.progress import ProgressLine, note, warn
-from jaxfilters.trackers.app.results import versions
-from jaxfilters.trackers.app.video import OverlayVideo
+from jaxfilters.trackers.app.progress import warn
+from jaxfilters.trackers.app.results import finite, versions
+from jaxfilters.trackers.app.stream import RunResult, StreamRun, StreamSpec, check_unused
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
-from jaxfilters.trackers.fingertips.files import FingertipFiles, read_events
+from jaxfilters.trackers.fingertips.files import EventFile
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
-from jaxfilters.trackers.fingertips.input import DemoHand, open_hands, shown
-from jaxfilters.trackers.fingertips.pictures import FingertipPictures
+from jaxfilters.trackers.fingertips.input import DemoHand, open_hands
+from jaxfilters.trackers.fingertips.run import FingertipStream
 from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
-from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.fingertips.summary import write_summary
+from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
-from jaxfilters.trackers.head.common.outcome import finite
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
-from jaxfilters.trackers.io.video_input import Moment, continued
-from jaxfilters.trackers.people.files import write_report
-
-
-class RunResult(NamedTuple):
-    """What came of a run."""
-
-    tally: Tally
-    frames_per_second: float
-    """Without the first frame, which compiles; NaN with one."""
-    interrupted: bool
-    failure: InputError | None
+from jaxfilters.trackers.io.video_input import Moment
 
 
 def track(options: argparse.Namespace) -> str:
@@ -49,6 +38,7 @@ def track(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
+    check_unused(options)
     symbols = _symbols(options.gestures)
     source = open_hands(
         options.video_source,
@@ -58,36 +48,45 @@ def track(options: argparse.Namespace) -> str:
         keypoints=options.keypoints,
         image_size=options.image_size,
     )
-    files = FingertipFiles(options.out, _identity(source, options), resume=options.resume)
-    began = time.perf_counter()
-    try:
-        user = _user(source, options.mask)
-        if not user.has_open_hand:
-            warn(f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles")
-        session = FingertipSession(
-            angles_of(user),
-            handedness=user.parameters.handedness,
-            num_hands=options.hands,
-            height=float(source.image_size[1]),
-            fps=source.fps,
-            config=dataclasses.replace(USUAL, posture=user.posture),
-            recogniser=recogniser_of(symbols),
+    user = _user(source, options.mask)
+    if not user.has_open_hand:
+        warn(f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles")
+    session = FingertipSession(
+        angles_of(user),
+        handedness=user.parameters.handedness,
+        num_hands=options.hands,
+        height=float(source.image_size[1]),
+        fps=source.fps,
+        config=dataclasses.replace(USUAL, posture=user.posture),
+        recogniser=recogniser_of(symbols),
+    )
+    with closing(EventFile(options.out / "events.jsonl")) as events:
+        stream = FingertipStream(source, lambda image: hands_in(image, user, options.hands), session, events)
+        total = getattr(source, "frames", 0) or None
+        spec = StreamSpec(
+            *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
+            *(TIP_TABLE, _identity(source, options), total),
         )
-        followed = _follow(source, user, session, files, options)
-    finally:
-        files.close()
-    if not followed.tally.frames:
-        if followed.interrupted:
-            raise KeyboardInterrupt("nothing was kept")
-        raise followed.failure or InputError(f"{source.name}: no image.")
-    report = _report(source, user, session, followed, options, time.perf_counter() - began)
-    write_report(options.out / "report.json", report)
-    for trouble in report["trouble"]:
-        warn(trouble)
-    if followed.failure is not None:
-        kept = f"the first {followed.tally.frames} frames are in {files.tips}"
-        raise InputError(f"{str(followed.failure).removesuffix('.')}; {kept}.")
-    return _told(report, options)
+        with closing(StreamRun(options, spec)) as run:
+            return _tracked(source, user, session, stream, run, options)
+
+
+def _tracked(
+    source: Any,
+    user: User,
+    session: FingertipSession,
+    stream: FingertipStream,
+    run: StreamRun,
+    options: argparse.Namespace,
+) -> str:
+    began = time.perf_counter()
+    result = run.follow()
+    stream.finish()
+    report = _report(source, user, session, stream.tally, result, options, time.perf_counter() - began)
+    run.writer.finish(report, status_names=np.asarray(STATUS))
+    write_summary(options.out / "summary.png", run.writer.results, stream.tally, session.events, source.image_size)
+    run.conclude(result)
+    return format_report(report, options)
 
 
 def recogniser_of(file: SymbolsFile) -> Recogniser:
@@ -128,61 +127,8 @@ def _identity(source: Any, options: argparse.Namespace) -> dict[str, Any]:
     return {"input": source.name, "image_size": size, "fps": rate, "version": version("jaxfilters"), **given}
 
 
-def _follow(
-    source: Any, user: User, session: FingertipSession, files: FingertipFiles, options: argparse.Namespace
-) -> RunResult:
-    tally = Tally()
-    if files.saved is not None:
-        tally = files.saved["tally"]
-        session.restore(files.saved["session"], read_events(files.events))
-        note(f"continuing after frame {tally.frames} of {options.out}")
-    name = f"overlay_from_{tally.frames}.mp4" if tally.frames else "overlay.mp4"
-    pictures, video, ends = FingertipPictures(), None, list[float]()
-    interrupted, failure, reported = False, None, len(session.events)
-    total = getattr(source, "frames", 0) or None
-    try:
-        with ProgressLine("tracking", total, done=tally.frames) as line:
-            moments = _moments(source, options.seconds)
-            image: Any
-            for time_s, (image,) in continued(moments, [source], tally.frames, tally.time_s):
-                found = session.process(hands_in(image, user, options.hands), np.array([time_s]))
-                report = HandReport(*(field[0] for field in found))
-                events, reported = session.events[reported:], len(session.events)
-                files.append(tally.frames, time_s, report, events)
-                if options.video:
-                    picture = pictures.drawn(shown(image), tally.frames, time_s, report, events)
-                    video = video or OverlayVideo(options.out / name, source.fps, picture.shape)
-                    video.write(picture)
-                tally = tally.add(time_s, report, source.truth[-1] if isinstance(source, DemoHand) else None)
-                files.checkpoint(partial(_saved, session, tally))
-                ends.append(time.perf_counter())
-                done = tally.frames if total is None else min(tally.frames, total)
-                line.show(done, f"{int(report.num_tips.sum())} fingertips")
-    except InputError as error:
-        failure = error
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        if video is not None:
-            video.close()
-    if video is not None:
-        video.check()
-    session.finish()
-    if session.events[reported:]:
-        files.append(tally.frames, 0.0, _NOTHING, session.events[reported:])
-    rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else math.nan
-    return RunResult(tally, rate, interrupted, failure)
-
-
-_NOTHING: Any = HandReport(*[np.zeros((0, 0), bool)] * len(HandReport._fields))  # type: ignore[arg-type]
-
-
-def _saved(session: FingertipSession, tally: Tally) -> dict[str, Any]:
-    """What the next images need."""
-    return {"session": session.saved(), "tally": tally}
-
-
 def _moments(source: Any, seconds: float | None) -> Iterator[Moment]:
+    """Those with an image; a live camera may have none when the time is over."""
     first = None
     for time_s, image in source.images():
         first = time_s if first is None else first
@@ -196,16 +142,16 @@ def _report(
     source: Any,
     user: User,
     session: FingertipSession,
-    followed: RunResult,
+    tally: Tally,
+    result: RunResult,
     options: argparse.Namespace,
     seconds: float,
 ) -> dict[str, Any]:
-    tally = followed.tally
     right = tally.right_counts / tally.frames if isinstance(source, DemoHand) else math.nan
     return {
         "input": source.name,
         "frames": tally.frames,
-        "frames_per_second": finite(followed.frames_per_second),
+        "frames_per_second": finite(result.frames_per_second),
         "seconds": round(seconds, 2),
         "fingertips": len(tally.frames_by_fingertip),
         "frames_by_fingertip": tally.frames_by_fingertip,
@@ -213,8 +159,8 @@ def _report(
         "events": dict(Counter(f"{event.name} {event.phase}" for event in session.events)),
         "mean_error_px": finite(tally.mean_error_px),
         "share_of_right_counts": finite(float(right)),
-        "interrupted": followed.interrupted,
-        "trouble": [trouble] if (trouble := source.trouble()) else [],
+        "interrupted": result.interrupted,
+        "trouble": result.trouble,
         "open_hand": user.has_open_hand,
         "hand": dataclasses.asdict(user.parameters),
         "mask": None if options.keypoints else options.mask,
@@ -224,7 +170,8 @@ def _report(
     }
 
 
-def _told(report: dict[str, Any], options: argparse.Namespace) -> str:
+def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
+    """The report in a few lines for a person."""
     speed, error = report["frames_per_second"], report["mean_error_px"]
     symbols = report["events"].get("symbol end", 0)
     lines = [
@@ -233,6 +180,7 @@ def _told(report: dict[str, Any], options: argparse.Namespace) -> str:
         + f", {report['fingertips']} fingertips, {symbols} {'symbol' if symbols == 1 else 'symbols'}"
         + (f", mean error {error:.2f} px" if error is not None else "")
         + (", interrupted" if report["interrupted"] else ""),
-        f"results in {options.out}: tips.csv, events.jsonl, report.json" + (", overlay.mp4" if options.video else ""),
+        f"results in {options.out}: track.csv, track.npz, events.jsonl, report.json, summary.png"
+        + (", overlay.mp4" if options.video else ""),
     ]
     return "\n".join(lines)

@@ -73,6 +73,8 @@ class DepthVideo:
 class LiveHands:
     """A live camera, whose first images are for getting to know the user and do not come again."""
 
+    is_live = True
+
     def __init__(self, camera: Any):
         self.name, self.fps, self.image_size = camera.name, camera.fps, camera.image_size
         self._camera, self._stream = camera, camera.images()

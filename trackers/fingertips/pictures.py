@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxfilters.trackers.app.video import caption
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event
-from jaxfilters.trackers.fingertips.files import name_of
 from jaxfilters.trackers.fingertips.state import MODE_NAMES, HandReport
+from jaxfilters.trackers.fingertips.table import name_of
 from jaxfilters.trackers.people.drawing import color_of
 
 WAY_FRAMES = 25

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxfilters.models.synthetic.desk_hand import DeskFrame
-from jaxfilters.trackers.fingertips.files import name_of
 from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.fingertips.table import name_of
 
 
 class Tally(NamedTuple):

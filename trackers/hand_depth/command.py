@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from jaxfilters.trackers.app.run import RunSpec, run
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.hand_depth.detect import check_unit
-from jaxfilters.trackers.hand_depth.drawing import write_overlay
+from jaxfilters.trackers.hand_depth.drawing import depth_range, draw_hand, write_overlay
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.hand_depth.summary import mean_joint_error, write_summary
 from jaxfilters.trackers.hand_depth.table import HAND_TABLE, TimedHandTrack
@@ -51,6 +51,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
         partial(_errors, sequence),
         partial(_draw_summary, sequence),
         partial(_draw_overlay, sequence),
+        partial(_pictures, sequence),
     )
 
 
@@ -72,3 +73,12 @@ def _draw_overlay(
     sequence: DepthSequence, path: Path, results: TimedHandTrack, rate: float, on_progress: Callable[[int], None]
 ) -> None:
     write_overlay(path, sequence, results, rate, on_progress)
+
+
+def _pictures(
+    sequence: DepthSequence, first: int, frames: list[np.ndarray], rows: TimedHandTrack
+) -> Iterator[np.ndarray]:
+    limits = depth_range(rows.joints)
+    for i, frame in enumerate(frames):
+        truth = None if sequence.joints is None else sequence.joints[first + i]
+        yield draw_hand(frame, sequence.camera, rows.joints[i], limits, truth)

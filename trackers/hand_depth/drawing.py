@@ -71,11 +71,19 @@ def draw_frame(sequence: DepthSequence, results: TimedHandTrack, index: int, lim
 
     `limits` are the depths (near, far) in metres that the colours span.
     """
-    scale = max(1, -(-_SMALLEST_HEIGHT // sequence.camera.shape[0]))
-    image = color_depth(sequence[index], *limits).repeat(scale, axis=0).repeat(scale, axis=1)
-    if sequence.joints is not None:
-        draw_skeleton(image, sequence.camera, sequence.joints[index], scale, color=_TRUTH_COLOR)
-    draw_skeleton(image, sequence.camera, results.joints[index], scale)
+    truth = None if sequence.joints is None else sequence.joints[index]
+    return draw_hand(sequence[index], sequence.camera, results.joints[index], limits, truth)
+
+
+def draw_hand(
+    depth: np.ndarray, camera: Pinhole, joints: np.ndarray, limits: tuple[float, float], truth: np.ndarray | None = None
+) -> np.ndarray:
+    """As `draw_frame`, of a depth image (rows, cols) in metres and joints (21, 3), metres in the camera frame."""
+    scale = max(1, -(-_SMALLEST_HEIGHT // camera.shape[0]))
+    image = color_depth(depth, *limits).repeat(scale, axis=0).repeat(scale, axis=1)
+    if truth is not None:
+        draw_skeleton(image, camera, truth, scale, color=_TRUTH_COLOR)
+    draw_skeleton(image, camera, joints, scale)
     return image
 
 

@@ -11,7 +11,7 @@ from jaxfilters.trackers.io.recording import check_times
 from jaxfilters.trackers.io.tables import Columns, read_table
 
 _WANTED = "expected .npz with points (frames, points, coordinates), or CSV with id, frame or time_s, and coordinates"
-_AXES = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("x_mm", "y_mm", "z_mm"), ("u", "v"))
+_AXES = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("x_mm", "y_mm", "z_mm"), ("x_px", "y_px"), ("u", "v"))
 _MOST_NUMBERS = 2**26
 """Of a table with a place for every point in every frame."""
 
@@ -19,8 +19,9 @@ _MOST_NUMBERS = 2**26
 def read_points(path: Path, fps: float) -> tuple[np.ndarray, np.ndarray]:
     """Points `(frames, points, coordinates)`, NaN where not observed, and times `(frames,)` in seconds.
 
-    The columns of a CSV are `id`, `frame` or `time_s`, and `x, y` and perhaps `z`, or the same with `_m` or `_mm`, or
-    `u, v`: `tips.csv` and `tracks.csv` of the trackers are such files. An `.npz` holds `points` and perhaps `t_s`.
+    The columns of a CSV are `id`, `frame` or `time_s`, and `x, y` and perhaps `z`, or the same with `_m`, `_mm` or
+    `_px`, or `u, v`: `track.csv` of `track people` and of `track fingertips` are such files. An `.npz` holds `points`
+    and perhaps `t_s`.
 
     Args:
         path: The file.

@@ -1,9 +1,12 @@
 """Images without lens distortion, by one map that is computed for the first of them."""
 
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 
 import cv2
 import numpy as np
+
+from jaxfilters.trackers.io.video_input import Moment
 
 
 class Undistortion:
@@ -60,3 +63,11 @@ class Undistortion:
         flat = np.asarray(uv, float).reshape(-1, 2)
         rays = np.linalg.solve(self.K, np.column_stack([flat, np.ones(len(flat))]).T).T
         return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)[0].reshape(np.shape(uv))
+
+
+def straightened(moments: Iterable[Moment], undistortions: Sequence[Undistortion]) -> Iterator[Moment]:
+    """Moments whose images have no lens distortion, one undistortion for each source."""
+    for moment in moments:
+        pairs = zip(moment.images, undistortions, strict=True)
+        images = tuple(None if image is None else undistortion.apply(image) for image, undistortion in pairs)
+        yield moment._replace(images=images)

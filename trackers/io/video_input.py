@@ -195,6 +195,8 @@ class ImageFolder:
 class LiveCamera:
     """A camera of this machine, read in a thread of its own: the newest image counts, what was missed is missed."""
 
+    is_live = True
+
     def __init__(self, number: int):
         self.name = f"camera {number}"
         self._capture = cv2.VideoCapture(number)
@@ -242,6 +244,11 @@ class LiveCamera:
         return self._trouble
 
 
+def is_live(source: Any) -> bool:
+    """Whether a source delivers images now, none of which comes twice."""
+    return getattr(source, "is_live", False)
+
+
 class Moment(NamedTuple):
     """What all sources have at one time."""
 
@@ -263,7 +270,7 @@ def continued(
         frames: Moments that the run has had.
         time_s: Of the last of them, seconds.
     """
-    if not any(isinstance(source, LiveCamera) for source in sources):
+    if not any(map(is_live, sources)):
         return itertools.islice(moments, frames, None)
     later_s = time_s + 1 / max(source.fps for source in sources) if frames else 0.0
     return (moment._replace(time_s=later_s + moment.time_s) for moment in moments)

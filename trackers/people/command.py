@@ -3,31 +3,33 @@
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfilters.trackers.app.progress import ProgressLine, warn
+from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.results import versions
-from jaxfilters.trackers.app.video import OverlayVideo, side_by_side
+from jaxfilters.trackers.app.stream import RunResult, StreamRun, StreamSpec, check_unused
 from jaxfilters.trackers.io.cameras import open_camera
 from jaxfilters.trackers.io.detections import read_detections
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
-from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.io.video_input import LiveCamera, continued, open_video, together
+from jaxfilters.trackers.io.undistortion import Undistortion, straightened
+from jaxfilters.trackers.io.video_input import is_live, open_video, together
 from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.detected import DetectedForeground
-from jaxfilters.trackers.people.drawing import drawn, write_plan
-from jaxfilters.trackers.people.files import TracksWriter, write_coco, write_mot, write_report
+from jaxfilters.trackers.people.drawing import write_plan
+from jaxfilters.trackers.people.files import by_frame, write_coco, write_mot
 from jaxfilters.trackers.people.recorded import Sighting
-from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleEstimate, PeopleSession
-from jaxfilters.trackers.people.state import TRACKED, PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.run import PeopleStream
+from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleSession
+from jaxfilters.trackers.people.state import PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.table import STATUS, as_rows, people_table
 from jaxfilters.trackers.people.tracker import people_scene
 
 
@@ -43,52 +45,55 @@ class Setup(NamedTuple):
     """Foreground from the boxes of a detector, one a camera; empty for background subtraction."""
 
 
-class RunResult(NamedTuple):
-    """What came of a run beside its tracks."""
-
-    frames: int
-    frames_per_second: float
-    """Without the first frame, which compiles; NaN until there are two."""
-    interrupted: bool
-
-
 def track(options: argparse.Namespace) -> str:
     """Follow everybody, and leave the results in `options.out`.
 
     Raises:
-        InputError: a source, a file or an option cannot be used.
+        InputError: a source, a file or an option cannot be used. What was tracked before is written.
         OutputError: the results cannot be written.
+        KeyboardInterrupt: before anything was tracked.
     """
+    check_unused(options)
     setup = _setup(options)
-    run = _identity(setup, options)
-    with closing(TracksWriter(options.out, setup.scene, run, resume=options.resume)) as writer:
-        return _tracked(setup, options, writer)
-
-
-def _tracked(setup: Setup, options: argparse.Namespace, writer: TracksWriter) -> str:
-    began = time.perf_counter()
     session = as_input_error(lambda: PeopleSession(setup.scene, setup.detected or options.background))
+    total = max((getattr(source, "frames", 0) for source in setup.sources), default=0) or None
+    moments = straightened(together(setup.sources), setup.undistortions)
+    spec = StreamSpec(
+        *(setup.sources, moments, partial(_trouble, setup.sources), PeopleStream(session)),
+        *(people_table(setup.scene), _identity(setup, options), total),
+    )
     session.prime(
         [
             [undistortion.apply(image) for image in source.sample(PRIMING_IMAGES)]
             for source, undistortion in zip(setup.sources, setup.undistortions, strict=True)
         ]
     )
-    writer.restore(session)
-    result = _run(setup, options, session, writer)
-    is_live = any(isinstance(source, LiveCamera) for source in setup.sources)
-    tracks = session.tracks.recorder.tracks if is_live else session.tracks.smoothed()
-    if not is_live:
-        writer.replace(tracks)
+    with closing(StreamRun(options, spec)) as run:
+        return _tracked(setup, options, session, run)
+
+
+def _tracked(setup: Setup, options: argparse.Namespace, session: PeopleSession, run: StreamRun) -> str:
+    began = time.perf_counter()
+    result = run.follow()
+    is_smoothed = not any(map(is_live, setup.sources))
+    tracks = session.tracks.smoothed() if is_smoothed else session.tracks.recorder.tracks
     if options.mot:
         write_mot(options.out / "tracks_mot.txt", setup.scene, setup.undistortions[0], tracks)
     if options.coco:
         write_coco(options.out / "tracks_coco.json", setup.scene, setup.undistortions[0], tracks)
-    write_plan(options.out / "plan.png", setup.scene, tracks)
-    report = _report(setup, options, result, tracks, not is_live, time.perf_counter() - began)
+    write_plan(options.out / "summary.png", setup.scene, tracks)
+    report = _report(setup, options, result, tracks, time.perf_counter() - began) | {
+        "frames": run.writer.frames,
+        "smoothed": is_smoothed,
+    }
     report["trouble"] += session.trouble()
-    write_report(options.out / "report.json", report)
+    run.writer.finish(report, as_rows(by_frame(tracks)) if is_smoothed else None, status_names=np.asarray(STATUS))
+    run.conclude(result)
     return _summary(report, options)
+
+
+def _trouble(sources: Sequence[Any]) -> list[str]:
+    return [trouble for source in sources if (trouble := source.trouble())]
 
 
 def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
@@ -105,7 +110,7 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _setup(options: argparse.Namespace) -> Setup:
-    config = as_input_error(lambda: PeopleConfig(**({"capacity": options.capacity} if options.capacity else {})))
+    config = as_input_error(partial(config_from_args, PeopleConfig, options))
     if not options.sources:
         if options.camera or options.scene or options.detections:
             raise InputError("--camera, --scene, --detections: of no use without a video, as for the synthetic room.")
@@ -165,70 +170,24 @@ def _demo_sources(room: DemoRoom) -> list[Any]:
     return [_DemoSource(room, camera) for camera in range(len(room.cameras))]
 
 
-def _run(setup: Setup, options: argparse.Namespace, session: PeopleSession, writer: TracksWriter) -> RunResult:
-    total = max((getattr(source, "frames", 0) for source in setup.sources), default=0) or None
-    first, ends = session.tracks.frames, list[float]()
-    video, interrupted = None, False
-    name = f"overlay_from_{first}.mp4" if first else "overlay.mp4"
-    try:
-        with ProgressLine("tracking", total, done=first) as line:
-            for moment in continued(together(setup.sources), setup.sources, first, session.tracks.time_s):
-                images = [
-                    None if image is None else undistortion.apply(image)
-                    for image, undistortion in zip(moment.images, setup.undistortions, strict=True)
-                ]
-                now = session.process(images, moment.time_s)
-                writer.append(now.added)
-                writer.checkpoint(session)
-                if options.video:
-                    video = _draw(video, options.out / name, setup, session, now)
-                ends.append(time.perf_counter())
-                inside = int(np.sum(now.people.mode == TRACKED))
-                done = now.frame + 1 if total is None else min(now.frame + 1, total)
-                line.show(done, f"{inside} {'person' if inside == 1 else 'people'}")
-                if options.seconds and now.time_s >= options.seconds:
-                    break
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        if video is not None:
-            video.close()
-    rate = (len(ends) - 1) / (ends[-1] - ends[0]) if len(ends) > 1 else float("nan")
-    return RunResult(session.tracks.frames, rate, interrupted)
-
-
-def _draw(
-    video: OverlayVideo | None, path: Path, setup: Setup, session: PeopleSession, now: PeopleEstimate
-) -> OverlayVideo:
-    views = zip(session.last_images, session.last_outlines, strict=True)
-    picture = side_by_side([drawn(image, outline, now.people) for image, outline in views], now.time_s)
-    if video is None:
-        video = OverlayVideo(path, max(source.fps for source in setup.sources), picture.shape)
-    video.write(picture)
-    return video
-
-
 def _report(
     setup: Setup,
     options: argparse.Namespace,
     result: RunResult,
     tracks: dict[int, list[Sighting]],
-    is_smoothed: bool,
     seconds: float,
 ) -> dict[str, Any]:
     rate = result.frames_per_second
     return {
         "input": [source.name for source in setup.sources],
-        "frames": result.frames,
         "frames_per_second": round(rate, 2) if rate == rate else None,
         "seconds": round(seconds, 2),
         "people": len(tracks),
-        "smoothed": is_smoothed,
         "interrupted": result.interrupted,
-        "trouble": [trouble for source in setup.sources if (trouble := source.trouble())],
+        "trouble": result.trouble,
         "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
         "background": "detections" if setup.detected else options.background,
-        "config": {name: getattr(setup.scene.config, name) for name in setup.scene.config.__dataclass_fields__},
+        "config": asdict(setup.scene.config),
         "versions": versions(),
     }
 
@@ -244,8 +203,6 @@ def _demo_error(room: DemoRoom, tracks: dict[int, list[Sighting]]) -> float | No
 
 
 def _summary(report: dict[str, Any], options: argparse.Namespace) -> str:
-    for trouble in report["trouble"]:
-        warn(trouble)
     speed = report["frames_per_second"]
     return (
         f"{report['frames']} frames in {report['seconds']:.1f} s"
@@ -253,7 +210,7 @@ def _summary(report: dict[str, Any], options: argparse.Namespace) -> str:
         + f", {report['people']} people"
         + (f", mean error {report['mean_error_m']:.2f} m" if report["mean_error_m"] is not None else "")
         + (", interrupted" if report["interrupted"] else "")
-        + f"\nresults in {options.out}: tracks.csv, plan.png, report.json"
+        + f"\nresults in {options.out}: track.csv, track.npz, report.json, summary.png"
         + (", overlay.mp4" if options.video else "")
         + (", tracks_mot.txt" if options.mot else "")
         + (", tracks_coco.json" if options.coco else "")

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from jaxfilters.trackers.app.argument_types import positive_integer
-from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.app.options import add_config, add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.people.config import PeopleConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="boxes of any detector (MOT text or COCO .json) in place of background subtraction, one for each source",
     )
-    parser.add_argument(
-        "--capacity", type=positive_integer, metavar="N", help="people at a time, at most (default: 32)"
-    )
+    add_config(parser, PeopleConfig, "capacity", "height_m", "height_sd_m", "memory_s", "hidden_s")
     add_video_options(parser)
     add_resume(parser)
     parser.add_argument("--mot", action="store_true", help="write tracks_mot.txt as well (MOT challenge)")

@@ -13,7 +13,7 @@ from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.state import HEIGHT, STATE, TENTATIVE, TRACKED, People, PeopleConfig, Report
+from jaxfilters.trackers.people.state import STATE, TENTATIVE, TRACKED, People, PeopleConfig, Report
 
 
 class Sighting(NamedTuple):
@@ -183,8 +183,3 @@ def _backward(config: PeopleConfig, beliefs: Gaussian, steps: jax.Array, length:
     is_last = jnp.arange(len(steps)) >= length - 1
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
     return jax.lax.scan(back, last, (beliefs, steps, is_last), reverse=True)[1]
-
-
-def height_of(seen: Sighting) -> float:
-    """Metres."""
-    return float(seen.mean[HEIGHT])

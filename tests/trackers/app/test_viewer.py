@@ -60,15 +60,15 @@ def test_long_videos_are_thinned_out_and_resumed_ones_joined(tmp_path, monkeypat
 
 
 def test_people_have_a_plan_and_a_line_each(tmp_path):
-    rows = ["frame,id,x_m,y_m,score,mode", "0,4,1,2,0.5,tracked", "1,4,1.5,2,0.5,hidden", "1,7,0,0,0.1,tracked"]
-    (tmp_path / "tracks.csv").write_text("\n".join(rows))
+    rows = ["frame,id,x_m,y_m,score,status", "0,4,1,2,0.5,tracking", "1,4,1.5,2,0.5,predicted", "1,7,0,0,0.1,tracking"]
+    (tmp_path / "track.csv").write_text("\n".join(rows))
     data = data_of(page_of(tmp_path))
     assert data["plan"] == [
         {"name": "4", "frame": [0, 1], "x": [1.0, 1.5], "y": [2.0, 2.0]},
         {"name": "7", "frame": [1], "x": [0.0], "y": [0.0]},
     ]
     assert [line["name"] for line in data["charts"][0]["lines"]] == ["x 4", "x 7"]
-    assert data["rows"][1] == [1, "4", "1.5", "2", "0.5", "hidden"]
+    assert data["rows"][1] == [1, "4", "1.5", "2", "0.5", "predicted"]
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,9 @@ def test_columns_have_the_names_of_the_state_and_units():
 
 def test_a_row_is_the_track_at_one_frame(perfect_track):
     table = articulated_table(Layout(2))
-    cells = dict(zip(table.columns, table.numbers(perfect_track).T, strict=True))
+    parts = [part.values(perfect_track).reshape(len(perfect_track.times_s), -1) for part in table.parts]
+    numbers = np.concatenate(parts, axis=1)
+    cells = dict(zip(table.columns, numbers.T, strict=True))
     names = Layout(2).names
     np.testing.assert_array_equal(cells["theta_13_rad"], perfect_track.mean[:, names.index("theta_13")])
     np.testing.assert_array_equal(cells["r_h_px"], perfect_track.mean[:, names.index("r_h")])

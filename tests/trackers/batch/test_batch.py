@@ -140,5 +140,5 @@ def test_a_second_command_finishes_what_a_killed_one_began(tmp_path):
     assert {row["name"]: (row["status"], row["attempts"]) for row in rows} == {
         other: ("done", 1 + (other == name)) for other in "abc"
     }
-    assert len({(out / other / "tips.csv").read_bytes() for other in "abc"}) == 1
+    assert len({(out / other / "track.csv").read_bytes() for other in "abc"}) == 1
     assert "continuing after frame" in (out / ".batch" / "logs" / f"{name}.txt").read_text()

@@ -10,14 +10,14 @@ import pytest
 
 from jaxfilters.models.synthetic.desk_hand import desk_video
 from jaxfilters.models.synthetic.strokes import drawn, tracked
+from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
-from jaxfilters.trackers.fingertips import files
 from jaxfilters.trackers.fingertips.command import recogniser_of
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event, Stroke
-from jaxfilters.trackers.fingertips.files import COLUMNS, tip_rows
 from jaxfilters.trackers.fingertips.input import LiveHands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures, in_words
 from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.fingertips.table import TIP_TABLE, tip_rows
 from jaxfilters.trackers.io.gesture_models import default_symbols
 
 OPEN, REST = 25, 45
@@ -53,16 +53,15 @@ def results(recording, tmp_path_factory):
 @pytest.mark.system
 def test_fingertips_are_where_they_are(recording, results):
     _, frames = recording
-    with (results / "tips.csv").open() as file:
+    with (results / "track.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == COLUMNS
     numbers = [int(row["frame"]) for row in rows]
     assert numbers == sorted(numbers)
     by_frame = {i: [row for row in rows if int(row["frame"]) == i] for i in range(len(frames))}
     assert all(len(by_frame[i]) == 5 for i in range(5, OPEN - 3))
     assert all(len(by_frame[i]) == 1 for i in range(OPEN + 16, len(frames)))
     apart = [
-        np.linalg.norm(frames[i].tips[frames[i].extended] - [float(row["x"]), float(row["y"])], axis=1).min()
+        np.linalg.norm(frames[i].tips[frames[i].extended] - [float(row["x_px"]), float(row["y_px"])], axis=1).min()
         for i in (*range(5, OPEN - 3), *range(OPEN + 16, len(frames)))
         for row in by_frame[i]
     ]
@@ -70,9 +69,9 @@ def test_fingertips_are_where_they_are(recording, results):
     names = {row["id"] for row in rows}
     assert names == {f"0-{i}" for i in range(5)}
     (thumb,) = {row["id"] for row in by_frame[15] if row["is_thumb"] == "1"}
-    (place,) = [[float(row["x"]), float(row["y"])] for row in by_frame[15] if row["id"] == thumb]
+    (place,) = [[float(row["x_px"]), float(row["y_px"])] for row in by_frame[15] if row["id"] == thumb]
     assert np.linalg.norm(frames[15].tips[0] - place) < 3
-    assert {row["status"] for row in rows} == {"observed", "coasted"}
+    assert {row["status"] for row in rows} == {"tracking", "predicted"}
 
 
 @pytest.mark.system
@@ -108,16 +107,16 @@ def test_hands_in_depth_images_lie_above_the_desk(recording, tmp_path):
 
 @pytest.mark.system
 def test_tips_of_another_run_are_not_overwritten(recording, results, capsys):
-    before = (results / "tips.csv").read_bytes()
+    before = (results / "track.csv").read_bytes()
     assert main(["track", "fingertips", str(recording[0]), "--out", str(results)]) == 2
     assert "another run" in capsys.readouterr().err
-    assert (results / "tips.csv").read_bytes() == before
+    assert (results / "track.csv").read_bytes() == before
 
 
 @pytest.mark.system
 def test_a_run_that_was_killed_is_resumed_bit_for_bit(recording, results, tmp_path, monkeypatch, capsys):
     out, command = tmp_path / "run", ["track", "fingertips", str(recording[0]), "--out", str(tmp_path / "run")]
-    monkeypatch.setattr(files, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
     drawn = FingertipPictures.drawn
 
     def killed(self, image, frame, *rest):
@@ -131,16 +130,16 @@ def test_a_run_that_was_killed_is_resumed_bit_for_bit(recording, results, tmp_pa
     assert main([*command, "--resume", "--hands", "2"]) == 2
     assert "hands was '1' and is '2'" in capsys.readouterr().err
     assert main([*command, "--resume"]) == 0
-    for name in ("tips.csv", "events.jsonl"):
+    for name in ("track.csv", "events.jsonl"):
         assert (out / name).read_bytes() == (results / name).read_bytes()
     one, other = (json.loads((folder / "report.json").read_text()) for folder in (out, results))
     for timed in ("seconds", "frames_per_second"):
         del one[timed], other[timed]
     assert one == other
     assert (out / "overlay_from_31.mp4").exists()
-    (out / "tips.csv").write_text("cut")
+    (out / "events.jsonl").unlink()
     assert main([*command, "--resume"]) == 2
-    assert "tips.csv: cannot be continued" in capsys.readouterr().err
+    assert "events.jsonl: cannot be continued" in capsys.readouterr().err
 
 
 def test_a_desk_without_a_hand_is_followed_to_its_end(tmp_path, capsys):
@@ -148,7 +147,7 @@ def test_a_desk_without_a_hand_is_followed_to_its_end(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["track", "fingertips", str(tmp_path / "desk.mp4"), "--out", str(out), "--no-video"]) == 0
     assert "no open hand" in capsys.readouterr().err
-    assert len((out / "tips.csv").read_text().splitlines()) == 1
+    assert len((out / "track.csv").read_text().splitlines()) == 1
     assert json.loads((out / "report.json").read_text())["frames_by_count"] == {"0": 5}
 
 
@@ -192,7 +191,7 @@ def two_hands():
         is_observed=np.array([[True, False], [False, True]]),
         position=np.full((2, 2, 2), 30.0),
         sd=np.ones((2, 2)),
-        velocity=np.zeros((2, 2, 2)),
+        velocity=np.full((2, 2, 2), 1.5),
         is_thumb=np.array([[False, False], [True, False]]),
         thumb_probability=np.array([[0.1, 0], [0.9, 0.2]]),
         palm=np.full((2, 2), 50.0),
@@ -205,11 +204,17 @@ def two_hands():
 
 
 def test_names_begin_with_the_hand():
-    rows = tip_rows(7, 0.25, two_hands())
-    assert [row[:4] for row in rows] == [
-        [7, "0.250000", hand, name] for hand, name in ((0, "0-4"), (1, "1-0"), (1, "1-1"))
+    names = ["frame", "time_s", *TIP_TABLE.columns, "status"]
+    rows = [dict(zip(names, row, strict=True)) for row in TIP_TABLE.rows(7, tip_rows(7, 0.25, two_hands()))]
+    assert [(row["frame"], row["time_s"], row["hand"], row["id"]) for row in rows] == [
+        (7, "0.250000", hand, name) for hand, name in (("0", "0-4"), ("1", "1-0"), ("1", "1-1"))
     ]
-    assert [row[9:11] for row in rows] == [["observed", 0], ["coasted", 1], ["observed", 0]]
+    assert [(row["status"], row["is_thumb"]) for row in rows] == [
+        ("tracking", "0"),
+        ("predicted", "1"),
+        ("tracking", "0"),
+    ]
+    assert {row["vx_px_per_s"] for row in rows} == {"45"}  # 1.5 pixels in 1/30 s
 
 
 def test_pictures_leave_the_image_as_it_is():

@@ -92,14 +92,14 @@ def test_keypoints_are_followed_to_names_thumbs_modes_and_symbols(tmp_path):
     assert main(["track", "fingertips", "--keypoints", str(path), "--image-size", "640x480", "--out", str(out)]) == 0
     report = json.loads((out / "report.json").read_text())
     assert (report["frames"], report["open_hand"], report["fingertips"]) == (len(frames), True, 5)
-    with (out / "tips.csv").open() as file:
+    with (out / "track.csv").open() as file:
         rows = list(csv.DictReader(file))
     thumbs = {row["id"] for row in rows if row["is_thumb"] == "1" and row["frame"] == "15"}
     near = [
         row
         for row in rows
         if row["frame"] == "15"
-        and np.hypot(float(row["x"]) - frames[15][0][4, 0], float(row["y"]) - frames[15][0][4, 1]) < 3
+        and np.hypot(float(row["x_px"]) - frames[15][0][4, 0], float(row["y_px"]) - frames[15][0][4, 1]) < 3
     ]
     assert thumbs == {row["id"] for row in near}
     symbols = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]

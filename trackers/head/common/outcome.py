@@ -1,21 +1,21 @@
 """What came of a run of a head: `report.json`, and a few lines for a person."""
 
 import argparse
-import math
 from typing import Any
 
 import numpy as np
 
-from jaxfilters.trackers.app.results import versions
+from jaxfilters.trackers.app.results import finite, versions
+from jaxfilters.trackers.app.stream import RunResult
 from jaxfilters.trackers.head.common.report import errors, shares
-from jaxfilters.trackers.head.common.run import HeadRun, RunResult
+from jaxfilters.trackers.head.common.run import HeadRun
 from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, displayed
 
 
 def run_report(run: HeadRun, followed: RunResult) -> dict[str, Any]:
     """What `report.json` says of any run of a head."""
-    results, place = run.writer.results, run.place
-    events = [{"frame": run.frame_of[min(i, len(run.frame_of) - 1)], "what": what} for i, what in run.session.events]
+    results, place, frame_of = run.writer.results, run.stream.place, run.stream.frame_of
+    events = [{"frame": frame_of[min(i, len(frame_of) - 1)], "what": what} for i, what in run.stream.session.events]
     return {
         "input": [source.name for source in place.sources],
         **shares(results),
@@ -53,8 +53,3 @@ def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
         + (", overlay.mp4" if options.video else "")
     )
     return "\n".join(lines)
-
-
-def finite(value: float) -> float | None:
-    """A number for JSON."""
-    return round(value, 3) if math.isfinite(value) else None

@@ -13,6 +13,8 @@ from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, HEAD_STA
 
 STATUS_WORDS = (*HEAD_STATUS, "skipped")
 """Words for the integers in `TimedHeadTrack.status`; skipped: without an image of each camera."""
+TABLE_STATUS = ("searching", "tracking", "tracking", "lost", "doubtful", "skipped")
+"""The same in tables, in the words of all trackers; `is_deformable` tells the two that are tracked apart."""
 SKIPPED = len(HEAD_STATUS)
 TRACKED = (RIGID, DEFORMABLE, DOUBTFUL)
 """Statuses in which there is a pose."""
@@ -70,15 +72,21 @@ class TimedHeadTrack(NamedTuple):
     """(frames,) int32: places in `STATUS_WORDS`."""
 
 
+def is_deformable(track: HeadRows) -> np.ndarray:
+    """(frames,) 1 where the head is tracked with a deformation, otherwise 0."""
+    return (track.status == DEFORMABLE).astype(int)
+
+
 HEAD_TABLE = TrackTable(
     TimedHeadTrack,
     (
         Columns(AXES, attrgetter("pose")),
         Columns(STD_AXES, attrgetter("pose_std")),
         Columns(tuple(f"deformation_{i}_m" for i in range(1, NUM_MODES + 1)), attrgetter("deformation")),
+        Columns(("is_deformable",), is_deformable),
         Columns(("score",), attrgetter("score")),
     ),
-    STATUS_WORDS,
+    TABLE_STATUS,
 )
 """How the track of a head before the cameras of a rig becomes rows."""
 

@@ -13,11 +13,13 @@ from jaxfilters.models.face.person_prior import eyes_apart
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
+from jaxfilters.trackers.app.results import finite
+from jaxfilters.trackers.app.stream import check_unused
 from jaxfilters.trackers.head.common.input import setup_of_one
-from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
+from jaxfilters.trackers.head.common.outcome import format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
-from jaxfilters.trackers.head.common.table import STATUS_WORDS
+from jaxfilters.trackers.head.common.table import TABLE_STATUS
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector, best_detector
@@ -27,7 +29,7 @@ from jaxfilters.trackers.io.enrolled_people import People, read_people, write_pe
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model, people_face_model
 from jaxfilters.trackers.io.landmark_sets import NAMES_68
-from jaxfilters.trackers.io.video_input import LiveCamera
+from jaxfilters.trackers.io.video_input import is_live
 
 PERSON_FILE = "person.npz"
 _GIVEN = ("model", "camera", "points", "known", "detector")
@@ -44,10 +46,11 @@ def track(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
+    check_unused(options)
     settings = as_input_error(partial(config_from_args, MonoConfig, options))
     model = _model(options)
     place = setup_of_one(options)
-    if any(isinstance(source, LiveCamera) for source in place.sources):
+    if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     face = tracked(model.model)
     known = None if options.known is None else read_people(options.known, face)
@@ -70,7 +73,7 @@ def _tracked(
     known: People | None,
     detected_by: str,
 ) -> str:
-    place, face = run.place, tracked(model.model)
+    place, face = run.stream.place, tracked(model.model)
     if place.note:
         warn(f"{place.note}: distances are wrong in proportion")
     followed = run.follow()
@@ -149,7 +152,7 @@ def _taken_for(run: HeadRun, known: People | None) -> dict[str, int]:
 
 def _learnt(session: MonoSession) -> dict[str, np.ndarray]:
     """What `track.npz` holds beside the track."""
-    learnt = {"status_names": np.asarray(STATUS_WORDS)}
+    learnt = {"status_names": np.asarray(TABLE_STATUS)}
     if session.person is not None:
         learnt |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
     return learnt

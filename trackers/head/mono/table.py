@@ -8,7 +8,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.trackers.app.results import Columns, TrackTable
-from jaxfilters.trackers.head.common.table import AXES, STATUS_WORDS, STD_AXES, pose_in_metres
+from jaxfilters.trackers.head.common.table import AXES, STD_AXES, TABLE_STATUS, is_deformable, pose_in_metres
 from jaxfilters.trackers.head.mono.state import MonoTrack
 
 
@@ -40,7 +40,7 @@ class TimedMonoTrack(NamedTuple):
     is_adjusted: np.ndarray
     """(frames,) 1 where the face was adjusted."""
     status: np.ndarray
-    """(frames,) int32: places in `STATUS_WORDS`."""
+    """(frames,) int32: places in `TABLE_STATUS`."""
 
 
 def mono_table(face: MultilinearFace) -> TrackTable:
@@ -52,9 +52,10 @@ def mono_table(face: MultilinearFace) -> TrackTable:
         Columns(STD_AXES, attrgetter("pose_std")),
         Columns(expressions, attrgetter("deformation")),
         Columns(identities, attrgetter("identity")),
+        Columns(("is_deformable",), is_deformable),
         *(Columns((name,), attrgetter(name)) for name in ("who", "is_adjusted", "score")),
     )
-    return TrackTable(TimedMonoTrack, columns, STATUS_WORDS)
+    return TrackTable(TimedMonoTrack, columns, TABLE_STATUS)
 
 
 def mono_in_metres(track: MonoTrack) -> MonoTrack:

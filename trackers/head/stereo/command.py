@@ -10,15 +10,17 @@ import numpy as np
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
+from jaxfilters.trackers.app.results import finite
+from jaxfilters.trackers.app.stream import check_unused
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.input import Setup, setup_of
-from jaxfilters.trackers.head.common.outcome import finite, format_report, run_report
+from jaxfilters.trackers.head.common.outcome import format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
 from jaxfilters.trackers.head.common.summary import write_summary
-from jaxfilters.trackers.head.common.table import HEAD_TABLE, STATUS_WORDS, empty_rows, in_metres
+from jaxfilters.trackers.head.common.table import HEAD_TABLE, TABLE_STATUS, empty_rows, in_metres
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.io.errors import InputError, as_input_error
-from jaxfilters.trackers.io.video_input import LiveCamera
+from jaxfilters.trackers.io.video_input import is_live
 
 
 def track(options: argparse.Namespace) -> str:
@@ -29,9 +31,10 @@ def track(options: argparse.Namespace) -> str:
         OutputError: the results cannot be written.
         KeyboardInterrupt: before anything was tracked.
     """
+    check_unused(options)
     settings = as_input_error(partial(config_from_args, HeadConfig, options))
     place = setup_of(options)
-    if any(isinstance(source, LiveCamera) for source in place.sources):
+    if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     session = as_input_error(lambda: _session(place, settings))
     rows = RowsOf(HEAD_TABLE, in_metres, partial(empty_rows, place.rig.num_cameras))
@@ -40,8 +43,8 @@ def track(options: argparse.Namespace) -> str:
 
 
 def _tracked(options: argparse.Namespace, settings: HeadConfig, run: HeadRun, session: HeadSession) -> str:
-    if run.place.note:
-        warn(run.place.note)
+    if run.stream.place.note:
+        warn(run.stream.place.note)
     followed = run.follow()
     report = run_report(run, followed) | {
         "explained_contribution": finite(float(session.contribution)),
@@ -52,7 +55,7 @@ def _tracked(options: argparse.Namespace, settings: HeadConfig, run: HeadRun, se
         },
     }
     run.writer.finish(report, **_learnt(session))
-    truth = None if run.place.truth is None else run.place.truth.poses
+    truth = None if run.stream.place.truth is None else run.stream.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
     run.conclude(followed)
     return format_report(report, options)
@@ -70,7 +73,7 @@ def _session(place: Setup, settings: HeadConfig) -> HeadSession:
 
 def _learnt(session: HeadSession) -> dict[str, np.ndarray]:
     """What `track.npz` holds beside the track."""
-    learnt = {"status_names": np.asarray(STATUS_WORDS)}
+    learnt = {"status_names": np.asarray(TABLE_STATUS)}
     if session.model is not None:
         names = ("mean", "basis", "deviation", "templates")
         learnt |= {f"model_{name}": np.asarray(getattr(session.model, name)) for name in names}

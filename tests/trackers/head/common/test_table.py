@@ -22,7 +22,8 @@ from jaxfilters.trackers.head.common.table import (
 
 COLUMNS = (
     "frame,time_s,x_m,y_m,z_m,roll_rad,yaw_rad,pitch_rad,x_std_m,y_std_m,z_std_m,roll_std_rad,yaw_std_rad,"
-    "pitch_std_rad,deformation_1_m,deformation_2_m,deformation_3_m,deformation_4_m,deformation_5_m,score,status"
+    "pitch_std_rad,deformation_1_m,deformation_2_m,deformation_3_m,deformation_4_m,deformation_5_m,is_deformable,"
+    "score,status"
 )
 TWO, ONE = partial(empty_rows, 2), partial(empty_rows, 1)
 
@@ -53,8 +54,8 @@ def test_rows_are_in_metres_and_radians(tmp_path):
     expected |= {"pitch_std_rad": 0.03, "yaw_std_rad": 0.02, "deformation_1_m": 1e-3, "deformation_2_m": 2e-3}
     expected |= {"deformation_3_m": 0, "deformation_5_m": 0, "score": 0.75}
     assert {name: float(row[name]) for name in expected} == pytest.approx(expected, rel=1e-6)
-    assert (row["frame"], row["time_s"], row["status"]) == ("0", "0.000000", "rigid")
-    assert lines[2].endswith("deformable")
+    assert (row["frame"], row["time_s"], row["status"]) == ("0", "0.000000", "tracking")
+    assert [one["is_deformable"] for one in csv.DictReader(lines)] == ["0", "1"]
 
 
 def test_pictures_show_millimetres_and_degrees_with_pitch_before_yaw():

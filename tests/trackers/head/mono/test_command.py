@@ -106,7 +106,7 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     assert {file.name for file in out.iterdir()} == OUTPUTS
     with (out / "track.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["status"] for row in rows] == ["initialising"] * 2 + ["deformable"] * (FRAMES - 2)
+    assert [row["status"] for row in rows] == ["searching"] * 2 + ["tracking"] * (FRAMES - 2)
     assert float(rows[7]["x_m"]) == pytest.approx(0.107, rel=1e-5)
     assert float(rows[7]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
     assert (float(rows[7]["expression_5"]), float(rows[7]["identity_15"])) == (0.25, 1.5)
@@ -125,7 +125,7 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     with np.load(out / "track.npz") as track:
         assert track["identity"].shape == (FRAMES, 15)
         assert track["person_identity"].shape == (15,)
-        assert track["status_names"][int(track["status"][5])] == "deformable"
+        assert track["status_names"][int(track["status"][5])] == "tracking"
     captured = capsys.readouterr()
     assert "assumed focal length" in captured.err
     assert "90 % tracked" in captured.out

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.landmarks import NAMES
+from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.head.common import input as head_input
-from jaxfilters.trackers.head.common import run as head_run
 from jaxfilters.trackers.head.stereo import command as head_command
 from jaxfilters.trackers.io.cameras import write_camera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.landmarks import read_landmarks
 from jaxfilters.trackers.io.rigs import RigCamera, write_rig
-from jaxfilters.trackers.io.video_input import ImageFolder
+from jaxfilters.trackers.io.video_input import ImageFolder, LiveCamera
 
 ROWS, COLS, FRAMES = 48, 64, 20
 K = np.array([[80.0, 0, 31.5], [0, 80, 23.5], [0, 0, 1]])
@@ -70,11 +70,13 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     assert {file.name for file in out.iterdir()} == OUTPUTS
     rows = rows_of(out)
     assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
-    words = ["initialising"] * 2 + ["rigid"] * 4 + ["deformable"] * 4 + ["lost"] * 2 + ["deformable"] * 8
+    words = ["searching"] * 2 + ["tracking"] * 8 + ["lost"] * 2 + ["tracking"] * 8
     assert [row["status"] for row in rows] == words
+    deformable = [i for i, row in enumerate(rows) if row["is_deformable"] == "1"]
+    assert deformable == [i for i in range(6, FRAMES) if i not in (10, 11)]
     # Every image went to the session once, in its place: the stand-in says what it saw.
     seen = [
-        tuple(1000 * float(row[name]) for name in ("x_m", "y_m", "z_m")) for row in rows if row["status"] in words[2:7]
+        tuple(1000 * float(row[name]) for name in ("x_m", "y_m", "z_m")) for row in rows if row["status"] == "tracking"
     ]
     expected = [(100 + i, 120 + 2 * i, 1000 * i / 30) for i in range(2, FRAMES) if i not in (10, 11)]
     np.testing.assert_allclose(seen, expected, rtol=1e-5)
@@ -111,7 +113,7 @@ def test_a_dropped_frame_is_a_row_without_a_pose(stereo, fake_head, tmp_path, ca
     out = tmp_path / "out"
     assert run(*stereo, "--out", out) == 0
     rows = rows_of(out)
-    assert [row["status"] for row in rows[6:9]] == ["deformable", "skipped", "deformable"]
+    assert [row["status"] for row in rows[6:9]] == ["tracking", "skipped", "tracking"]
     assert np.isnan([float(rows[7][name]) for name in ("x_m", "yaw_rad", "deformation_1_m", "score")]).all()
     # The frames after it still come in pairs of one moment.
     assert (float(rows[8]["x_m"]), float(rows[8]["y_m"])) == pytest.approx((0.108, 0.136), rel=1e-6)
@@ -175,7 +177,7 @@ def test_ctrl_c_writes_what_there_is(stereo, fake_head, tmp_path, monkeypatch, c
 def test_an_interrupted_run_is_resumed_bit_for_bit(stereo, fake_head, tmp_path, monkeypatch, capsys, kept_until):
     """Ended by an error that nobody foresaw in the frames after the last checkpoint, or before the first one."""
     process = head_command.HeadSession.process
-    monkeypatch.setattr(head_run, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert run(*stereo, "--out", whole) == 0
 
@@ -264,7 +266,7 @@ def test_without_a_recording_the_synthetic_face_is_followed(fake_head, tmp_path,
 def test_live_cameras_are_followed_image_by_image(stereo, fake_head, tmp_path, monkeypatch, capsys):
     """A folder poses as a camera that stops: each pair is tracked at once, the stop is said, results are there."""
 
-    class Live(head_command.LiveCamera):
+    class Live(LiveCamera):
         def __init__(self, number):
             self._folder = ImageFolder(stereo[number], 30.0)
             self.name, self.fps, self.image_size = f"camera {number}", 30.0, self._folder.image_size
