@@ -1,4 +1,4 @@
-"""Two real, calibrated, synchronised cameras of one street, PETS 2009 S2.L1 views 1 and 6, beside each of them alone."""
+"""Two real, synchronised cameras of one street, PETS 2009 S2.L1 views 1 and 6, beside each of them alone."""
 
 import csv
 import itertools

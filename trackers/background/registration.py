@@ -178,7 +178,7 @@ class Registration:
         window = cv2.createHanningWindow(grey.shape[::-1], cv2.CV_32F)
         (u, v), _ = cv2.phaseCorrelate(self._reference.astype(np.float32), grey.astype(np.float32), window)
         middle = (np.array(grey.shape[::-1]) - 1) / 2
-        rays = self._rays(np.array([middle, middle + [u, v]]), step)
+        rays = self._rays(np.stack([middle, middle + np.array([u, v])]), step)
         axis = np.cross(rays[0], rays[1])
         return cv2.Rodrigues(axis)[0]
 

@@ -3,7 +3,7 @@
 A temporal median takes whoever stands still for half of a recording for the room. A detector of upright people
 (N. Dalal, B. Triggs, "Histograms of oriented gradients for human detection", 2005, as trained by OpenCV) finds them in
 the sampled images. It also answers to railings and doors; only boxes count that have the size of a person who stands on
-the floor there. Where somebody covers a pixel in all images, the room behind is interpolated from its surroundings (A.
+the floor there. Where a person covers a pixel in all images, the room behind is interpolated from its surroundings (A.
 Telea 2004), unless nothing moves there at all: then it is a thing.
 """
 
@@ -70,7 +70,7 @@ def standing_boxes(camera: FloorCamera, floor: np.ndarray, image: np.ndarray) ->
     if any(size < need for size, need in zip(scaled.shape[:2], detector.winSize[::-1], strict=True)):
         return np.zeros((0, 4))
     detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
-    found, scores = detector.detectMultiScale(
+    found, _ = detector.detectMultiScale(
         scaled, hitThreshold=_LEAST_SCORE, winStride=(8, 8), padding=(16, 16), scale=1.1, groupThreshold=0
     )
     if not len(found):

@@ -1,4 +1,4 @@
-"""The room behind people who never leave: figures of the detector's liking before a room of which every pixel is known."""
+"""The room behind people who never leave: flat figures in given boxes before a room of which every pixel is known."""
 
 import cv2
 import numpy as np
@@ -76,7 +76,7 @@ def test_only_boxes_of_the_size_of_people_on_the_floor_count():
     assert counts(1.0, 2.0, 1.5)
     assert not counts(0.0, 0.0, 1.1)
     assert not counts(0.0, 0.0, 2.4)
-    assert not counts(0.0, 0.0, 1.7, floor=FLOOR + [10.0, 0.0])
+    assert not counts(0.0, 0.0, 1.7, floor=FLOOR + np.array([10.0, 0.0]))
 
 
 def test_a_room_without_people_is_left_as_it_is(room):
