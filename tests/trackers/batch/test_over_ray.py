@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 
 import pytest
 
@@ -17,7 +18,7 @@ def test_a_task_for_each_gpu_or_for_each_machine_without_one():
 
 def test_without_ray_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])
-    monkeypatch.setattr("jaxfilters.trackers.batch.over_ray.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "ray", None)
     (tmp_path / "manifest.json").write_text(json.dumps([{"name": "a", "tracker": "fingertips"}]))
     assert main(["batch", str(tmp_path / "manifest.json"), "--out", str(tmp_path / "out"), "--ray", "auto"]) == 2
     assert "jaxfilters[ray]" in capsys.readouterr().err
@@ -38,4 +39,4 @@ def test_a_cluster_of_one_machine_tracks_and_reports(tmp_path, monkeypatch):
     found = {row["name"]: row for row in json.loads((out / "report.json").read_text())}
     assert (found["drawn"]["status"], found["missing"]["status"]) == ("done", "failed")
     assert "nothing.npz" in found["missing"]["error"]
-    assert (out / "drawn" / "tips.csv").read_text().count("\n") > 10
+    assert (out / "drawn" / "track.csv").read_text().count("\n") > 10
