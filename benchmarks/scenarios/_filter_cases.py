@@ -162,7 +162,9 @@ def hidden_markov(setting: Setting) -> Metrics:
 
 def first_call(setting: Setting, what: str, library: str) -> Metrics:
     """What the first call costs in a fresh process, compilation included; `what` is `ekf`, `gradient` or `pf`."""
-    jax.block_until_ready(jax.jit(jnp.sin)(1.0))
+    # The first factorisation makes JAX import SciPy's LAPACK, a tenth of a second that belongs to no filter: some
+    # libraries import it with themselves.
+    jax.block_until_ready(jax.jit(jnp.linalg.cholesky)(jnp.eye(2)))
     if what == "pf":
         drift = models.drift(setting.seed, setting.size(200))
         filter = models.plain(drift.model, 1000)
