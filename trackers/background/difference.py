@@ -101,7 +101,7 @@ class Difference:
         return self.background
 
     def _weaken_shadows(self, image: np.ndarray, probability: np.ndarray) -> None:
-        """Only what differs at all is looked at, a few percent of an image; of large images every second pixel or so."""
+        """Only what differs at all is looked at, a few percent of an image; of large images not every pixel."""
         assert self.background is not None
         every = max(1, image.shape[1] // _SHADOW_COLS)
         ratio = np.ascontiguousarray(self._ratio[::every, ::every])

@@ -128,6 +128,8 @@ class Registration:
     def _estimate(self, image: np.ndarray) -> np.ndarray:
         """The rotation that turns rays of the reference into those of the image; the last one where none is found."""
         assert self._reference is not None
+        if len(self._corners) < _LEAST_CORNERS:
+            return self._rotation
         grey, step = _small_grey(image), _step(image)
         grey = _as_bright(grey, self._reference)
         found = self._from_corners(grey, self._rotation, step, *_NEAR)
@@ -141,8 +143,6 @@ class Registration:
     def _from_corners(
         self, grey: np.ndarray, guess: np.ndarray, step: int, side_px: int, levels: int
     ) -> np.ndarray | None:
-        if len(self._corners) < _LEAST_CORNERS:
-            return None
         start = _moved(self._homography(guess, step), self._corners).astype(np.float32)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
             self._reference,
@@ -156,6 +156,10 @@ class Registration:
         here, there = self._corners[good[:, 0] > 0], found[good[:, 0] > 0]
         if len(here) < _LEAST_CORNERS:
             return None
+        # Whatever else moves, if only a part of the room stands where it stood, the camera does.
+        still = np.linalg.norm(_moved(self._homography(self._rotation, step), here) - there, axis=1) < _STILL_PX
+        if np.mean(still) > _LEAST_SHARE:
+            return self._rotation
         rotation = self._robust_rotation(here, there, step)
         misses = np.linalg.norm(_moved(self._homography(rotation, step), here) - there, axis=1)
         agree = np.sum(misses < _AGREES_PX)

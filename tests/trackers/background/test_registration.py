@@ -60,6 +60,17 @@ def test_people_and_light_do_not_turn_a_camera():
     assert off_px(registration, rotation) < 0.3
 
 
+def test_a_crowd_that_fills_most_of_the_image_does_not_turn_a_camera():
+    """Three fifths of the image move by six pixels as one body, a train; the camera stands in its last pose."""
+    registration, rotation = Registration(K), turn(1.0, 3.0, 0.0)
+    registration.straightened(rendered(np.eye(3)))
+    registration.straightened(rendered(rotation))
+    image = rendered(rotation)
+    image[:, 64:] = rendered(turn(1.0, 9.0, 0.0))[:, 64:]
+    registration.straightened(image)
+    assert off_px(registration, rotation) < 0.3
+
+
 def test_a_camera_that_stands_still_or_sees_nothing_to_hold_on_to_is_left_as_it_is():
     registration = Registration(K)
     still, noise = rendered(np.eye(3)), np.random.default_rng(1)
