@@ -184,8 +184,7 @@ def _run(setup: Setup, options: argparse.Namespace, session: PeopleSession, writ
                     video = _draw(video, options.out / name, setup, session, now)
                 ends.append(time.perf_counter())
                 inside = int(np.sum(now.people.mode == TRACKED))
-                done = now.frame + 1 if total is None else min(now.frame + 1, total)
-                line.show(done, f"{inside} {'person' if inside == 1 else 'people'}")
+                line.show(now.frame + 1, f"{inside} {'person' if inside == 1 else 'people'}")
                 if options.seconds and now.time_s >= options.seconds:
                     break
     except KeyboardInterrupt:
