@@ -31,7 +31,9 @@ class ProgressLine:
             sys.stderr.write("\n")
 
     def show(self, done: int, note: str = "") -> None:
-        """Show that `done` of the total are finished."""
+        """Show that `done` of the total are finished; a total that is exceeded was a false claim, and is forgotten."""
+        if self._total is not None and done > self._total:
+            self._total = None
         if self._total is None:
             self._show(f"{self._label} {done}  {note}", done, done - self._shown >= _FRAMES_A_LINE)
             return

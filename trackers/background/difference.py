@@ -14,6 +14,8 @@ SHADOW_BRIGHTNESS = (0.5, 0.95)
 """How bright the background may remain within a shadow."""
 SHADOW_CHROMATICITY = 0.02
 """Largest change of red / (red + green + blue), or of green or blue, within a shadow."""
+_SHADOW_COLS = 640
+"""Columns in which shadows are looked for, at least: in larger images they are larger as well."""
 _SHADOW_SIDE = 5
 """Pixels: shadows are at least as wide everywhere; the edges of dark clothes, which look alike, are not."""
 
@@ -99,17 +101,23 @@ class Difference:
         return self.background
 
     def _weaken_shadows(self, image: np.ndarray, probability: np.ndarray) -> None:
-        """Only what differs at all is looked at: a few percent of an image."""
+        """Only what differs at all is looked at, a few percent of an image; of large images not every pixel."""
         assert self.background is not None
-        found = cv2.findNonZero(cv2.inRange(self._ratio, _AT_THRESHOLD * 3 // 4, 255))
+        every = max(1, image.shape[1] // _SHADOW_COLS)
+        ratio = np.ascontiguousarray(self._ratio[::every, ::every])
+        found = cv2.findNonZero(cv2.inRange(ratio, _AT_THRESHOLD * 3 // 4, 255))
         if found is None:
             return
         cols, rows = found[:, 0].T
-        places = rows * np.int32(image.shape[1]) + cols
-        mask = np.zeros(probability.shape, np.uint8)
-        mask.reshape(-1)[places] = is_shadow(_colors(image, places), _colors(self.background, places))
-        weakened = np.minimum(probability, np.float32(self._shadow_probability))
-        cv2.copyTo(weakened, wide(mask), probability)
+        places = every * (rows * np.int32(image.shape[1]) + cols)
+        mask = np.zeros(ratio.shape, np.uint8)
+        mask[rows, cols] = is_shadow(_colors(image, places), _colors(self.background, places))
+        mask = wide(mask, -(-_SHADOW_SIDE // every) | 1)
+        if every > 1:
+            mask = cv2.resize(mask, image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        u, v, width, height = cv2.boundingRect(mask)
+        shadow, within = mask[v : v + height, u : u + width] > 0, probability[v : v + height, u : u + width]
+        np.minimum(within, np.float32(self._shadow_probability), out=within, where=shadow)
 
 
 def logistic_table() -> np.ndarray:
@@ -128,9 +136,9 @@ def is_shadow(now: np.ndarray, empty: np.ndarray) -> np.ndarray:
     return is_darker & (np.max(change, axis=0) < np.float32(SHADOW_CHROMATICITY) * sum_now * sum_empty)
 
 
-def wide(mask: np.ndarray) -> np.ndarray:
-    """The parts of a mask (rows, cols) that are at least as wide as a shadow."""
-    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((_SHADOW_SIDE, _SHADOW_SIDE), np.uint8))
+def wide(mask: np.ndarray, side: int = _SHADOW_SIDE) -> np.ndarray:
+    """The parts of a mask (rows, cols) that are at least as wide as a shadow, `side` pixels."""
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
 
 
 def _colors(image: np.ndarray, places: np.ndarray) -> np.ndarray:

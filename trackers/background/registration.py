@@ -28,6 +28,7 @@ _AGREES_PX = 1.5
 _ITERATIONS = 6
 _STILL_PX = 0.35
 """Largest motion of a corner of the image up to which a camera counts as still: the image is left as it is."""
+_SAME_LIGHT = 0.02
 _BEGINNING = 4
 """The pose of the calibration is the usual one in one of so many parts of a recording, the first."""
 
@@ -127,6 +128,8 @@ class Registration:
     def _estimate(self, image: np.ndarray) -> np.ndarray:
         """The rotation that turns rays of the reference into those of the image; the last one where none is found."""
         assert self._reference is not None
+        if len(self._corners) < _LEAST_CORNERS:
+            return self._rotation
         grey, step = _small_grey(image), _step(image)
         grey = _as_bright(grey, self._reference)
         found = self._from_corners(grey, self._rotation, step, *_NEAR)
@@ -140,8 +143,6 @@ class Registration:
     def _from_corners(
         self, grey: np.ndarray, guess: np.ndarray, step: int, side_px: int, levels: int
     ) -> np.ndarray | None:
-        if len(self._corners) < _LEAST_CORNERS:
-            return None
         start = _moved(self._homography(guess, step), self._corners).astype(np.float32)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
             self._reference,
@@ -155,6 +156,10 @@ class Registration:
         here, there = self._corners[good[:, 0] > 0], found[good[:, 0] > 0]
         if len(here) < _LEAST_CORNERS:
             return None
+        # Whatever else moves, if only a part of the room stands where it stood, the camera does.
+        still = np.linalg.norm(_moved(self._homography(self._rotation, step), here) - there, axis=1) < _STILL_PX
+        if np.mean(still) > _LEAST_SHARE:
+            return self._rotation
         rotation = self._robust_rotation(here, there, step)
         misses = np.linalg.norm(_moved(self._homography(rotation, step), here) - there, axis=1)
         agree = np.sum(misses < _AGREES_PX)
@@ -234,10 +239,13 @@ def _step(image: np.ndarray) -> int:
 def _small_grey(image: np.ndarray) -> np.ndarray:
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     step = _step(image)
-    return grey if step == 1 else np.ascontiguousarray(cv2.blur(grey, (step, step))[::step, ::step])
+    if step == 1:
+        return grey
+    rows, cols = grey.shape[0] // step, grey.shape[1] // step
+    return cv2.resize(grey[: rows * step, : cols * step], (cols, rows), interpolation=cv2.INTER_AREA)
 
 
 def _as_bright(grey: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Grey values scaled to the median of the reference: optical flow takes brightness for constant."""
-    gain = max(1.0, float(np.median(reference))) / max(1.0, float(np.median(grey)))
-    return grey if abs(gain - 1) < 0.02 else cv2.convertScaleAbs(grey, alpha=gain)
+    """Grey values scaled to the mean of the reference: optical flow takes brightness for constant."""
+    gain = max(1.0, cv2.mean(reference)[0]) / max(1.0, cv2.mean(grey)[0])
+    return grey if abs(gain - 1) < _SAME_LIGHT else cv2.convertScaleAbs(grey, alpha=gain)

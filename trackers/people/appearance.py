@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
-from jaxfilters.trackers.people.silhouettes import body_of, presence_of
+from jaxfilters.trackers.people.silhouettes import body_of, overlapping, presence_of
 from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleScene
 
 BINS = 8
@@ -47,12 +47,15 @@ def _in_camera(scene, camera, furniture, frame, places, active):
         box = jnp.where(shown, ellipse_of(seen).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
         window = foreground.window(box, camera.shape, GRID)
 
+        near = overlapping(camera.P, places, active.at[k].set(False), window.uv)
+        nearest = jnp.argsort(~near)
+
         def hide(turn, free):
-            other = order[turn]
-            ahead = (outlines.depth[other] < seen.depth) & (other != k)
+            other = nearest[turn]
+            ahead = outlines.depth[other] < seen.depth
             return free * (1 - presence_of(scene.config, camera.P, places[other], window.uv) * ahead)
 
-        free = jax.lax.fori_loop(0, num_active, hide, window.inside * (seen.depth < furniture.ravel()[window.pixel]))
+        free = jax.lax.fori_loop(0, jnp.sum(near), hide, window.inside * (seen.depth < furniture.ravel()[window.pixel]))
         mine = presence_of(scene.config, camera.P, places[k], window.uv) * shown * (mask[window.pixel] / 255)
         histogram, enough = _histogram(image[window.pixel], mine * free, window.uv[:, 1] < seen.center[1])
         return found[0].at[k].set(histogram), found[1].at[k].set(enough)

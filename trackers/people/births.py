@@ -13,7 +13,7 @@ from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import walkable
-from jaxfilters.trackers.people.silhouettes import area_of, body_of, presence_of
+from jaxfilters.trackers.people.silhouettes import OVERLAP, area_of, body_of, presence_of
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig, PeopleScene
 
 REDUCED_COLS = 160
@@ -24,6 +24,8 @@ MARGIN = 1.25
 LEAST_SHARE = 0.5
 """Of the samples that an image must show for a person to be found there."""
 
+_WINDOW = (2, 4)
+"""Parts of an image, in rows and columns, one of which holds most people; larger ones are covered in all of it."""
 LEAST_CELLS = 1024
 """A room of 90 square metres."""
 
@@ -145,11 +147,25 @@ def _reduced_contrast(scene, camera, furniture, places, active, frame):
     v, u = jnp.meshgrid(*[step * jnp.arange(n, dtype=float) for n in reduced.shape], indexing="ij")
     uv, depth = jnp.stack([u, v], axis=-1), furniture[::step, ::step]
     order = jnp.argsort(~active)
+    size = tuple(max(1, n // parts) for n, parts in zip(reduced.shape, _WINDOW, strict=True))
 
     def cover(turn, unexplained):
         place = places[order[turn]]
-        ahead = outline(camera.P, body_of(place)).depth < depth
-        return unexplained * (1 - presence_of(scene.config, camera.P, place, uv) * ahead)
+        body = outline(camera.P, body_of(place))
+
+        def covered(unexplained, uv, depth):
+            return unexplained * (1 - presence_of(scene.config, camera.P, place, uv) * (body.depth < depth))
+
+        def around(unexplained):
+            middle = body.center[::-1] / step - jnp.array(size) / 2
+            low = jnp.clip(jnp.round(middle), 0, jnp.array(reduced.shape) - jnp.array(size)).astype(jnp.int32)
+            cut = [jax.lax.dynamic_slice(image, low, size) for image in (unexplained, depth)]
+            pixels = jax.lax.dynamic_slice(uv, (*low, 0), (*size, 2))
+            return jax.lax.dynamic_update_slice(unexplained, covered(cut[0], pixels, cut[1]), low)
+
+        reach = 2 * OVERLAP * jnp.sqrt(jnp.diagonal(body.shape))[::-1] / step
+        is_small = (body.code == VISIBLE) & jnp.all(reach < jnp.array(size))
+        return jax.lax.cond(is_small, around, lambda image: covered(image, uv, depth), unexplained)
 
     free = jnp.full(reduced.shape, 1 - foreground.CLUTTER)
     return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))

@@ -8,13 +8,24 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
-from jaxfilters.models.person.ellipsoid import VISIBLE, Ellipsoid, Outline, ellipse_of, near_depth, outline, standing
+from jaxfilters.models.person.ellipsoid import (
+    INSIDE,
+    VISIBLE,
+    Ellipsoid,
+    Outline,
+    ellipse_of,
+    near_depth,
+    outline,
+    standing,
+)
 from jaxfilters.models.person.foreground import Window, contrast, log_likelihood_ratio, presence
 from jaxfilters.trackers.people.silhouette_bias import displacement
 from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
 
 MARGIN = 0.3
 """Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
+OVERLAP = 2.5
+"""Sizes of an outline beyond which a body makes hardly any pixel foreground: one in a thousand."""
 LEAST_SIZE_M = 0.1
 SINK = 0.023
 """Of the height, over a step: hips, at 0.53 of it, sink by 1 - cos a where legs swing to a, up to 0.42 radians."""
@@ -123,20 +134,36 @@ def area_of(seen: Outline) -> Float[Array, ""]:
     return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
 
 
+def overlapping(
+    P: Float[Array, "3 4"],
+    places: Float[Array, "slots 4"],
+    others: Bool[Array, " slots"],
+    uv: Float[Array, "samples 2"],
+) -> Bool[Array, " slots"]:
+    """Which of the others can be present at any pixel of a window in the camera of a projection matrix."""
+    seen = jax.vmap(outline, in_axes=(None, 0))(P, jax.vmap(body_of)(places))
+    reach = OVERLAP * jnp.sqrt(jnp.diagonal(seen.shape, axis1=-2, axis2=-1))
+    low, high = jnp.min(uv, axis=0), jnp.max(uv, axis=0)
+    meets = jnp.all((seen.center + reach >= low) & (seen.center - reach <= high), axis=-1)
+    return others & ((meets & (seen.code == VISIBLE)) | (seen.code == INSIDE))
+
+
 def unexplained_of(
     scene: PeopleScene, places: Float[Array, "slots 4"], others: Bool[Array, " slots"], views: View
 ) -> Float[Array, "cameras samples"]:
     """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
-    order = jnp.argsort(~others)
 
     def in_camera(P, view):
+        near = overlapping(P, places, others, view.window.uv)
+        order = jnp.argsort(~near)
+
         def hide(turn, free):
             place = places[order[turn]]
             ahead = outline(P, body_of(place)).depth < view.depth
             return free * (1 - presence_of(scene.config, P, place, view.window.uv) * ahead)
 
         free = jnp.full(view.foreground.shape, 1 - foreground.CLUTTER)
-        return jax.lax.fori_loop(0, jnp.sum(others), hide, free)
+        return jax.lax.fori_loop(0, jnp.sum(near), hide, free)
 
     return jax.vmap(in_camera)(scene.projections(), views)
 

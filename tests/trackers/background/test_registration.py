@@ -42,7 +42,8 @@ def test_the_turn_of_a_camera_is_found_and_undone(angles_px):
     assert same is still
     assert nothing is None
     image, blank = registration.straightened(rendered(rotation))
-    assert off_px(registration, rotation) < 0.25
+    # Forty corners, of which the far ones leave the image, and a light that is that of other parts of the scene.
+    assert off_px(registration, rotation) < 0.4
     differences = np.abs(image.astype(int) - still)[blank == 0]
     assert np.mean(differences) < 2.5
     assert 0 < np.mean(blank > 0) < 0.25
@@ -56,6 +57,17 @@ def test_people_and_light_do_not_turn_a_camera():
     image = rendered(rotation)
     image[:, 50:105] = rendered(turn(0.0, 8.0, 0.0))[:, 50:105]
     registration.straightened((0.75 * image).astype(np.uint8))
+    assert off_px(registration, rotation) < 0.3
+
+
+def test_a_crowd_that_fills_most_of_the_image_does_not_turn_a_camera():
+    """Three fifths of the image move by six pixels as one body, a train; the camera stands in its last pose."""
+    registration, rotation = Registration(K), turn(1.0, 3.0, 0.0)
+    registration.straightened(rendered(np.eye(3)))
+    registration.straightened(rendered(rotation))
+    image = rendered(rotation)
+    image[:, 64:] = rendered(turn(1.0, 9.0, 0.0))[:, 64:]
+    registration.straightened(image)
     assert off_px(registration, rotation) < 0.3
 
 

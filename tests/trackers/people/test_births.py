@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.people import births
 from jaxfilters.trackers.people.births import LEAST_CELLS, LEAST_SHARE, birth, cells_of, padded, stride
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
@@ -53,6 +54,20 @@ def test_whoever_is_known_is_nobody_new(found, draw, camera):
     assert not found(mask, known=SOMEBODY).found
     both = draw(camera, [SOMEBODY, (-1.0, 0.2, 1.7, 0.45)])[0]
     check_near(found(both, known=SOMEBODY), (-1.0, 0.2))
+
+
+@pytest.mark.system
+def test_windows_of_people_cover_what_whole_images_would(camera, floor, monkeypatch):
+    """Far, near, half outside the image and behind the camera; against the same with windows as large as the image."""
+    scene = people_scene([camera], floor, config=replace(CONFIG, capacity=4))
+    at = jnp.array([[-1.0, 6.0], [0.3, -1.5], [3.2, 2.0], [0.0, -9.0]])
+    places = jnp.concatenate([at, jnp.tile(jnp.array([1.7, 0.45]), (4, 1))], axis=1)
+    frame = CameraFrame(np.full(camera.shape, 200, np.uint8), np.zeros((*camera.shape, 3), np.uint8), np.bool_(True))
+    inputs = scene, camera, scene.furniture[0], places, jnp.ones(4, bool), frame
+    found = np.asarray(births._reduced_contrast(*inputs))
+    monkeypatch.setattr(births, "_WINDOW", (1, 1))
+    np.testing.assert_allclose(found, births._reduced_contrast(*inputs), atol=3e-3)
+    assert np.ptp(found) > 0.3
 
 
 def test_small_things_are_nobody(found, camera):
