@@ -49,12 +49,12 @@ def track(options: argparse.Namespace) -> str:
     check_unused(options)
     settings = as_input_error(partial(config_from_args, VARIANTS[options.variant], options))
     model = _model(options)
+    face = tracked(model.model)
+    known = None if options.known is None else read_people(options.known, face)
     places = Places(camera=options.camera, points=options.points, fps=options.fps)
     place = setup_of_one(options.video_source, places, options.seed or 0)
     if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
-    face = tracked(model.model)
-    known = None if options.known is None else read_people(options.known, face)
     remembered = None if known is None else known.remembered
     detector = _detector(options)
     session = as_input_error(
