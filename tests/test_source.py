@@ -183,6 +183,10 @@ def imports_of_the_application(path):
     return [name for name in imported(path) if name.startswith("jaxfilters.trackers.app")]
 
 
+def imports_of_argparse(path):
+    return [name for name in imported(path) if name.split(".")[0] == "argparse"]
+
+
 def imports_by_another_name(path):
     """`import models.camera` in a checkout would load a second copy of the module, with other classes."""
     return [name for name in imported(path) if name.split(".")[0] in {"", "models", "trackers", "benchmarks"}]
@@ -209,6 +213,12 @@ def test_trackers_import_nothing_of_the_application_around_them():
     systems = [path for path in (ROOT / "trackers").rglob("*.py") if not APPLICATION & set(path.parts)]
     paths = sorted(path for path in systems if path.stem not in PRESENTATION)
     assert not (found := offenders(paths, imports_of_the_application)), found
+
+
+def test_command_lines_are_known_to_commands_and_the_application_alone():
+    systems = [path for path in (ROOT / "trackers").rglob("*.py") if not APPLICATION & set(path.parts)]
+    paths = sorted(path for path in systems if path.stem not in {"command", "options"})
+    assert not (found := offenders(paths, imports_of_argparse)), found
 
 
 def test_our_modules_have_one_name():

@@ -59,8 +59,8 @@ class Schedule(NamedTuple):
         return {
             "rigid": HeadConfig(learn=False),
             "deformable": HeadConfig(rigid_frames=self.start),
-            "paper_rigid": HeadConfig(mode="paper", learn=False),
-            "paper_deformable": HeadConfig(mode="paper", rigid_frames=self.start),
+            "paper_rigid": HeadConfig(variant="published", learn=False),
+            "paper_deformable": HeadConfig(variant="published", rigid_frames=self.start),
         }
 
 

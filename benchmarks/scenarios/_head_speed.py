@@ -58,7 +58,7 @@ def speed_metrics(seed: int, counts: tuple[int, ...], rounds: int) -> dict[str, 
     recorded = recording(seed)
     options = {f"_{count}_particles": HeadConfig(num_particles=count, rigid_frames=0) for count in counts}
     usual = f"_{USUAL}_particles"
-    options[f"{usual}_paper"] = HeadConfig(mode="paper", num_particles=USUAL, rigid_frames=0)
+    options[f"{usual}_paper"] = HeadConfig(variant="published", num_particles=USUAL, rigid_frames=0)
     trackers = {name: prepared(recorded, chosen) for name, chosen in options.items()}
     modern, paper = trackers[usual], trackers[f"{usual}_paper"]
     trackers[f"{usual}_live"] = modern._replace(images=modern.images[:1], times=modern.times[:1])
@@ -172,7 +172,7 @@ def _learnt(state: HeadState, images: Array, shape: Array):
 def _recalculated(rig, state: HeadState, images: Array, x: Array):
     estimated = state.model.mean + (state.model.basis @ x[POSE:]).reshape(state.model.mean.shape)
     shape, windows = learning.recalculated(state.learner, estimated, images, state.model.templates, x[:POSE], rig)
-    return learning.learnt(state.learner, state.model, shape, windows, jnp.ones((), bool), *_way("paper"))
+    return learning.learnt(state.learner, state.model, shape, windows, jnp.ones((), bool), *_way("published"))
 
 
 def _way(mode: str):

@@ -31,11 +31,11 @@ FIRST_SEED = 100
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Root mean square errors of tables 3 and 4 in millimetres and degrees."""
 ALWAYS = {"": HeadConfig(learn=False), "_learning": HeadConfig()}
-_PAPER = HeadConfig(mode="paper", learn=False)
+_PAPER = HeadConfig(variant="published", learn=False)
 PAPER = {
     "_paper": _PAPER,
-    "_paper_fixed5": HeadConfig(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=5.0),
-    "_paper_fixed1": HeadConfig(mode="paper", learn=False, diffusion="fixed", fixed_diffusion=1.0),
+    "_paper_fixed5": HeadConfig(variant="published", learn=False, diffusion="fixed", fixed_diffusion=5.0),
+    "_paper_fixed1": HeadConfig(variant="published", learn=False, diffusion="fixed", fixed_diffusion=1.0),
 }
 TABLED = ("", "_learning", "_paper")
 """With their ratios to the paper's errors, and their coverage."""

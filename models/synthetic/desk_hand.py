@@ -146,7 +146,10 @@ def frame_of(
     rows, cols = desk.shape
     if rows * 4 != cols * 3:
         raise ValueError(f"shape must be rows : columns = 3 : 4; got {desk.shape}.")
-    coverage = np.mean([hand_coverage(pose, desk.shape) for pose in poses], axis=0)
+    coverage = np.zeros(desk.shape)
+    for pose in poses:
+        coverage += hand_coverage(pose, desk.shape)
+    coverage /= len(poses)
     middle = poses[len(poses) // 2]
     scale = rows / LAYOUT_ROWS
     bases, tips = _finger_ends(middle)

@@ -1,6 +1,7 @@
 """Trackers called from Python: the same track as by the command, and errors. The pages in docs/ run all six."""
 
 from importlib import import_module
+from inspect import Parameter, signature
 
 import jax
 import numpy as np
@@ -13,9 +14,12 @@ from jaxfilters.trackers.registry import SYSTEMS
 from jaxfilters.trackers.tracker import step_chunk, track_frames
 
 
-def test_every_system_can_be_run_from_python():
+def test_every_system_is_called_with_frames_times_cameras_and_a_configuration():
     for system in SYSTEMS:
-        assert callable(import_module(system.package).track), system.name
+        parameters = list(signature(import_module(system.package).track).parameters.values())[:4]
+        assert [parameter.default is Parameter.empty for parameter in parameters[:2]] == [True, True], system.name
+        assert parameters[1].name == "times_s", system.name
+        assert (parameters[3].name, parameters[3].default) == ("config", None), system.name
 
 
 @pytest.mark.usefixtures("fake_hand_depth")

@@ -45,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with ended_by_signals():
             if options.command in ("track", "demo"):
                 check_free(options.out)
+                if options.rerun is not None:
+                    import_module("jaxfilters.trackers.app.rerun_log").check_log(options.rerun)
             print(_command_of(options)(options))
     except (InputError, OutputError, CheckpointError) as error:
         print(f"jaxfilters: error: {error}", file=sys.stderr)

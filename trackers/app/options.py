@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,10 +16,19 @@ _SHORT = {"num_particles": "--particles"}
 """Further names of options."""
 
 
-def config_from_args(config: Callable[..., Made], options: argparse.Namespace) -> Made:
-    """A configuration with the options of the command line; those that are None keep the default of its field."""
+def config_from_args(config: Made | type[Made], options: argparse.Namespace) -> Made:
+    """A configuration with the options of the command line; those that are None keep what it has, or its defaults."""
     names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
-    return config(**{name: value for name in names if (value := getattr(options, name, None)) is not None})
+    given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    return config(**given) if isinstance(config, type) else dataclasses.replace(config, **given)  # type: ignore[type-var]
+
+
+def add_variant(parser: argparse.ArgumentParser, variants: Iterable[str]) -> None:
+    """Which tracker: the first of the variants unless given."""
+    names = tuple(variants)
+    parser.add_argument(
+        "--variant", choices=names, default=names[0], help="this tracker, or the published one (default: %(default)s)"
+    )
 
 
 def add_config(parser: argparse.ArgumentParser, config: type, *names: str) -> None:

@@ -1,6 +1,7 @@
 """The folder that a run writes its results into, held by one run at a time."""
 
 import errno
+import os
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -36,11 +37,15 @@ class OutputFolder:
 
 
 def check_free(path: Path) -> None:
-    """Refuse a folder that another run writes into, before the recording is read; the folder is not made.
+    """Refuse a folder that cannot be written, before the recording is read; the folder is not made.
 
     Raises:
-        OutputError: Another run writes into it.
+        OutputError: Another run writes into it, or nobody can.
     """
+    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        why = "no permission" if nearest.is_dir() else f"{nearest} is not a folder"
+        raise OutputError(f"cannot write into {path}: {why}.")
     if (path / LOCK).exists():
         OutputFolder(path).close()
 

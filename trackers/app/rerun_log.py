@@ -31,15 +31,11 @@ class RerunLog:
             table: Whose columns become time series; those of places and their standard deviations become ellipsoids.
 
         Raises:
-            InputError: rerun-sdk is not installed, or the name of the file is another one.
+            InputError: as for `check_log`.
             OutputError: the file cannot be written, or the viewer cannot be started.
         """
-        if to != VIEWER and Path(to).suffix != ".rrd":
-            raise InputError(f"--rerun {to}: expected a file whose name ends in .rrd, or nothing for the viewer.")
-        try:
-            self._rerun: Any = import_module("rerun")
-        except ImportError:
-            raise InputError("--rerun: needs rerun-sdk: pip install 'jaxfilters[viz]'.") from None
+        check_log(to)
+        self._rerun: Any = import_module("rerun")
         self._table, self._status = table, [*dict.fromkeys(table.status_names)]
         self._to = self._rerun.RecordingStream("jaxfilters")
         try:
@@ -114,6 +110,20 @@ class RerunLog:
 
     def _send(self, entity: str, index: list[Any], columns: Any) -> None:
         self._to.send_columns(entity, indexes=index, columns=columns)
+
+
+def check_log(to: str) -> None:
+    """Refuse a log that cannot be written, before anything is computed.
+
+    Raises:
+        InputError: rerun-sdk is not installed, or the name of the file is not one of the viewer.
+    """
+    if to != VIEWER and Path(to).suffix != ".rrd":
+        raise InputError(f"--rerun {to}: expected a file whose name ends in .rrd, or nothing for the viewer.")
+    try:
+        import_module("rerun")
+    except ImportError:
+        raise InputError("--rerun: needs rerun-sdk: pip install 'jaxfilters[viz]'.") from None
 
 
 def open_log(options: argparse.Namespace, table: TrackTable) -> RerunLog | None:

@@ -173,19 +173,16 @@ class StreamRun:
                 is_last = bool(self._options.seconds) and moment.time_s >= self._options.seconds
                 if is_last or self.spec.session.is_due(waiting):
                     self._advance(waiting)
-                    line.show(self._done(), self.spec.session.status)
+                    line.show(self.writer.frames, self.spec.session.status)
                     waiting = []
                     self._checkpoint()
                 if is_last:
                     return
             if waiting:
                 self._advance(waiting)
-                line.show(self._done(), self.spec.session.status)
+                line.show(self.writer.frames, self.spec.session.status)
         if self._failure is None:
             self._checkpoint(complete=True)
-
-    def _done(self) -> int:
-        return self.writer.frames if self.spec.frames is None else min(self.writer.frames, self.spec.frames)
 
     def _readable(self) -> Iterator[Moment]:
         """The moments after the last checkpoint, up to the first that cannot be read."""

@@ -14,9 +14,9 @@ class ArticulatedConfig:
         ValueError: naming the field, what was expected and what came.
     """
 
-    mode: Annotated[str, OneOf("recommended", "literal", "unconstrained")] = "recommended"
-    """How estimates are kept within the limits of a hand; literal is the filter of the paper, with one hypothesis, and
-    unconstrained has no limits and one hypothesis."""
+    variant: Annotated[str, OneOf("recommended", "published", "unconstrained")] = "recommended"
+    """How estimates are kept within the limits of a hand; published is the filter of the paper, with one hypothesis,
+    and unconstrained has no limits and one hypothesis."""
     hypotheses: int = 6
     """Largest number of hypotheses about the depth."""
     hand: Annotated[str, OneOf("right", "left")] = "right"

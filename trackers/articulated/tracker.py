@@ -39,7 +39,14 @@ from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
-from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, FeatureSequence, Start, keypoint_noise
+from jaxfilters.trackers.articulated.recording import (
+    NOISE_SHARE,
+    FeatureFrame,
+    FeatureSequence,
+    Start,
+    from_keypoints,
+    keypoint_noise,
+)
 from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
 from jaxfilters.trackers.tracker import Tracker, track_frames
 
@@ -133,7 +140,37 @@ def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) ->
     return tracker_of(hand, _limits(hand.layout), start, config)
 
 
-def track(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> ArticulatedTrack:
+def track(
+    keypoints: Float[np.ndarray, "frames 21 2"],
+    times_s: Float[np.ndarray, " frames"],
+    image_shape: tuple[int, int] | None = None,
+    config: ArticulatedConfig | None = None,
+    *,
+    confidence: Float[np.ndarray, "frames 21"] | None = None,
+) -> ArticulatedTrack:
+    """The hand in every frame of keypoints, equal to that of `jaxfilters track articulated` with the same seed.
+
+    Args:
+        keypoints: Pixels, wrist, thumb, index, middle, ring, little, base to tip; NaN where nothing was observed.
+        times_s: Seconds, strictly increasing.
+        image_shape: Rows and columns of the camera's image, where known.
+        config: Options of the tracker.
+        confidence: Of the keypoints, 0 or more; 1 for all unless given.
+
+    Returns:
+        The track as NumPy arrays, the frame axis first.
+
+    Raises:
+        ValueError: as for `from_keypoints` and `build`.
+    """
+    points = np.asarray(keypoints, float)
+    sequence = from_keypoints(
+        np.asarray(times_s, float), points, "keypoints", confidence=confidence, image_shape=image_shape
+    )
+    return track_sequence(sequence, config)
+
+
+def track_sequence(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> ArticulatedTrack:
     """The hand in every frame of a recording of features, equal to that of `jaxfilters track articulated`.
 
     Args:
@@ -166,9 +203,9 @@ def _limits(layout: Layout) -> Inequalities:
 def _filter(setup: _Setup, prior: Gaussian) -> Filter:
     make: Callable[..., Filter] = {
         "recommended": recommended,
-        "literal": literal,
+        "published": literal,
         "unconstrained": unconstrained,
-    }[setup.config.mode]
+    }[setup.config.variant]
     return make(setup.hand, prior, setup.limits, gate=setup.config.gate or math.inf)
 
 
@@ -187,7 +224,7 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
         starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.zeros(1), jnp.ones((), bool))
     else:
         starts = _keypoint_starts(setup, jax.tree.map(jnp.asarray, frame))
-    slots = setup.config.hypotheses if setup.config.mode == "recommended" else 1
+    slots = setup.config.hypotheses if setup.config.variant == "recommended" else 1
     bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, 1 if setup.start is not None else NUM_STARTS))
     misses = jnp.where(starts.found, 0, PATIENCE + 1).astype(jnp.int32)
     return TrackState(bank, jnp.zeros((), dtype=float), misses, key)
@@ -203,7 +240,7 @@ def _first_belief(bank: GaussianSumState) -> Gaussian:
 
 
 def _keypoint_starts(setup: _Setup, frame: FeatureFrame) -> Starts:
-    limits = None if setup.config.mode == "unconstrained" else setup.limits.constraints
+    limits = None if setup.config.variant == "unconstrained" else setup.limits.constraints
     return starts_from_points(setup.hand, limits, frame.y, frame.mask, frame.std)
 
 

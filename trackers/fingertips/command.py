@@ -21,7 +21,7 @@ from jaxfilters.trackers.fingertips.files import EventFile
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
 from jaxfilters.trackers.fingertips.input import DemoHand, open_hands
 from jaxfilters.trackers.fingertips.run import FingertipStream
-from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
+from jaxfilters.trackers.fingertips.session import VARIANTS, FingertipSession
 from jaxfilters.trackers.fingertips.summary import write_summary
 from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
@@ -51,13 +51,15 @@ def track(options: argparse.Namespace) -> str:
     user = _user(source, options.mask)
     if not user.has_open_hand:
         warn(f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles")
+    config, method = VARIANTS[options.variant]
     session = FingertipSession(
         angles_of(user),
         handedness=user.parameters.handedness,
         num_hands=options.hands,
         height=float(source.image_size[1]),
         fps=source.fps,
-        config=dataclasses.replace(USUAL, posture=user.posture),
+        config=dataclasses.replace(config, posture=user.posture),
+        method=method,
         recogniser=recogniser_of(symbols),
     )
     with closing(EventFile(options.out / "events.jsonl")) as events:
@@ -122,7 +124,7 @@ def _user(source: Any, mask: str) -> User:
 
 def _identity(source: Any, options: argparse.Namespace) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
-    given = {name: str(getattr(options, name)) for name in ("mask", "hands", "gestures", "seed")}
+    given = {name: str(getattr(options, name)) for name in ("mask", "hands", "gestures", "seed", "variant")}
     size, rate = list(source.image_size), source.fps
     return {"input": source.name, "image_size": size, "fps": rate, "version": version("jaxfilters"), **given}
 

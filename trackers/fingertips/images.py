@@ -19,8 +19,8 @@ from jaxfilters.models.fingertip.skin import SkinModel, fit_skin_model, skin_mas
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture, ThumbAngles, calibrated, usual
 from jaxfilters.trackers.fingertips.events import Event, Recogniser
 from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, hands_of, parameters_of
-from jaxfilters.trackers.fingertips.session import FingertipSession
-from jaxfilters.trackers.fingertips.state import HandReport
+from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
+from jaxfilters.trackers.fingertips.state import FingertipConfig, HandReport
 
 OPEN_HAND_IMAGES = 60
 """Images in which an open hand is looked for before a recording is followed."""
@@ -53,6 +53,7 @@ def track(
     images: Sequence[np.ndarray],
     times_s: np.ndarray,
     mask: str = "infrared",
+    config: FingertipConfig | None = None,
     *,
     num_hands: int = 1,
     recogniser: Recogniser | None = None,
@@ -64,6 +65,7 @@ def track(
         times_s: Seconds, growing evenly.
         mask: How hands differ from the desk: they are brighter (`infrared`), above it (`depth`), or have the colour of
             skin (`colour`).
+        config: Constants of the tracker.
         num_hands: At most.
         recogniser: What names strokes; without one they have no label.
 
@@ -83,6 +85,7 @@ def track(
         num_hands=num_hands,
         height=float(images[0].shape[0]),
         fps=float(1 / np.median(np.diff(times_s))),
+        config=config or USUAL,
         recogniser=recogniser,
     )
     seconds = np.asarray(times_s, float) - float(times_s[0])

@@ -4,7 +4,13 @@ import argparse
 from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import image_size
-from jaxfilters.trackers.app.options import add_results_options, add_resume, add_seed, add_video_options
+from jaxfilters.trackers.app.options import (
+    add_results_options,
+    add_resume,
+    add_seed,
+    add_variant,
+    add_video_options,
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL.npz",
         help="the symbols; `jaxfilters fit gestures` makes such a file (default: twelve shapes)",
     )
+    add_variant(parser, ("modern", "published"))
     add_seed(parser, default=0)
     add_video_options(parser)
     add_resume(parser)

@@ -23,13 +23,15 @@ from jaxfilters.trackers.fingertips.events import Event, HandFrame, Recogniser
 from jaxfilters.trackers.fingertips.hands import run_hands, start_hands
 from jaxfilters.trackers.fingertips.manipulation import IDLE, Handling, HandlingConfig, handled
 from jaxfilters.trackers.fingertips.state import FingertipConfig, HandReport, Method, scaled
-from jaxfilters.trackers.fingertips.tracker import MODERN
+from jaxfilters.trackers.fingertips.tracker import MODERN, PUBLISHED, PUBLISHED_CONFIG
 
 STILL_PX = 1.5
 """Pixels a frame of 1/30 s in a 640x480 image, below which a hand rests."""
 
 
 USUAL = FingertipConfig()
+VARIANTS = {"modern": (USUAL, MODERN), "published": (PUBLISHED_CONFIG, PUBLISHED)}
+"""Constants and strategies by name."""
 
 
 class FingertipSession:

@@ -13,10 +13,11 @@ from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
 from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.background.median import MedianBackground, evenly
 from jaxfilters.trackers.background.registration import Registration, intrinsics
+from jaxfilters.trackers.people.config import PeopleConfig
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
 from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
-from jaxfilters.trackers.people.tracker import outlines, start, step
+from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
 
 PRIMING_IMAGES = 40
 """Images from which the empty room is estimated before a recording is tracked."""
@@ -42,7 +43,12 @@ class PeopleEstimate(NamedTuple):
 
 
 def track(
-    images: Sequence[Sequence[np.ndarray | None]], times_s: ArrayLike, scene: PeopleScene, subtraction: str = "median"
+    images: Sequence[Sequence[np.ndarray | None]],
+    times_s: ArrayLike,
+    scene: PeopleScene,
+    config: PeopleConfig | None = None,
+    *,
+    subtraction: str = "median",
 ) -> dict[int, list[Sighting]]:
     """Everybody's smoothed track in recorded images, by identity.
 
@@ -51,6 +57,7 @@ def track(
             `None` where a camera has nothing new.
         times_s: Seconds, strictly increasing.
         scene: Cameras, floor and furniture, as `people_scene` makes them.
+        config: Constants in place of those of the scene.
         subtraction: Of the background: `median`, `mog2` or `knn`.
 
     Returns:
@@ -62,6 +69,8 @@ def track(
     seconds = np.asarray(times_s, float)
     if not len(images) or seconds.shape != (len(images),):
         raise ValueError(f"times_s: expected one for each of at least one image; got {seconds.shape}, {len(images)}.")
+    if config is not None:
+        scene = people_scene(scene.cameras, scene.floor, furniture=scene.furniture, config=config)
     session = PeopleSession(scene, subtraction)
     every = max(1, len(images) // PRIMING_IMAGES)
     session.prime([[one for one in views[::every] if one is not None] for views in zip(*images, strict=True)])

@@ -121,10 +121,10 @@ def test_options_reach_the_tracker_and_the_rest_keeps_its_default(tmp_path, monk
     configs, build = [], articulated_hand.build
     remember = lambda sequence, config: configs.append(config) or build(sequence, config)
     monkeypatch.setattr(articulated_hand, "build", remember)
-    options = "--mode literal --hypotheses 2 --hand left --gate 0 --seed 7"
+    options = "--variant published --hypotheses 2 --hand left --gate 0 --seed 7"
     assert run("--out", tmp_path / "a", "--no-video", *options.split()) == 0
     assert run("--out", tmp_path / "b", "--no-video") == 0
-    assert configs == [ArticulatedConfig("literal", 2, "left", 0.0, 7), ArticulatedConfig()]
+    assert configs == [ArticulatedConfig("published", 2, "left", 0.0, 7), ArticulatedConfig()]
 
 
 @pytest.mark.system
@@ -198,7 +198,7 @@ def test_wrong_options_are_one_clear_line(options, message, tmp_path, capfd):
     ("arguments", "message"),
     [
         ("", "required: --out"),
-        ("--out a --mode fast", "--mode: invalid choice: 'fast'"),
+        ("--out a --variant fast", "--variant: invalid choice: 'fast'"),
         ("--out a --hand third", "--hand: invalid choice: 'third'"),
         ("--out a --image-size 640", "--image-size: expected WIDTHxHEIGHT in pixels, such as 640x480; got 640"),
         ("--out a --image-size 640x0", "--image-size: expected WIDTHxHEIGHT in pixels, such as 640x480; got 640x0"),

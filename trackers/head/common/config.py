@@ -14,7 +14,7 @@ class HeadConfig:
         ValueError: naming the field, what was expected and what came.
     """
 
-    mode: Annotated[str, OneOf("modern", "paper")] = "modern"
+    variant: Annotated[str, OneOf("modern", "published")] = "modern"
     """Improved filter, which refines what the particles find, or the one of Oka, Sato and Sugano's papers."""
     num_particles: int = 1000
     """Number of particles."""
@@ -49,5 +49,5 @@ def compiled(config: HeadConfig) -> HeadConfig:
     """
     diffusion = "online" if config.diffusion == "online" else "proportional"
     return HeadConfig(
-        config.mode, config.num_particles, diffusion=diffusion, learn=config.learn, rigid_frames=config.rigid_frames
+        config.variant, config.num_particles, diffusion=diffusion, learn=config.learn, rigid_frames=config.rigid_frames
     )

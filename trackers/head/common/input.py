@@ -1,9 +1,9 @@
 """What the head trackers watch: two cameras of a rig, one camera, or a synthetic face."""
 
-import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -46,79 +46,89 @@ class Setup(NamedTuple):
     """What was assumed, for a person."""
 
 
-def setup_of(options: argparse.Namespace) -> Setup:
+class Places(NamedTuple):
+    """What describes the cameras of a recording, and what is given of it; None where it is not."""
+
+    rig: Path | None = None
+    """Of two cameras or more."""
+    camera: Path | None = None
+    """Intrinsics of one camera."""
+    points: Path | None = None
+    """Landmarks in the first image."""
+    fps: float | None = None
+    """Frames per second, in place of what the recording says."""
+
+    def given(self) -> list[str]:
+        """The options of those that are there."""
+        return [f"--{name}" for name, value in self._asdict().items() if value is not None]
+
+
+def setup_of(sources: Sequence[str], places: Places, seed: int) -> Setup:
     """The cameras and sources that the command line of `track head-stereo` names.
 
     Raises:
         InputError: a source or a file cannot be used, they do not fit each other, or one is missing.
     """
-    if not options.sources:
-        return _synthetic(options)
-    if len(options.sources) == 1:
-        place = _single(options, options.sources[0])
+    if not sources:
+        _refuse_unused(places)
+        return _rendered(sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True))
+    if len(sources) == 1:
+        place = _single(sources[0], places)
         return place._replace(note="; ".join(["one camera: a rigid face of average size", *filter(None, [place.note])]))
-    if options.camera:
+    if places.camera:
         raise InputError("--camera: for one source alone; two cameras are described by --rig RIG.json.")
-    if not options.rig:
+    if not places.rig:
         raise InputError("--rig: missing; `jaxfilters calibrate stereo` makes a RIG.json of two cameras.")
-    described = open_rig(options.rig)
-    if len(described.cameras) != len(options.sources):
+    described = open_rig(places.rig)
+    if len(described.cameras) != len(sources):
         raise InputError(
-            f"{options.rig}: {len(described.cameras)} cameras; got {len(options.sources)} sources, expected one each."
+            f"{places.rig}: {len(described.cameras)} cameras; got {len(sources)} sources, expected one each."
         )
-    sources = [open_video(source, fps=options.fps) for source in options.sources]
-    for source, camera in zip(sources, described.cameras, strict=True):
-        _check_size(source, camera.image_size, f"{options.rig}: {camera.name}")
-    return Setup(
-        described.rig, described.undistortions, sources, _points(options, described.undistortions[0]), None, None
-    )
+    videos = [open_video(source, fps=places.fps) for source in sources]
+    for video, camera in zip(videos, described.cameras, strict=True):
+        _check_size(video, camera.image_size, f"{places.rig}: {camera.name}")
+    points = _points(places.points, described.undistortions[0])
+    return Setup(described.rig, described.undistortions, videos, points, None, None)
 
 
-def setup_of_one(options: argparse.Namespace) -> Setup:
+def setup_of_one(source: str | None, places: Places, seed: int) -> Setup:
     """The camera and source that the command line of `track head-mono` names.
 
     Raises:
         InputError: the source or a file cannot be used, or they do not fit each other.
     """
-    if options.video_source is not None:
-        return _single(options, options.video_source)
-    _refuse_unused({"--camera": options.camera, "--points": options.points, "--fps": options.fps})
-    seed = options.seed or 0
+    if source is not None:
+        return _single(source, places)
+    _refuse_unused(places)
     camera = Pinhole.from_intrinsics(_SYNTHETIC_FOCAL, (319.5, 239.5), (480, 640))
     poses = motion(_MOTION, _SYNTHETIC_FRAMES, seed, place_mm=MONOCULAR_PLACE_MM)
     talking = speech_schedule(_SYNTHETIC_FRAMES)
     return _rendered(face_sequence(jax.random.key(seed), poses, rig=monocular(camera), expressions=talking))
 
 
-def _single(options: argparse.Namespace, name: str) -> Setup:
-    if getattr(options, "rig", None):
+def _single(name: str, places: Places) -> Setup:
+    if places.rig:
         raise InputError(
             "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
         )
-    source, note = open_video(name, fps=options.fps), None
-    if not options.camera and options.points is None:
+    source, note = open_video(name, fps=places.fps), None
+    if not places.camera and places.points is None:
         source, note = upright(source)
     cols, rows = source.image_size
-    if options.camera:
-        K, distortion, image_size = open_intrinsics(options.camera)
-        _check_size(source, image_size, str(options.camera))
+    if places.camera:
+        K, distortion, image_size = open_intrinsics(places.camera)
+        _check_size(source, image_size, str(places.camera))
     else:
         focal = FOCAL_WIDTHS * cols
         K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
         note = "; ".join([*filter(None, [note]), f"an assumed focal length of {focal:.0f} px"])
     undistortion = Undistortion((rows, cols), K, distortion)
     rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
-    return Setup(rig, [undistortion], [source], _points(options, undistortion), None, note)
+    return Setup(rig, [undistortion], [source], _points(places.points, undistortion), None, note)
 
 
-def _synthetic(options: argparse.Namespace) -> Setup:
-    _refuse_unused({"--rig": options.rig, "--camera": options.camera, "--points": options.points, "--fps": options.fps})
-    seed = options.seed or 0
-    return _rendered(sequence(jax.random.key(seed), _MOTION, _SYNTHETIC_FRAMES, seed, deform=True))
-
-
-def _refuse_unused(given: dict[str, Any]) -> None:
-    if unused := [name for name, value in given.items() if value is not None]:
+def _refuse_unused(places: Places) -> None:
+    if unused := places.given():
         raise InputError(f"{', '.join(unused)}: of no use without a recording; the synthetic face has its own.")
 
 
@@ -161,11 +171,11 @@ def _remembered(made: FaceSequence):
     return images
 
 
-def _points(options: argparse.Namespace, undistortion: Undistortion) -> np.ndarray | None:
-    if options.points is None:
+def _points(file: Path | None, undistortion: Undistortion) -> np.ndarray | None:
+    if file is None:
         return None
     rows, cols = undistortion.shape
-    pixels = read_landmarks(options.points, (cols, rows))
+    pixels = read_landmarks(file, (cols, rows))
     if undistortion.K is None or undistortion.is_identity:
         return pixels
     return Calibration(undistortion.K, undistortion.distortion, np.eye(3), np.zeros(3), 0.0).undistort(pixels)

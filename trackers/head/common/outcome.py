@@ -1,6 +1,6 @@
 """What came of a run of a head: `report.json`, and a few lines for a person."""
 
-import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,14 +8,14 @@ import numpy as np
 from jaxfilters.trackers.app.results import finite, versions
 from jaxfilters.trackers.app.stream import RunResult
 from jaxfilters.trackers.head.common.report import errors, shares
-from jaxfilters.trackers.head.common.run import HeadRun
-from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, displayed
+from jaxfilters.trackers.head.common.run import HeadStream
+from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, HeadRows, displayed
 
 
-def run_report(run: HeadRun, followed: RunResult) -> dict[str, Any]:
+def run_report(stream: HeadStream, results: HeadRows, followed: RunResult) -> dict[str, Any]:
     """What `report.json` says of any run of a head."""
-    results, place, frame_of = run.writer.results, run.stream.place, run.stream.frame_of
-    events = [{"frame": frame_of[min(i, len(frame_of) - 1)], "what": what} for i, what in run.stream.session.events]
+    place, frame_of = stream.place, stream.frame_of
+    events = [{"frame": frame_of[min(i, len(frame_of) - 1)], "what": what} for i, what in stream.session.events]
     return {
         "input": [source.name for source in place.sources],
         **shares(results),
@@ -30,8 +30,8 @@ def run_report(run: HeadRun, followed: RunResult) -> dict[str, Any]:
     }
 
 
-def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
-    """The report in a few lines for a person."""
+def format_report(report: dict[str, Any], out: Path, *, has_video: bool) -> str:
+    """The report of results in the folder `out` in a few lines for a person."""
     speed, share = report["frames_per_second"], report["share_tracked"]
     lines = [
         f"{report['frames']} frames"
@@ -49,7 +49,6 @@ def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
         last = f"; last: {report['events'][-1]['what']}" if report["events"] else ""
         lines.append(f"no face was followed{last}")
     lines.append(
-        f"results in {options.out}: track.csv, track.npz, report.json, summary.png"
-        + (", overlay.mp4" if options.video else "")
+        f"results in {out}: track.csv, track.npz, report.json, summary.png" + (", overlay.mp4" if has_video else "")
     )
     return "\n".join(lines)

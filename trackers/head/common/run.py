@@ -1,7 +1,6 @@
 """A head's session in a run: images of all cameras in, rows and pictures out."""
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 
 from jaxfilters.trackers.app.results import TrackTable
-from jaxfilters.trackers.app.stream import StreamRun, StreamSpec
+from jaxfilters.trackers.app.stream import StreamSpec
 from jaxfilters.trackers.head.common.drawing import draw_frame
 from jaxfilters.trackers.head.common.input import Setup
 from jaxfilters.trackers.head.common.table import SKIPPED, STATUS_WORDS, HeadRows, with_gaps
@@ -111,42 +110,31 @@ class HeadStream:
         return track
 
 
-class HeadRun(StreamRun):
-    """A run of a head tracker."""
+def stream_spec(stream: HeadStream, rows: RowsOf, config: Any, files: Mapping[str, Any]) -> StreamSpec:
+    """A run of a head.
 
-    def __init__(self, options: argparse.Namespace, place: Setup, session: HeadTracker, rows: RowsOf, config: Any):
-        """A run before its first image, or with `--resume` after its last checkpoint.
-
-        Args:
-            options: Of the command line.
-            place: What is watched.
-            session: What follows the head.
-            rows: How its track becomes rows.
-            config: A dataclass of Python values, with `chunk`: the options of the session.
-
-        Raises:
-            OutputError: the folder holds another run's track, or cannot be written.
-            CheckpointError: the run that is to be resumed is another one, or its checkpoint is damaged.
-        """
-        paired = PairedInput(place.sources)
-        total = min((getattr(source, "frames", 0) for source in place.sources), default=0) or None
-        self.stream = HeadStream(place, session, rows, config.chunk)
-        identity = _identity(options, place, config)
-        moments = straightened(iter(paired), place.undistortions)
-        super().__init__(
-            options, StreamSpec(place.sources, moments, paired.trouble, self.stream, rows.table, identity, total)
-        )
+    Args:
+        stream: What is watched, and what follows the head.
+        rows: How its track becomes rows.
+        config: A dataclass of Python values: the options of the session.
+        files: What else decides about the results, by the names of options; None where it was not given.
+    """
+    sources = stream.place.sources
+    paired = PairedInput(sources)
+    total = min((getattr(source, "frames", 0) for source in sources), default=0) or None
+    moments = straightened(iter(paired), stream.place.undistortions)
+    identity = _identity(stream.place, config, files)
+    return StreamSpec(sources, moments, paired.trouble, stream, rows.table, identity, total)
 
 
-def _identity(options: argparse.Namespace, place: Setup, config: Any) -> dict[str, Any]:
+def _identity(place: Setup, config: Any, files: Mapping[str, Any]) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
-    given = {name: getattr(options, name, None) for name in ("camera", "rig", "points", "model", "known", "detector")}
     return {
         "input": [source.name for source in place.sources],
         "image_sizes": [list(source.image_size) for source in place.sources],
         "fps": [source.fps for source in place.sources],
         "version": version("jaxfilters"),
-        **{f"--{name}": str(value) for name, value in given.items() if value is not None},
+        **{f"--{name}": str(value) for name, value in files.items() if value is not None},
         **{f"config.{name}": value for name, value in asdict(config).items()},
     }
 

@@ -14,13 +14,13 @@ from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.results import finite
-from jaxfilters.trackers.app.stream import check_unused
-from jaxfilters.trackers.head.common.input import setup_of_one
+from jaxfilters.trackers.app.stream import StreamRun, check_unused
+from jaxfilters.trackers.head.common.input import Places, setup_of_one
 from jaxfilters.trackers.head.common.outcome import format_report, run_report
-from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
+from jaxfilters.trackers.head.common.run import HeadStream, RowsOf, stream_spec
 from jaxfilters.trackers.head.common.summary import Labels, write_summary
 from jaxfilters.trackers.head.common.table import TABLE_STATUS
-from jaxfilters.trackers.head.mono.config import MonoConfig
+from jaxfilters.trackers.head.mono.config import VARIANTS, MonoConfig
 from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector, best_detector
 from jaxfilters.trackers.head.mono.session import MonoSession
@@ -47,38 +47,42 @@ def track(options: argparse.Namespace) -> str:
         KeyboardInterrupt: before anything was tracked.
     """
     check_unused(options)
-    settings = as_input_error(partial(config_from_args, MonoConfig, options))
+    settings = as_input_error(partial(config_from_args, VARIANTS[options.variant], options))
     model = _model(options)
-    place = setup_of_one(options)
-    if any(map(is_live, place.sources)):
-        settings = dataclasses.replace(settings, chunk=1, live=True)
     face = tracked(model.model)
     known = None if options.known is None else read_people(options.known, face)
+    places = Places(camera=options.camera, points=options.points, fps=options.fps)
+    place = setup_of_one(options.video_source, places, options.seed or 0)
+    if any(map(is_live, place.sources)):
+        settings = dataclasses.replace(settings, chunk=1, live=True)
     remembered = None if known is None else known.remembered
     detected_by, detector = _detector(options)
     session = as_input_error(
         lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
     )
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
-    with closing(HeadRun(options, place, session, rows, settings)) as run:
-        return _tracked(options, settings, run, session, model, known, detected_by)
+    stream = HeadStream(place, session, rows, settings.chunk)
+    files = {name: getattr(options, name) for name in _GIVEN} | {"detector": detected_by}
+    with closing(StreamRun(options, stream_spec(stream, rows, settings, files))) as run:
+        return _tracked(options, settings, stream, run, session, model, known, detected_by)
 
 
 def _tracked(
     options: argparse.Namespace,
     settings: MonoConfig,
-    run: HeadRun,
+    stream: HeadStream,
+    run: StreamRun,
     session: MonoSession,
     model: FaceModelFile,
     known: People | None,
     detected_by: str,
 ) -> str:
-    place, face = run.stream.place, tracked(model.model)
+    place, face = stream.place, tracked(model.model)
     if place.note:
         warn(f"{place.note}: distances are wrong in proportion")
     followed = run.follow()
     person = session.person
-    report = run_report(run, followed) | {
+    report = run_report(stream, run.writer.results, followed) | {
         "focal_length_px": np.asarray(place.rig.focal[0], float).tolist(),
         "is_focal_length_assumed": place.truth is None and options.camera is None,
         "eyes_apart_mm": None if person is None else finite(float(eyes_apart(face, person))),
@@ -100,7 +104,8 @@ def _tracked(
     truth = None if place.truth is None else place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
     run.conclude(followed)
-    return format_report(report, options) if focal is None else f"{format_report(report, options)}\n{_in_words(focal)}"
+    lines = format_report(report, options.out, has_video=options.video)
+    return lines if focal is None else f"{lines}\n{_in_words(focal)}"
 
 
 def _model(options: argparse.Namespace) -> FaceModelFile:
@@ -143,7 +148,7 @@ def _in_words(focal: dict[str, Any]) -> str:
     return f"the focal length looks like {focal['px']:.0f} px, give or take {focal['std_px']:.0f}"
 
 
-def _taken_for(run: HeadRun, known: People | None) -> dict[str, int]:
+def _taken_for(run: StreamRun, known: People | None) -> dict[str, int]:
     """In how many frames each of those who are known was before the camera; nobody without frames."""
     who = np.asarray(run.writer.results.who)
     names = () if known is None else known.names

@@ -3,8 +3,15 @@
 import argparse
 from pathlib import Path
 
-from jaxfilters.trackers.app.options import add_config, add_results_options, add_resume, add_seed, add_video_options
-from jaxfilters.trackers.head.mono.config import MonoConfig
+from jaxfilters.trackers.app.options import (
+    add_config,
+    add_results_options,
+    add_resume,
+    add_seed,
+    add_variant,
+    add_video_options,
+)
+from jaxfilters.trackers.head.mono.config import VARIANTS, MonoConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="what finds the landmarks: MediaPipe's face mesh (default where it is installed), which with a model of "
         "68 landmarks gives most of them, and the width of the irises, or OpenCV's cascades",
     )
+    add_variant(parser, VARIANTS)
     add_config(parser, MonoConfig, "eyes_apart_mm", "num_particles")
     parser.add_argument(
         "--known",

@@ -32,6 +32,7 @@ from jaxfilters.trackers.head.mono.start import Start, begin, detected, initiali
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack, prior_of
 from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_points
+from jaxfilters.trackers.io.face_models import people_face_model
 
 MOST_REPROJECTION = 0.05
 """Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
@@ -154,8 +155,9 @@ def track(
     images: UInt8[np.ndarray, "b rows cols"],
     times_s: Float[np.ndarray, " b"],
     camera: Pinhole,
-    face: MultilinearFace,
-    options: MonoConfig | None = None,
+    config: MonoConfig | None = None,
+    *,
+    face: MultilinearFace | None = None,
     **known: Any,
 ) -> MonoTrack:
     """The head in images in memory; `MonoSession` takes them in pieces.
@@ -164,9 +166,9 @@ def track(
         images: Grey, without lens distortion.
         times_s: Seconds, growing.
         camera: Which took them.
-        face: Model of ten landmarks, or of the 68 of iBUG; `jaxfilters.trackers.io.face_models.default_face_model` is a
-            general one.
-        options: Constants.
+        config: Constants.
+        face: Model of ten landmarks, or of the 68 of iBUG; by default the general one of
+            `jaxfilters.trackers.io.face_models.people_face_model`, as for videos by the command.
         known: `points`, `detections`, `detector` and `remembered` of `MonoSession`.
 
     Returns:
@@ -175,7 +177,8 @@ def track(
     Raises:
         ValueError: as for `MonoSession` and its `process`.
     """
-    session = MonoSession(monocular(camera), face, options, **known)
+    face = people_face_model().model if face is None else face
+    session = MonoSession(monocular(camera), face, config, **known)
     return session.process(images[:, None], np.asarray(times_s))
 
 

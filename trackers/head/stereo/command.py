@@ -11,11 +11,11 @@ from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.results import finite
-from jaxfilters.trackers.app.stream import check_unused
+from jaxfilters.trackers.app.stream import StreamRun, check_unused
 from jaxfilters.trackers.head.common.config import HeadConfig
-from jaxfilters.trackers.head.common.input import Setup, setup_of
+from jaxfilters.trackers.head.common.input import Places, Setup, setup_of
 from jaxfilters.trackers.head.common.outcome import format_report, run_report
-from jaxfilters.trackers.head.common.run import HeadRun, RowsOf
+from jaxfilters.trackers.head.common.run import HeadStream, RowsOf, stream_spec
 from jaxfilters.trackers.head.common.summary import write_summary
 from jaxfilters.trackers.head.common.table import HEAD_TABLE, TABLE_STATUS, empty_rows, in_metres
 from jaxfilters.trackers.head.stereo.session import HeadSession
@@ -33,20 +33,26 @@ def track(options: argparse.Namespace) -> str:
     """
     check_unused(options)
     settings = as_input_error(partial(config_from_args, HeadConfig, options))
-    place = setup_of(options)
+    place = setup_of(
+        options.sources, Places(options.rig, options.camera, options.points, options.fps), options.seed or 0
+    )
     if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     session = as_input_error(lambda: _session(place, settings))
     rows = RowsOf(HEAD_TABLE, in_metres, partial(empty_rows, place.rig.num_cameras))
-    with closing(HeadRun(options, place, session, rows, settings)) as run:
-        return _tracked(options, settings, run, session)
+    stream = HeadStream(place, session, rows, settings.chunk)
+    files = {name: getattr(options, name) for name in ("camera", "rig", "points", "detector")}
+    with closing(StreamRun(options, stream_spec(stream, rows, settings, files))) as run:
+        return _tracked(options, settings, stream, run, session)
 
 
-def _tracked(options: argparse.Namespace, settings: HeadConfig, run: HeadRun, session: HeadSession) -> str:
-    if run.stream.place.note:
-        warn(run.stream.place.note)
+def _tracked(
+    options: argparse.Namespace, settings: HeadConfig, stream: HeadStream, run: StreamRun, session: HeadSession
+) -> str:
+    if stream.place.note:
+        warn(stream.place.note)
     followed = run.follow()
-    report = run_report(run, followed) | {
+    report = run_report(stream, run.writer.results, followed) | {
         "explained_contribution": finite(float(session.contribution)),
         "config": dataclasses.asdict(settings),
         "options": {
@@ -55,10 +61,10 @@ def _tracked(options: argparse.Namespace, settings: HeadConfig, run: HeadRun, se
         },
     }
     run.writer.finish(report, **_learnt(session))
-    truth = None if run.stream.place.truth is None else run.stream.place.truth.poses
+    truth = None if stream.place.truth is None else stream.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
     run.conclude(followed)
-    return format_report(report, options)
+    return format_report(report, options.out, has_video=options.video)
 
 
 def _session(place: Setup, settings: HeadConfig) -> HeadSession:

@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="columns name,u,v: the ten landmarks in the first image of the first camera, pixels from the centre of "
         "the top left one (default: they are detected)",
     )
-    add_config(parser, HeadConfig, "mode", "detector", "num_particles")
+    add_config(parser, HeadConfig, "variant", "detector", "num_particles")
     add_seed(parser)
     add_video_options(parser)
     add_resume(parser)

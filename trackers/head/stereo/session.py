@@ -96,7 +96,8 @@ def track(
     images: UInt8[np.ndarray, "b C rows cols"],
     times_s: Float[np.ndarray, " b"],
     rig: CameraRig,
-    options: HeadConfig | None = None,
+    config: HeadConfig | None = None,
+    *,
     points: Float[np.ndarray, "K 2"] | None = None,
 ) -> HeadTrack:
     """The head in images in memory; `HeadSession` takes them in pieces.
@@ -105,7 +106,7 @@ def track(
         images: Grey, of all cameras at one moment each, without lens distortion.
         times_s: Seconds, growing.
         rig: One camera or more.
-        options: Constants.
+        config: Constants.
         points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
 
     Returns:
@@ -114,7 +115,7 @@ def track(
     Raises:
         ValueError: as for `HeadSession` and its `process`.
     """
-    return HeadSession(rig, options, points).process(images, np.asarray(times_s))
+    return HeadSession(rig, config, points).process(images, np.asarray(times_s))
 
 
 def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:

@@ -81,7 +81,7 @@ def begin(
     images = jnp.asarray(images, pose.dtype)
     slopes = unknown_slopes(len(model.mean))
     registered = _registered(images, model.mean, pose, slopes, rig)
-    if VARIANTS[options.mode].sharpens:
+    if VARIANTS[options.variant].sharpens:
         slopes = first_slopes(images, model.mean, pose, rig)
         registered = _sharper(images, model.mean, pose, slopes, rig)
     x = jnp.concatenate([registered.pose, jnp.zeros(NUM_MODES, pose.dtype)])
@@ -132,7 +132,7 @@ def advance(
 def _step(
     rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadConfig
 ) -> tuple[HeadState, HeadTrack]:
-    way = VARIANTS[options.mode]
+    way = VARIANTS[options.variant]
     images = images.astype(state.belief.mean.dtype)
     key, search_key, lost_key = jax.random.split(state.key, 3)
     state = at_last_good(lost_key, state)

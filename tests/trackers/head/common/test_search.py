@@ -184,7 +184,7 @@ def test_options_that_differ_in_numbers_share_a_program():
     fixed = [HeadConfig(diffusion="fixed", fixed_diffusion=value, seed=i) for i, value in enumerate((1.0, 5.0))]
     assert compiled(fixed[0]) == compiled(fixed[1]) == compiled(HeadConfig())
     assert compiled(HeadConfig(diffusion="online")) != compiled(HeadConfig())
-    assert compiled(HeadConfig(mode="paper")) != compiled(HeadConfig())
+    assert compiled(HeadConfig(variant="published")) != compiled(HeadConfig())
     one, two = (jax.tree.structure(first_diffusion(options)) for options in fixed)
     assert one == two
 

@@ -224,12 +224,13 @@ def mono_options(**given):
     from argparse import Namespace
 
     usual = dict(video_source=None, camera=None, points=None, fps=None, seed=None, num_particles=None, video=False)
+    usual |= dict(resume=False, variant="modern")
     return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, estimate_focal=False, known=None) | given)
 
 
 def test_the_synthetic_face_is_one_camera_with_truth(monkeypatch, tmp_path):
     monkeypatch.setattr(head_input, "_SYNTHETIC_FRAMES", 5)
-    place = head_input.setup_of_one(mono_options(out=tmp_path, model=None))
+    place = head_input.setup_of_one(None, head_input.Places(), 0)
     assert place.rig.num_cameras == 1
     assert place.points.shape == (10, 2)
     assert place.truth.poses.shape == (5, 6)

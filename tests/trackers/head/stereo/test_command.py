@@ -66,7 +66,7 @@ def rows_of(out):
 
 def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run(*stereo, "--out", out, "--seed", 3, "--num-particles", 50, "--mode", "paper") == 0
+    assert run(*stereo, "--out", out, "--seed", 3, "--num-particles", 50, "--variant", "published") == 0
     assert {file.name for file in out.iterdir()} == OUTPUTS
     rows = rows_of(out)
     assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
@@ -84,7 +84,7 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     assert float(rows[5]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
     assert fake_head[0].sizes == [8, 8, 4]
     options = fake_head[0].options
-    assert (options.seed, options.num_particles, options.mode) == (3, 50, "paper")
+    assert (options.seed, options.num_particles, options.variant) == (3, 50, "published")
     with np.load(out / "track.npz") as track:
         assert track["image_points"].shape == (FRAMES, 2, 10, 2)
         assert track["status_names"][int(track["status"][10])] == "lost"
@@ -309,7 +309,10 @@ def test_wrong_input_is_named(stereo, fake_head, tmp_path, capsys, arguments, me
 
 
 def test_wrong_arguments_exit_with_two(capsys):
-    for arguments, message in (("a b", "required: --out"), ("--out a --mode fast", "--mode: invalid choice: 'fast'")):
+    for arguments, message in (
+        ("a b", "required: --out"),
+        ("--out a --variant fast", "--variant: invalid choice: 'fast'"),
+    ):
         with pytest.raises(SystemExit, match="2"):
             run(*arguments.split())
         assert message in capsys.readouterr().err

@@ -17,8 +17,8 @@ from jaxfilters.trackers.head.stereo.registration import register
 pytestmark = pytest.mark.optimised
 
 CHUNK = 8
-MODERN, PAPER = HeadConfig(), HeadConfig(mode="paper")
-FIXED = HeadConfig(mode="paper", diffusion="fixed", fixed_diffusion=1.0)
+MODERN, PAPER = HeadConfig(), HeadConfig(variant="published")
+FIXED = HeadConfig(variant="published", diffusion="fixed", fixed_diffusion=1.0)
 PAPER_ADAPTIVE = {"slow": (1.25, 1.91, 2.71, 0.25, 1.55, 1.70), "fast": (3.42, 3.34, 4.92, 0.87, 2.86, 2.34)}
 """Published errors of the adaptive tracker, millimetres and degrees (P, tables 3 and 4)."""
 
