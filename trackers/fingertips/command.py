@@ -63,9 +63,8 @@ def track(options: argparse.Namespace) -> str:
     try:
         user = _user(source, options.mask)
         if not user.has_open_hand:
-            warn(
-                f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles{_advice(options)}"
-            )
+            usual = "no open hand in the first images; thumbs are recognised by the usual angles"
+            warn(f"{source.name}: {usual}{_advice(options)}")
         session = FingertipSession(
             angles_of(user),
             handedness=user.parameters.handedness,
