@@ -24,7 +24,7 @@ WORKING_RADIUS = 6.5
 """Pixels: hands with thicker fingers are looked at in a smaller image, and only their tips in the whole one."""
 SMALLEST_PALM = 1.7
 """Tip radii; what is thinner everywhere is no hand."""
-BEHIND, NEAR = 0.3, 1.3
+BEHIND, NEAR = 0.6, 1.3
 """Palm radii: farther back than the one, or nearer to the palm than the other, there are no tips."""
 
 
@@ -134,7 +134,12 @@ def _components(skin: np.ndarray, tip_radius: float) -> Iterator[_Silhouette]:
     shrink = max(1.0, tip_radius / WORKING_RADIUS)
     size = (max(1, round(cols / shrink)), max(1, round(rows / shrink)))
     step = np.array([cols / size[0], rows / size[1]])
-    small = cv2.resize(255 * skin, size, interpolation=cv2.INTER_AREA) if shrink > 1 else 255 * skin
+    small = 255 * skin
+    whole = int(shrink)
+    if whole > 1 and not (rows % whole or cols % whole):
+        # Means of whole pixels are many times as fast as those of fractions, which then have fewer pixels to go over.
+        small = cv2.resize(small, (cols // whole, rows // whole), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(small, size, interpolation=cv2.INTER_AREA) if shrink > 1 else small
     inside = cv2.threshold(small, 127, 1, cv2.THRESH_BINARY)[1]
     ltype = cv2.CV_16U if inside.size < MOST_FOR_SHORT_LABELS else cv2.CV_32S
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8, ltype=ltype)

@@ -165,5 +165,5 @@ def _sampled(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _units(vectors: np.ndarray) -> np.ndarray:
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(lengths, 1e-9)
+    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+    return vectors / np.maximum(lengths, 1e-9)[:, None]

@@ -129,6 +129,19 @@ def depth_mask(
     return cv2.medianBlur(mask, 3).view(bool)
 
 
+def reading_mask(depth: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
+    """Where an image of depths has readings at all: the hand, where what is behind it was removed or is too far away.
+
+    Args:
+        depth: (rows, cols) metres along the optical axis; what is not finite or not positive is no reading.
+
+    Raises:
+        ValueError: depth that is not (rows, cols) of floats.
+    """
+    _check_floats("depth", depth)
+    return cv2.medianBlur(_is_reading(depth).astype(np.uint8), 3).view(bool)
+
+
 def _is_reading(depth: np.ndarray) -> np.ndarray:
     return np.isfinite(depth) & (depth > 0)
 

@@ -63,7 +63,7 @@ def best_apart(
 
 def _refined(response: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Vertices (n, 2) of parabolas through the neighbours of each peak, in x and in y."""
-    padded = np.pad(response, 1, mode="edge")
+    padded = cv2.copyMakeBorder(response, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     x, y = places[:, 0] + 1, places[:, 1] + 1
     middle = padded[y, x]
     shift = []

@@ -50,7 +50,8 @@ def track(options: argparse.Namespace) -> str:
     )
     user = _user(source, options.mask)
     if not user.has_open_hand:
-        warn(f"{source.name}: no open hand in the first images; thumbs are recognised by the usual angles")
+        usual = "no open hand in the first images; thumbs are recognised by the usual angles"
+        warn(f"{source.name}: {usual}{_advice(options)}")
     config, method = VARIANTS[options.variant]
     session = FingertipSession(
         angles_of(user),
@@ -105,6 +106,11 @@ def recogniser_of(file: SymbolsFile) -> Recogniser:
         return Recognised(file.symbols.names[label] if label >= 0 else None, float(np.max(found.confidence)))
 
     return recognise
+
+
+def _advice(options: argparse.Namespace) -> str:
+    brightest = options.mask == "infrared" and options.keypoints is None
+    return "; where hands are not the brightest of all, --mask colour may find them" if brightest else ""
 
 
 def _symbols(path: str) -> SymbolsFile:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +15,8 @@ from jaxfilters.models.fingertip.first_image import fit_hand_parameters, fit_han
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.fingertip.keypoints import KEYPOINT_POSTURE
 from jaxfilters.models.fingertip.observation import HandObservation
-from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold
+from jaxfilters.models.fingertip.segmentation import bright_mask, depth_mask, fit_desk, otsu_threshold, reading_mask
+from jaxfilters.models.fingertip.side import thumb_side_log_odds
 from jaxfilters.models.fingertip.skin import SkinModel, fit_skin_model, skin_mask, skin_models
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture, ThumbAngles, calibrated, usual
 from jaxfilters.trackers.fingertips.events import Event, Recogniser
@@ -32,6 +34,8 @@ CLUSTER_IMAGES = 6
 """Images whose clusters of colour are tried, where no image shows an open hand in the colour of common skin."""
 LEAST_SHOWN = 0.5
 """Fingertips an image, on average over these, that the colour of a hand shows."""
+LEAST_DESK = 0.4
+"""Of an image of depths, that has readings where it shows a desk; with fewer, what is behind the hand was removed."""
 Segment = Callable[[np.ndarray], np.ndarray]
 """`image -> mask` (rows, cols) bool."""
 
@@ -114,7 +118,7 @@ def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> Us
         user = _consistent(user, images[:: max(1, len(images) // CLUSTER_IMAGES)])
     if user is None:
         raise ValueError(f"no image in which a hand differs from the desk; {why}")
-    return user
+    return _with_side(user, images)
 
 
 def _best_user(estimate: Callable[[Any], User], images: Sequence[Any]) -> tuple[User | None, str]:
@@ -145,6 +149,14 @@ def _consistent(by_skin: User | None, images: Sequence[Any]) -> User | None:
     shown = [np.mean([_num_tips(user, image) for image in images]) for user in users]
     best = int(np.argmax(shown)) if users else 0
     return users[best] if users and shown[best] >= LEAST_SHOWN else None
+
+
+def _with_side(user: User, images: Sequence[Any]) -> User:
+    """With the side of the thumb that the fingers of all images together make likelier."""
+    hands = [detect_hands(user.segment(image), user.parameters, capacity=1)[0] for image in images]
+    stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *hands)
+    log_odds = np.asarray(jax.vmap(thumb_side_log_odds)(stacked))
+    return user._replace(parameters=replace(user.parameters, handedness=1 if log_odds.sum() >= 0 else -1))
 
 
 def _num_tips(user: User, image: np.ndarray) -> int:
@@ -186,6 +198,8 @@ def _by_brightness(image: np.ndarray) -> User:
 
 
 def _by_height(image: np.ndarray) -> User:
+    if reading_mask(image).mean() < LEAST_DESK:
+        return _of_mask(reading_mask, image)
     desk = fit_desk(image)
     return _of_mask(lambda image: depth_mask(image, desk), image)
 

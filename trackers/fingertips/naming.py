@@ -1,20 +1,15 @@
 """Which finger a track is that becomes a fingertip: a number of its own, or one of five names by its place."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters.math import assignment
 from jaxfilters.models.fingertip.observation import MAX_TIPS, HandObservation
+from jaxfilters.models.fingertip.side import ANGLES, LENGTHS
 from jaxfilters.models.fingertip.thumb import base_angle
 from jaxfilters.trackers.fingertips.state import CONFIRMED, Fingers, FingertipConfig, HandState, Tracks
 
-ANGLES = tuple(math.radians(angle) for angle in (58.0, 20.0, 0.0, -18.0, -38.0))
-"""Of the tips of thumb, forefinger, middle, ring and little finger about the palm, of people's open hands."""
-LENGTHS = (1.85, 2.5, 2.75, 2.5, 2.1)
-"""Of the same, palm radii from the palm."""
 UPDATE_SHARE = 0.02
 """Of what a frame shows in the place that belongs to a name: a hand changes its posture slowly."""
 MOST, KEPT = 16.0, 8.0

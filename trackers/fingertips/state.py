@@ -143,6 +143,10 @@ class HandState(NamedTuple):
     """Frames in a row without a tip."""
     disordered: Int32[Array, ""]
     """Frames in a row in which the order of the fingers was in doubt."""
+    turned: Bool[Array, ""]
+    """Whether the thumb is on the side other than the given one."""
+    side_odds: Float[Array, ""]
+    """Log odds that it is on the given one."""
     next_identity: Int32[Array, ""]
 
 
@@ -190,6 +194,8 @@ class Method(NamedTuple):
 
     hint: Callable[..., Gaussian]
     """`(config, state, observed) -> beliefs`, with what else than tips tells where fingers are in this frame."""
+    side: Callable[..., tuple[Array, Array]]
+    """`(state, observed, side) -> (turned, side_odds)`: whether the thumb is on the side other than `side`."""
     associate: Callable[..., tuple[Array, Array]]
     """`(config, state, beliefs, observed) -> (tip of every slot or -1, whether the order was in doubt)`."""
     may_begin: Callable[..., Array]

@@ -14,7 +14,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.fingertip import motion
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles, base_angle
-from jaxfilters.trackers.fingertips import lifecycle, naming
+from jaxfilters.trackers.fingertips import lifecycle, naming, sides
 from jaxfilters.trackers.fingertips.association import likeliest, nearest_in_order
 from jaxfilters.trackers.fingertips.state import (
     ABSENT,
@@ -33,6 +33,7 @@ from jaxfilters.trackers.fingertips.thumbs import MEAN_SCORE, POSTERIOR
 
 MODERN = Method(
     lifecycle.carried,
+    sides.by_fingers,
     likeliest,
     lifecycle.away_from_others,
     naming.by_place,
@@ -42,6 +43,7 @@ MODERN = Method(
 )
 PUBLISHED = Method(
     lifecycle.no_hint,
+    sides.as_given,
     nearest_in_order,
     lifecycle.anywhere,
     naming.numbered,
@@ -66,6 +68,8 @@ def start(config: FingertipConfig, angles: ThumbAngles, *, method: Method = MODE
         axis_unseen=never,
         empty=jnp.zeros((), jnp.int32),
         disordered=jnp.zeros((), jnp.int32),
+        turned=jnp.zeros((), bool),
+        side_odds=jnp.asarray(sides.DECIDED, dtype=float),
         next_identity=jnp.zeros((), jnp.int32),
     )
 
@@ -87,10 +91,12 @@ def step(
         angles: Of this person's thumb and forefinger.
         state: The hand before.
         observed: What the frame shows; with no hand and no tip it is a frame to coast through.
-        side: -1 for the hand whose thumb is clockwise of the arm's axis.
+        side: -1 for the hand whose thumb is clockwise of the arm's axis, at first: it may turn over.
         method: The strategies.
     """
     observed = _usable(observed)
+    state = _sided(config, angles, state, observed, side, method)
+    side = jnp.where(state.turned, -side, side)
     placed = _placed(config, state, observed)
     moves = motion.velocity_driven(config.frame)
     beliefs = method.hint(config, state, observed)
@@ -99,8 +105,10 @@ def step(
     corrected, _ = jax.vmap(motion.correct)(beliefs, observed.tips[jnp.maximum(tip, 0)], matched)
     following = jax.vmap(motion.predict, in_axes=(None, 0, None))(moves, corrected, config.drive)
     tracks, ready = lifecycle.continued(config, state.tracks, following, matched)
+    # Fingers of a hand that turned over have no names any more.
+    unnamed = (tracks.mode == CONFIRMED) & (tracks.identity < 0)
     places = corrected.mean[:, :2]
-    identity, fingers = method.name(config, placed, tracks, ready, places, observed, side)
+    identity, fingers = method.name(config, placed, tracks, ready | unnamed, places, observed, side)
     tracks = tracks._replace(identity=identity)
     seen_twice = ~jnp.any(tip[:, None] == jnp.arange(len(observed.is_tip)), axis=0)
     new = seen_twice & method.may_begin(config, tracks, places, observed)
@@ -117,7 +125,9 @@ def step(
     sight = _Sight(corrected, observed.tips[jnp.maximum(tip, 0)], matched, probability)
     report = _report(config, after, observed, sight, method)
     gone = after.empty >= config.empty_frames
-    nothing = start(config, angles, method=method)._replace(fingers=fingers, next_identity=after.next_identity)
+    nothing = start(config, angles, method=method)._replace(
+        fingers=fingers, next_identity=after.next_identity, turned=after.turned, side_odds=after.side_odds
+    )
     return jax.tree.map(lambda a, b: jnp.where(gone, a, b), nothing, after), report
 
 
@@ -180,6 +190,26 @@ def _usable(observed: HandObservation) -> HandObservation:
         has_axis=has_axis,
         is_hand=palm_there,
     )
+
+
+def _sided(
+    config: FingertipConfig,
+    angles: ThumbAngles,
+    state: HandState,
+    observed: HandObservation,
+    side: float | Array,
+    method: Method,
+) -> HandState:
+    """With the side of the thumb; where that is another one than before, no finger has a name, nor is one the thumb."""
+    turned, odds = method.side(state, observed, side)
+    new = no_tracks(config, method.thumb.start(config, angles))
+    forgotten = state.tracks._replace(identity=new.identity, thumb=new.thumb, is_thumb=new.is_thumb)
+    tracks, fingers = jax.tree.map(
+        lambda a, b: jnp.where(turned != state.turned, a, b),
+        (forgotten, naming.no_fingers()),
+        (state.tracks, state.fingers),
+    )
+    return state._replace(tracks=tracks, fingers=fingers, turned=turned, side_odds=odds)
 
 
 def _placed(config: FingertipConfig, state: HandState, observed: HandObservation) -> HandState:

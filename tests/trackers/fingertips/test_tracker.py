@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.fingertip import thumb
+from jaxfilters.models.fingertip import side, thumb
 from jaxfilters.models.fingertip.observation import WHOLE_IMAGE, HandObservation
 from jaxfilters.models.gesture import codes
 from jaxfilters.models.synthetic import fingertip_points as points
@@ -293,3 +293,18 @@ def test_a_prediction_where_the_image_shows_no_hand_is_not_reported_and_keeps_it
     assert set(reports[-1].identity[reports[-1].is_tip]) == set(reports[5].identity[reports[5].is_tip])
     _, reports = play([shown(both)] * 6 + [shown(index)] * 3)
     assert [int(report.num_tips) for report in reports[5:]] == [2, 2, 2, 2]
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("turns_after", [0, 40])
+def test_a_hand_that_turns_over_has_its_thumb_on_the_other_side_within_a_second(turns_after):
+    """Turned over from the start, it is one whose side was given wrongly."""
+    angles, lengths = np.array(side.ANGLES), 46 * np.array(side.LENGTHS)
+    open_hand = np.stack([-lengths * np.sin(angles), -lengths * np.cos(angles)], axis=1)
+    turned = np.array([-1.0, 1.0]) * open_hand
+    frames = [shown(open_hand)] * turns_after + [shown([])] * min(turns_after, 8) + [shown(turned)] * 30
+    _, reports = play(frames)
+    for report in reports[3:turns_after]:
+        assert names_from_the_left(report) == [0, 1, 2, 3, 4]
+    assert names_from_the_left(reports[-1]) == [4, 3, 2, 1, 0]
+    assert reports[-1].position[reports[-1].is_thumb][:, 0] == pytest.approx(320 - open_hand[0, 0], abs=1)
