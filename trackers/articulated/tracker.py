@@ -241,7 +241,7 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
 
 
 def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
-    if setup.config.mode == "literal":
+    if setup.config.variant == "published":
         best = jnp.argmax(start.log_weights)
         start = GaussianSumState(jax.tree.map(lambda leaf: leaf[best][None], start.components), jnp.zeros(1))
     filter = _bank(setup, _first_belief(start), capacity, start)

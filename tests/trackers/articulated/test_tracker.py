@@ -111,7 +111,7 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
 def test_the_literal_mode_is_the_extended_kalman_filter_of_the_paper():
     sequence = tracker.synthetic_sequence(0)
     count = 12
-    config = ArticulatedConfig(mode="literal", gate=0.5)  # a gate that would refuse most rows
+    config = ArticulatedConfig(variant="published", gate=0.5)  # a gate that would refuse most rows
     short = FeatureSequence(
         2, FULL, sequence.times_s[:count], sequence.y[:count], sequence.std[:count], "short", start=sequence.start
     )
