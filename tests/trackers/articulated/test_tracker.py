@@ -108,7 +108,7 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
 
 
 @pytest.mark.system
-def test_the_literal_mode_is_the_extended_kalman_filter_of_the_paper():
+def test_the_published_variant_is_the_extended_kalman_filter_of_the_paper():
     sequence = tracker.synthetic_sequence(0)
     count = 12
     config = ArticulatedConfig(variant="published", gate=0.5)  # a gate that would refuse most rows
@@ -134,7 +134,7 @@ def test_the_literal_mode_is_the_extended_kalman_filter_of_the_paper():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"mode": "best"}, "mode must be one of recommended, literal, unconstrained; got 'best'"),
+        ({"variant": "best"}, "variant must be one of recommended, published, unconstrained; got 'best'"),
         ({"hypotheses": 0}, "hypotheses must be at least 1; got 0"),
         ({"gate": -1.0}, "gate must be at least 0; got -1.0"),
         ({"hand": "third"}, "hand must be one of right, left; got 'third'"),
