@@ -6,13 +6,11 @@ it. A task whose machine fails is started again, and its recordings are taken ov
 
 import argparse
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 from jaxfilters.trackers.io.errors import InputError
-
-LOCAL = "local"
-"""Address that starts a cluster of this machine alone."""
 
 
 def run_on_cluster(options: argparse.Namespace) -> None:
@@ -23,8 +21,7 @@ def run_on_cluster(options: argparse.Namespace) -> None:
     """
     if find_spec("ray") is None:
         raise InputError("--ray needs the package ray: pip install 'jaxfilters[ray]'.")
-    import ray
-
+    ray = import_module("ray")
     try:
         ray.init(address=options.ray, log_to_driver=True)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -48,8 +45,7 @@ def shares_of(nodes: Sequence[Mapping[str, Any]]) -> list[tuple[str, dict[str, i
 
 
 def _wait_for_all(ray: Any, options: argparse.Namespace) -> None:
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
+    affinity = import_module("ray.util.scheduling_strategies").NodeAffinitySchedulingStrategy
     shares = shares_of(ray.nodes())
     if not shares:
         raise InputError(f"--ray {options.ray}: its machines have no processors to offer.")
@@ -57,7 +53,7 @@ def _wait_for_all(ray: Any, options: argparse.Namespace) -> None:
     words = argparse.Namespace(**vars(options) | here)
     tasks = []
     for machine, share in shares:
-        place = NodeAffinitySchedulingStrategy(machine, soft=True)
+        place = affinity(machine, soft=True)
         remote = ray.remote(max_retries=-1, scheduling_strategy=place, **share)(_work)
         tasks.append(remote.remote(words))
     try:
