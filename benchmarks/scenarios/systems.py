@@ -65,7 +65,7 @@ def hand_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     errors: dict[str, list[float]] = {"": [], "_simple": []}
     for one in range(seed, seed + (1 if quick else 3)):
         recording, truth = hand_depth.synthetic_sequence(one)
-        count = 20 if quick else len(truth)
+        count = 20 if quick else 60
         frames, config = [recording[i] for i in range(count)], hand_depth.HandDepthConfig(seed=one, hand="right")
         track = hand_depth.track(frames, recording.times_s[:count], recording.camera, config)
         alone = simplest.registered_hands(recording.camera, np.stack(frames), track.pose[0], hand_geometry())
@@ -79,7 +79,7 @@ def articulated_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Root mean square errors of angles and lengths in the last frames of the paper's sequence."""
     angles: dict[str, list[float]] = {"": [], "_simple": []}
     lengths: dict[str, list[float]] = {"": [], "_simple": []}
-    for one in range(seed, seed + (1 if quick else 10)):
+    for one in range(seed, seed + (1 if quick else 6)):
         made = simulate_paper(jax.random.key(one))
         mean = articulated.track(articulated.synthetic_sequence(one)).mean
         for name, states in (("", mean), ("_simple", simplest.reprojected_hand(made))):
@@ -92,7 +92,7 @@ def articulated_metrics(quick: bool, seed: int) -> dict[str, Metric]:
 
 def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Accuracy of tracks and mean error of places, four people in a room with a desk and a pillar."""
-    room = demo_room(seed, frames=40 if quick else 240)
+    room = demo_room(seed, frames=40 if quick else 120)
     images = [room.image(0, i) for i in range(len(room))]
     scene = people.people_scene(room.cameras, room.floor, furniture=room.furniture)
     tracks = people.track([[image] for image in images], [i / room.fps for i in range(len(room))], scene)
@@ -112,7 +112,7 @@ def stereo_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Root mean square errors of the pose of slow heads before two cameras."""
     errors: dict[str, list[np.ndarray]] = {"": [], "_simple": []}
     for head in range(seed, seed + (1 if quick else 3)):
-        made = sequence(jax.random.key(head), "slow", 30 if quick else 300, head)
+        made = sequence(jax.random.key(head), "slow", 30 if quick else 150, head)
         errors[""].append(rmse(follow(made, {"": HeadConfig(learn=False)})[""]))
         images = [image for _, part in made.chunks() for image in part]
         uv = np.stack([simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1)
@@ -126,7 +126,7 @@ def mono_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     errors: dict[str, list[np.ndarray]] = {"": [], "_simple": []}
     first = START_FRAMES[-1] + 1
     for head in range(seed, seed + (1 if quick else 3)):
-        made = talking_head(head, 60 if quick else 300)
+        made = talking_head(head, 60 if quick else 150)
         contender = Contender(default_face_model().model, MonoConfig(seed=head))
         errors[""].append(follow_all(made, {"": contender}, head)[""].means)
         images = [image[0] for _, part in made.chunks() for image in part]
@@ -139,7 +139,7 @@ def mono_metrics(quick: bool, seed: int) -> dict[str, Metric]:
 
 def fingertip_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Share of frames with the right number of fingertips, one to five of them, infrared."""
-    key, frames = jax.random.key(seed), 12 if quick else 150
+    key, frames = jax.random.key(seed), 12 if quick else 100
     rendered = [fingertips.render(key, count, frames) for count in range(1, 6)]
     parameters = fingertips.open_hand(key)
     right: dict[str, list[float]] = {"": [], "_simple": []}
