@@ -89,10 +89,12 @@ def test_the_reference_is_the_usual_pose_of_the_beginning():
     random = np.random.default_rng(2)
     rotations = [turn(*random.normal(0, 0.7, 3)) for _ in range(6)] + [turn(0.0, 9.0, 5.0)] * 4
     registration = Registration(K)
-    straight = registration.prime([rendered(one) for one in rotations])
+    straight, blank = registration.prime([rendered(one) for one in rotations])
     expected = rendered(np.eye(3)).astype(int)
     inner = np.s_[20:100, 25:135]
     assert all(np.mean(np.abs(image - expected)[inner]) < 6 for image in straight)
+    assert [bool(one.any()) for one in blank[6:]] == [True] * 4
+    assert all(one[inner].max() == 0 for one in blank)
     # Differences between the images are those of interpolation; the pose itself is known as well as two are on average.
     assert max(np.mean(np.abs(a.astype(int) - straight[0])[inner]) for a in straight) < 2.5
 
