@@ -109,10 +109,6 @@ class Registration:
         found = cv2.goodFeaturesToTrack(self._reference, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX)
         self._corners = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
 
-    def in_video(self, uv: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) of the last image as it came, for pixels (n, 2) of the straightened one."""
-        return cv2.perspectiveTransform(np.asarray(uv, float).reshape(-1, 1, 2), self._homography(self._rotation))[:, 0]
-
     def state(self) -> dict[str, np.ndarray]:
         """The reference, as arrays to save; empty before the first image."""
         if self._reference is None:
