@@ -57,7 +57,7 @@ class Registration:
         self.failures = 0
         """Images in which no rotation could be found; they were taken for turned as the one before."""
 
-    def prime(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def prime(self, images: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Take the reference from images spread over a recording, and straighten all of them.
 
         The reference pose is the median one of the first quarter of the images: a calibration is older than a
@@ -67,7 +67,7 @@ class Registration:
             images: (rows, cols[, 3]) uint8 of one shape, at least one, in their order.
 
         Returns:
-            The images as from the reference pose.
+            The images as from the reference pose, and where each shows nothing: (rows, cols) uint8, not zero there.
         """
         self.refer_to(images[0])
         rotations = np.stack([self._estimate(image) for image in images])
@@ -75,10 +75,11 @@ class Registration:
         angles = np.median([cv2.Rodrigues(one)[0][:, 0] for one in beginning], axis=0)
         usual = cv2.Rodrigues(angles)[0]
         # Rays of the first image turn by `usual` into the reference pose.
-        found = [self._turned(image, one @ usual.T) for image, one in zip(images, rotations, strict=True)]
+        back = [one @ usual.T for one in rotations]
+        found = [self._turned(image, one) for image, one in zip(images, back, strict=True)]
         self.refer_to(found[0])
         self._rotation = np.eye(3)
-        return found
+        return found, [self._blank(images[0].shape[:2], one) for one in back]
 
     def straightened(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """An image as from the reference pose, and where it shows nothing.
@@ -100,17 +101,13 @@ class Registration:
         if moved < _STILL_PX:
             return image, None
         self.most_px = max(self.most_px, moved)
-        return self._turned(image, self._rotation), self._blank(image.shape[:2])
+        return self._turned(image, self._rotation), self._blank(image.shape[:2], self._rotation)
 
     def refer_to(self, image: np.ndarray) -> None:
         """Take corners from another image in the reference pose, as from a background that follows the light."""
         self._reference = _small_grey(image)
         found = cv2.goodFeaturesToTrack(self._reference, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX)
         self._corners = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
-
-    def in_video(self, uv: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) of the last image as it came, for pixels (n, 2) of the straightened one."""
-        return cv2.perspectiveTransform(np.asarray(uv, float).reshape(-1, 1, 2), self._homography(self._rotation))[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
         """The reference, as arrays to save; empty before the first image."""
@@ -204,11 +201,13 @@ class Registration:
             image, self._homography(rotation), image.shape[1::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
 
-    def _blank(self, shape: tuple[int, int]) -> np.ndarray:
+    def _blank(self, shape: tuple[int, int], rotation: np.ndarray) -> np.ndarray:
+        """Where an image that `_turned` gives shows nothing, 255."""
+        blank = np.zeros(shape, np.uint8)
+        if self._motion_px(rotation, shape) < _STILL_PX:
+            return blank
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        return cv2.warpPerspective(
-            np.zeros(shape, np.uint8), self._homography(self._rotation), shape[::-1], flags=flags, borderValue=255.0
-        )
+        return cv2.warpPerspective(blank, self._homography(rotation), shape[::-1], flags=flags, borderValue=255.0)
 
     def _motion_px(self, rotation: np.ndarray, shape: tuple[int, ...]) -> float:
         rows, cols = shape[:2]

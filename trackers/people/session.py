@@ -165,9 +165,9 @@ class PeopleSession:
         """Estimate each camera's background from images spread over its recording; none where it has no samples."""
         for camera, (model, images) in enumerate(zip(self._backgrounds, samples, strict=True)):
             if images and self._registrations:
-                straight = self._registrations[camera].prime(evenly(images))
+                straight, blank = self._registrations[camera].prime(evenly(images))
                 scene = self.tracks.scene
-                model.prime(emptied(scene.cameras[camera], np.asarray(scene.floor), straight))
+                model.prime(emptied(scene.cameras[camera], np.asarray(scene.floor), straight, blank))
                 self._renew_reference(camera)
             elif images:
                 model.prime(images)

@@ -32,18 +32,24 @@ _INPAINT_RADIUS_PX = 5.0
 _NEAR_BOX_PX = 2
 
 
-def emptied(camera: FloorCamera, floor: np.ndarray, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The images with the room in the place of the people who stand upright in it.
+def emptied(
+    camera: FloorCamera, floor: np.ndarray, images: Sequence[np.ndarray], blank: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """The images with the room in the place of the people who stand upright in it, and where they show nothing.
 
     Args:
         camera: Of the images.
         floor: (corners, 2) polygon in which people can stand, metres.
         images: (rows, cols, 3) uint8 spread over a recording, from one pose.
+        blank: For each image (rows, cols), not zero where a camera that had turned showed nothing.
 
     Returns:
-        As many images; those in which nobody was found as they were.
+        As many images; those in which nothing was found as they were.
     """
-    masks = [_mask(image.shape[:2], standing_boxes(camera, floor, image)) for image in images]
+    masks = [
+        _mask(image.shape[:2], standing_boxes(camera, floor, image)) | (unknown > 0)
+        for image, unknown in zip(images, blank, strict=True)
+    ]
     somewhere = np.any(masks, axis=0)
     if not somewhere.any():
         return list(images)

@@ -12,6 +12,7 @@ SHAPE = (120, 160)
 K = np.array([[160.0, 0, 79.5], [0, 160.0, 59.5], [0, 0, 1.0]])
 R = cv2.Rodrigues(np.array([np.pi / 2 + 0.35, 0.0, 0.0]))[0]
 CAMERA = FloorCamera.from_matrix(K @ np.column_stack([R, -R @ [0.0, -6.0, 3.0]]), SHAPE)
+ALL_SHOWN = [np.zeros(SHAPE, np.uint8)] * 20
 FLOOR = np.array([[-3.0, -3.0], [3.0, -3.0], [3.0, 3.0], [-3.0, 3.0]])
 
 
@@ -43,7 +44,7 @@ def test_a_person_who_sways_for_the_whole_recording_is_not_part_of_the_room(room
     images = [with_person(room, boxes[i][0], 20 + 40 * (i % 2)) for i in range(20)]
     queue = iter(boxes)
     monkeypatch.setattr(standing, "standing_boxes", lambda camera, floor, image: next(queue))
-    empty = np.median(emptied(CAMERA, FLOOR, images), axis=0)
+    empty = np.median(emptied(CAMERA, FLOOR, images, ALL_SHOWN), axis=0)
     plain = np.median(images, axis=0)
     assert np.abs(plain - room).max() > 60
     assert np.abs(empty - room).max() < 12
@@ -55,7 +56,7 @@ def test_a_person_who_leaves_late_is_replaced_by_what_was_behind(room, monkeypat
     images = [with_person(room, box[0], 30) if i < 14 else room for i in range(20)]
     queue = iter([box] * 14 + [np.zeros((0, 4))] * 6)
     monkeypatch.setattr(standing, "standing_boxes", lambda camera, floor, image: next(queue))
-    for image in emptied(CAMERA, FLOOR, images):
+    for image in emptied(CAMERA, FLOOR, images, ALL_SHOWN):
         np.testing.assert_array_equal(image, room)
 
 
@@ -63,7 +64,7 @@ def test_a_thing_that_looks_like_a_person_stays(room, monkeypatch):
     box = np.array([box_of(-1.0, 0.0)])
     image = with_person(room, box[0], 40)
     monkeypatch.setattr(standing, "standing_boxes", lambda camera, floor, image: box)
-    for found in emptied(CAMERA, FLOOR, [image] * 10):
+    for found in emptied(CAMERA, FLOOR, [image] * 10, ALL_SHOWN[:10]):
         np.testing.assert_array_equal(found, image)
 
 
@@ -80,5 +81,14 @@ def test_only_boxes_of_the_size_of_people_on_the_floor_count():
 
 
 def test_a_room_without_people_is_left_as_it_is(room):
-    for image, found in zip([room] * 3, emptied(CAMERA, FLOOR, [room] * 3), strict=True):
+    for image, found in zip([room] * 3, emptied(CAMERA, FLOOR, [room] * 3, ALL_SHOWN[:3]), strict=True):
         np.testing.assert_array_equal(image, found)
+
+
+def test_what_a_turned_camera_did_not_show_comes_from_the_other_images(room):
+    """A strip of twelve of twenty images is made up."""
+    images, blank = [room.copy() for _ in range(20)], [np.zeros(SHAPE, np.uint8) for _ in range(20)]
+    for i in range(12):
+        images[i][:, 140:], blank[i][:, 140:] = 255, 255
+    for image in emptied(CAMERA, FLOOR, images, blank):
+        np.testing.assert_array_equal(image, room)
