@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from jaxfilters.trackers.app.canvas import write_outlined
 from jaxfilters.trackers.io.errors import OutputError
 
 STATUS_COLORS = ((0, 200, 255), (110, 220, 90), (84, 92, 255), (0, 140, 255))
@@ -64,8 +65,7 @@ def write_video(
 def caption(image: np.ndarray, text: str, line: int, color: tuple = (255, 255, 255)) -> None:
     """Write `text` into the top left corner of `image`, `line` lines down, outlined to stay legible on anything."""
     place = (10, 22 + 22 * line)
-    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
-    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 1, cv2.LINE_AA)
+    write_outlined(image, text, place, color)
 
 
 def side_by_side(images: list[np.ndarray], time_s: float) -> np.ndarray:

@@ -6,13 +6,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import LINKS
+from jaxfilters.trackers.app.canvas import WHITE, can_be_drawn, draw_dot, draw_line, draw_outline
 from jaxfilters.trackers.app.video import STATUS_COLORS, caption, write_video
 from jaxfilters.trackers.articulated.recording import FeatureSequence
 from jaxfilters.trackers.articulated.table import TimedArticulatedTrack
@@ -27,8 +27,6 @@ _MARGIN = 0.12
 """Of a picture without a camera image: free space around the hand, as a share of its extent."""
 _LONGEST = 1.3
 """A measured line is drawn over the link that it belongs to, and beyond it by this factor."""
-_SUBPIXEL = 4
-"""Fractional bits of the coordinates that OpenCV draws with."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +94,7 @@ def draw_frame(scene: Scene, index: int) -> np.ndarray:
     image = np.full((*canvas.shape, 3), _PAPER, np.uint8)
     fine = max(1, round(canvas.shape[0] / 400))
     _draw_measured(image, scene, index, fine)
-    palm = scene.palm[index]
-    if _can_be_drawn(palm):
-        hull = cv2.convexHull(np.asarray([_fixed_point(point) for point in canvas.place(palm)], np.int32))
-        cv2.polylines(image, [hull], True, _PALM, fine, cv2.LINE_AA, _SUBPIXEL)
+    draw_outline(image, canvas.place(scene.palm[index]), _PALM, fine)
     if scene.true_joints is not None:
         for chain in scene.true_joints[index]:
             _draw_chain(image, canvas.place(chain), _TRUTH, fine)
@@ -108,7 +103,7 @@ def draw_frame(scene: Scene, index: int) -> np.ndarray:
         _draw_chain(image, canvas.place(np.concatenate([wrist, chain[:1]])), _faded(_color(finger)), fine)
         _draw_chain(image, canvas.place(chain), _color(finger), 2 * fine)
         for point in canvas.place(chain[np.isfinite(chain).all(axis=-1)]):
-            _draw_dot(image, point, (255, 255, 255), fine + 1.2)
+            draw_dot(image, point, WHITE, fine + 1.2)
     return image
 
 
@@ -200,8 +195,7 @@ def _true_joints(sequence: FeatureSequence, hand: ArticulatedHand, frames: slice
 def _draw_measured(image: np.ndarray, scene: Scene, index: int, fine: int) -> None:
     canvas, measured = scene.canvas, scene.measured
     for point in canvas.place(measured.points[index]):
-        if _can_be_drawn(point):
-            _draw_dot(image, point, _MEASURED, 3.0 * fine)
+        draw_dot(image, point, _MEASURED, 3.0 * fine)
     for chain, lines in zip(scene.joints[index], measured.lines[index], strict=True):
         for start, end, line in zip(chain[:-1], chain[1:], lines, strict=True):
             _draw_line(image, scene, line, np.stack([start, end]), fine)
@@ -213,7 +207,7 @@ def _draw_measured(image: np.ndarray, scene: Scene, index: int, fine: int) -> No
 
 def _draw_line(image: np.ndarray, scene: Scene, line: np.ndarray, link: np.ndarray, fine: int) -> None:
     """The part of a measured line (angle, distance) that lies beside a link (2, 2)."""
-    if not np.isfinite(line).all() or not _can_be_drawn(link):
+    if not np.isfinite(line).all() or not can_be_drawn(link):
         return
     direction = np.asarray([np.cos(line[0]), np.sin(line[0])])
     normal = np.asarray([-direction[1], direction[0]])
@@ -225,14 +219,7 @@ def _draw_line(image: np.ndarray, scene: Scene, line: np.ndarray, link: np.ndarr
 
 def _draw_chain(image: np.ndarray, points: np.ndarray, color: tuple, thickness: int) -> None:
     for start, end in pairwise(points):
-        if _can_be_drawn(np.stack([start, end])):
-            ends = (_fixed_point(start), _fixed_point(end))
-            cv2.line(image, *ends, color, thickness, cv2.LINE_AA, _SUBPIXEL)
-
-
-def _draw_dot(image: np.ndarray, point: np.ndarray, color: tuple, radius: float) -> None:
-    if _can_be_drawn(point):
-        cv2.circle(image, _fixed_point(point), round(radius * 2**_SUBPIXEL), color, -1, cv2.LINE_AA, _SUBPIXEL)
+        draw_line(image, start, end, color, thickness)
 
 
 def _color(finger: int) -> tuple[int, int, int]:
@@ -241,11 +228,3 @@ def _color(finger: int) -> tuple[int, int, int]:
 
 def _faded(color: tuple[int, int, int]) -> tuple:
     return tuple((part + paper) // 2 for part, paper in zip(color, _PAPER, strict=True))
-
-
-def _can_be_drawn(points: np.ndarray) -> bool:
-    return bool(np.isfinite(points).all()) and float(np.abs(points).max()) < 1e5
-
-
-def _fixed_point(point: np.ndarray) -> tuple[int, int]:
-    return round(float(point[0]) * 2**_SUBPIXEL), round(float(point[1]) * 2**_SUBPIXEL)

@@ -6,11 +6,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from jaxfilters.trackers.app.canvas import color_of, write_outlined
 from jaxfilters.trackers.app.video import caption
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event
 from jaxfilters.trackers.fingertips.state import MODE_NAMES, HandReport
 from jaxfilters.trackers.fingertips.table import name_of
-from jaxfilters.trackers.people.drawing import color_of
 
 WAY_FRAMES = 25
 EVENT_FRAMES = 45
@@ -56,8 +56,7 @@ class FingertipPictures:
         if report.is_thumb[hand, slot]:
             cv2.circle(picture, place, 13, _THUMB, 2, cv2.LINE_AA)
         at = (place[0] + 12, place[1] - 8)
-        cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
+        write_outlined(picture, name, at, color, 0.5)
         return name
 
 

@@ -6,20 +6,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from jaxfilters.trackers.app.canvas import INK, color_of, write
 from jaxfilters.trackers.app.chart import Curve, Shade, draw_chart
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event
 from jaxfilters.trackers.fingertips.table import TimedTips, name_of
 from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.io.errors import OutputError
-from jaxfilters.trackers.people.drawing import color_of
 
 SIGMAS = 2.0
 """Half the height of the bands of charts, standard deviations."""
 _WIDTH, _PLAN_ROWS, _CHART_ROWS, _LEGEND_ROWS = 1200, 560, 200, 30
-_PAPER, _INK, _FRAME = 255, (60, 60, 60), (200, 200, 200)
+_PAPER, _FRAME = 255, (200, 200, 200)
 _DRAWN, _HANDLED = (205, 240, 205), (225, 225, 250)
 """Paper of a chart while a symbol is drawn, and while something is handled."""
-_TEXT = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)
 
 
 def draw_summary(
@@ -53,7 +52,7 @@ def draw_summary(
         draw_chart(
             size,
             "fingertips; green paper: a symbol is drawn, red paper: something is handled",
-            *(times_s, [Curve("", counts, _INK)], "time (s)"),
+            *(times_s, [Curve("", counts, INK)], "time (s)"),
             from_zero=True,
             shades=shades,
         ),
@@ -105,7 +104,7 @@ def _plan(
     for event in symbols:
         left, top, *_ = event.quantities["box_px"]
         at = pixel(np.array([left, top])) - [0, 6]
-        _write(sheet, str(event.quantities["label"] or "unknown"), (int(at[0]), int(max(at[1], 12))))
+        write(sheet, str(event.quantities["label"] or "unknown"), (int(at[0]), int(max(at[1], 12))))
     return sheet
 
 
@@ -114,9 +113,9 @@ def _legend(fingers: list[tuple[int, int]]) -> np.ndarray:
     left = 62
     for hand, finger in fingers:
         cv2.line(sheet, (left, 15), (left + 20, 15), _color(hand, finger), 4, cv2.LINE_AA)
-        left += 50 + _write(sheet, name_of(hand, finger), (left + 26, 20))
+        left += 50 + write(sheet, name_of(hand, finger), (left + 26, 20))
     if not fingers:
-        _write(sheet, "no fingertips", (left, 20))
+        write(sheet, "no fingertips", (left, 20))
     return sheet
 
 
@@ -132,8 +131,3 @@ def _shades(events: Sequence[Event], times_s: np.ndarray) -> list[Shade]:
         elif (event.hand, event.name) in began:
             shades.append(Shade(began.pop((event.hand, event.name)), event.time_s, _HANDLED))
     return shades
-
-
-def _write(sheet: np.ndarray, text: str, place: tuple[int, int]) -> int:
-    cv2.putText(sheet, text, place, *_TEXT, _INK, 1, cv2.LINE_AA)
-    return int(cv2.getTextSize(text, *_TEXT, 1)[0][0])

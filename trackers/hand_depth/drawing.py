@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.app.canvas import WHITE, draw_dot, draw_line
 from jaxfilters.trackers.app.video import STATUS_COLORS, caption, write_video
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.hand_depth.table import TimedHandTrack
@@ -20,8 +21,6 @@ FINGER_COLORS = ((84, 92, 255), (60, 176, 255), (110, 220, 90), (255, 190, 70), 
 _TRUTH_COLOR = (235, 235, 235)
 _SMALLEST_HEIGHT = 480
 """Images with fewer rows are enlarged, so that lines and text stay fine against the hand."""
-_SUBPIXEL = 4
-"""Fractional bits of the coordinates that OpenCV draws with."""
 
 
 def depth_range(joints: np.ndarray, margin: float = 0.08) -> tuple[float, float]:
@@ -53,17 +52,14 @@ def draw_skeleton(
     in_front = np.where(visible[:, None], joints, (0.0, 0.0, 1.0))
     # The centre of camera pixel 0 is the centre of a block of `scale` pixels.
     points = (np.asarray(camera.project(jnp.asarray(in_front, jnp.float32))) + 0.5) * scale - 0.5
-    visible &= np.abs(points).max(axis=-1) < 1e5
     thickness = max(1, round(image.shape[0] / (400 if color else 240)))
     for base, tip in BONES:
         if visible[base] and visible[tip]:
             paint = color or FINGER_COLORS[(tip - 1) // 4]
-            ends = (_fixed_point(points[base]), _fixed_point(points[tip]))
-            cv2.line(image, *ends, paint, thickness, cv2.LINE_AA, _SUBPIXEL)
+            draw_line(image, points[base], points[tip], paint, thickness)
     if color is None:
         for joint in np.flatnonzero(visible):
-            radius = round((thickness + 0.8) * 2**_SUBPIXEL)
-            cv2.circle(image, _fixed_point(points[joint]), radius, (255, 255, 255), -1, cv2.LINE_AA, _SUBPIXEL)
+            draw_dot(image, points[joint], WHITE, thickness + 0.8)
 
 
 def draw_frame(sequence: DepthSequence, results: TimedHandTrack, index: int, limits: tuple[float, float]) -> np.ndarray:
@@ -112,7 +108,3 @@ def _captioned(sequence: DepthSequence, results: TimedHandTrack, frames_per_seco
         caption(image, f"frame {i}   {time_s:6.2f} s   {count}   {speed}", 0)
         caption(image, STATUS_NAMES[status], 1, STATUS_COLORS[status])
         yield image
-
-
-def _fixed_point(point: np.ndarray) -> tuple[int, int]:
-    return round(float(point[0]) * 2**_SUBPIXEL), round(float(point[1]) * 2**_SUBPIXEL)

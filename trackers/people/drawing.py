@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline
+from jaxfilters.trackers.app.canvas import color_of, write, write_outlined
 from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.people.recorded import Sighting, pieces
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, People, PeopleScene
@@ -17,13 +18,6 @@ _PAPER, _INK, _FLOOR = (255, 255, 255), (70, 70, 70), (236, 240, 242)
 _NOT_MEASURED = {"hidden", "no_depth"}
 """Modes of sightings whose distance from the camera is not measured."""
 _UNSURE = (170, 170, 170)
-
-
-def color_of(identity: int) -> tuple[int, int, int]:
-    """Blue, green, red: neighbours in number are far apart in hue."""
-    hue = int(180 * (identity * 0.618034 % 1))
-    b, g, r = cv2.cvtColor(np.array([[[hue, 200, 235]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
-    return int(b), int(g), int(r)
 
 
 def drawn(image: np.ndarray, outlines: Outline, people: People) -> np.ndarray:
@@ -45,8 +39,7 @@ def _draw_one(image, center, shape, color, identity):
     cv2.ellipse(image, place, axes, angle, 0, 360, color, 2, cv2.LINE_AA)
     if identity >= 0:
         top = (place[0] - 8, max(12, place[1] - int(np.sqrt(shape[1, 1])) - 6))
-        cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
-        cv2.putText(image, str(identity), top, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 2, cv2.LINE_AA)
+        write_outlined(image, str(identity), top, color, thickness=2)
 
 
 def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
@@ -76,9 +69,7 @@ def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]
     for number, center in enumerate(centers):
         at = tuple(int(v) for v in pixels(center)[0])
         cv2.drawMarker(plan, at, _INK, cv2.MARKER_TRIANGLE_UP, 16, 2, cv2.LINE_AA)
-        cv2.putText(
-            plan, f"camera {number}", (at[0] + 10, at[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
-        )
+        write(plan, f"camera {number}", (at[0] + 10, at[1] - 8), _INK)
     parts = {identity: pieces(track, scene.config.hidden_s) for identity, track in tracks.items()}
     for identity, some in parts.items():
         for one in some:
@@ -88,7 +79,7 @@ def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]
             _draw_way(plan, one, color_of(identity), pixels)
         end = tuple(int(v) for v in pixels(some[-1][-1].mean[:2])[0])
         cv2.circle(plan, end, 5, color_of(identity), -1, cv2.LINE_AA)
-        cv2.putText(plan, str(identity), (end[0] + 7, end[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
+        write(plan, str(identity), (end[0] + 7, end[1] - 5), _INK, 0.5)
     if not cv2.imwrite(str(path), plan):
         raise OutputError(f"cannot write {path}.")
 
@@ -128,5 +119,5 @@ def _draw_grid(plan, low, high, pixels):
             a, b = (tuple(int(v) for v in end) for end in pixels(ends))
             cv2.line(plan, a, b, (222, 222, 222), 1, cv2.LINE_AA)
             place = (a[0] - 8, len(plan) - 28) if axis == 0 else (8, a[1] + 4)
-            cv2.putText(plan, f"{value:g}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
-    cv2.putText(plan, "metres", (8, len(plan) - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
+            write(plan, f"{value:g}", place, _INK, 0.4)
+    write(plan, "metres", (8, len(plan) - 8), _INK, 0.42)

@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.trackers.app.canvas import BLACK, draw_dot, draw_line
 from jaxfilters.trackers.app.video import caption, side_by_side
 from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, displayed
 
@@ -23,8 +23,6 @@ _AXES_MM = np.array([[0.0, 0, 0], [50, 0, 0], [0, 50, 0], [0, 0, -80]], np.float
 _MILLIMETRES = np.array([1e3, 1e3, 1e3, 1, 1, 1], np.float32)
 """In which the rig projects; poses of rows are in metres and radians."""
 _LANDMARK, _LINE = (255, 255, 255), (220, 220, 120)
-_SUBPIXEL = 4
-"""Fractional bits of the coordinates that OpenCV draws with."""
 
 
 def draw_frame(images: list[np.ndarray | None], rig: CameraRig, track: HeadRows, i: int) -> np.ndarray:
@@ -51,16 +49,9 @@ def draw_points(image: np.ndarray, points: np.ndarray, color: tuple, line: tuple
     """Landmarks (10, 2) in pixels of the picture, joined to eyes, mouth, and the outline of the nose."""
     for outline in OUTLINES:
         for a, b in pairwise(outline):
-            if can_be_drawn(points[[a, b]]):
-                cv2.line(image, _fixed(points[a]), _fixed(points[b]), line, 1, cv2.LINE_AA, _SUBPIXEL)
+            draw_line(image, points[a], points[b], line, 1)
     for point in points:
-        if can_be_drawn(point):
-            cv2.circle(image, _fixed(point), round(size * 2**_SUBPIXEL), color, -1, cv2.LINE_AA, _SUBPIXEL)
-
-
-def can_be_drawn(points: np.ndarray) -> bool:
-    """Whether points are somewhere near the picture."""
-    return bool(np.isfinite(points).all()) and float(np.abs(points).max()) < 1e4
+        draw_dot(image, point, color, size)
 
 
 def _axes(rig: CameraRig, pose: np.ndarray) -> np.ndarray:
@@ -80,9 +71,8 @@ def _draw_face(picture: np.ndarray, points: np.ndarray) -> None:
 
 def _draw_axes(picture: np.ndarray, ends: np.ndarray) -> None:
     for end, color in zip(ends[1:], AXIS_COLORS, strict=True):
-        if can_be_drawn(np.stack([ends[0], end])):
-            cv2.line(picture, _fixed(ends[0]), _fixed(end), (0, 0, 0), 5, cv2.LINE_AA, _SUBPIXEL)
-            cv2.line(picture, _fixed(ends[0]), _fixed(end), color, 3, cv2.LINE_AA, _SUBPIXEL)
+        draw_line(picture, ends[0], end, BLACK, 5)
+        draw_line(picture, ends[0], end, color, 3)
 
 
 def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
@@ -93,7 +83,3 @@ def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
         x, y, z, roll, pitch, yaw = displayed(track.pose[i])
         caption(picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm", 2)
         caption(picture, f"roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 3)
-
-
-def _fixed(point: np.ndarray) -> tuple[int, int]:
-    return round(float(point[0]) * 2**_SUBPIXEL), round(float(point[1]) * 2**_SUBPIXEL)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from jaxfilters.models.face.shape_model import FaceModel
+from jaxfilters.trackers.app.canvas import INK, write
 from jaxfilters.trackers.app.chart import Color, Curve, Shade, draw_chart
 from jaxfilters.trackers.head.common.drawing import HEAD_STATUS_COLORS, draw_points
 from jaxfilters.trackers.head.common.state import NUM_MODES
@@ -24,7 +25,7 @@ _LEFT, _OVERSAMPLE = 62, 2
 _SCALE = 1.35
 """Pixels a millimetre of the drawn faces, at most."""
 _COLORS: tuple[Color, ...] = ((70, 70, 215), (60, 150, 60), (205, 110, 40), (160, 60, 160), (40, 140, 190))
-_INK, _TRUTH, _MEAN = (60, 60, 60), (150, 150, 150), (165, 165, 165)
+_TRUTH, _MEAN = (150, 150, 150), (165, 165, 165)
 _PLUS, _MINUS = (70, 70, 215), (205, 110, 40)
 _TINT = 0.22
 """Share of a status's colour in the paper behind a chart."""
@@ -70,7 +71,7 @@ def draw_summary(
         if np.any(np.nan_to_num(track.deformation[:, mode]))
     ]
     charts.append(chart(labels.coefficients, modes, "time (s)"))
-    charts.append(chart("score: mean correlation", [Curve("", track.score.astype(float), _INK)], "time (s)"))
+    charts.append(chart("score: mean correlation", [Curve("", track.score.astype(float), INK)], "time (s)"))
     # Translations on the left, rotations on the right.
     order = [0, 3, 1, 4, 2, 5, 6, 7]
     rows = [np.concatenate([charts[a], charts[b]], axis=1) for a, b in zip(order[::2], order[1::2], strict=True)]
@@ -105,16 +106,16 @@ def draw_modes(model: FaceModel | None, labels: Labels = DEFORMATION) -> np.ndar
     learnt = np.flatnonzero(deviation > 0)[:NUM_MODES]
     if model is None or not learnt.size:
         what = "no face was registered" if model is None else "a rigid face: no deformation was estimated"
-        _text(sheet, what, (_LEFT, 24))
+        write(sheet, what, (_LEFT, 24))
         return sheet
     width = _WIDTH // NUM_MODES
     for cell, mode in enumerate(learnt):
         offset = DEVIATIONS * deviation[mode] * np.asarray(model.basis, float)[:, mode].reshape(-1, 3)
         picture = _draw_mode((_MODE_ROWS, width), np.asarray(model.mean, float), offset)
-        _text(picture, f"{labels.mode}{mode + 1}, sd {deviation[mode]:.1f} mm", (26, 52))
+        write(picture, f"{labels.mode}{mode + 1}, sd {deviation[mode]:.1f} mm", (26, 52))
         sheet[:, cell * width : (cell + 1) * width] = picture
     legend = f"{labels.modes}: mean in grey, {DEVIATIONS:g} sd more in red, {DEVIATIONS:g} sd less in blue"
-    _text(sheet, legend, (_LEFT, 24))
+    write(sheet, legend, (_LEFT, 24))
     return sheet
 
 
@@ -133,7 +134,7 @@ def _draw_mode(size: tuple[int, int], mean: np.ndarray, offset: np.ndarray) -> n
             draw_points(sheet, center + scale * shape[:, axes], color, color, 2.0 * _OVERSAMPLE)
     picture = cv2.resize(sheet, size[::-1], interpolation=cv2.INTER_AREA)
     for view, middle in (("front", 0.33), ("side", 0.8)):
-        _text(picture, view, (int(middle * size[1]) - 16, size[0] - 12), _MEAN)
+        write(picture, view, (int(middle * size[1]) - 16, size[0] - 12), _MEAN)
     return picture
 
 
@@ -146,17 +147,11 @@ def _legend(status: np.ndarray) -> np.ndarray:
         if not share:
             continue
         cv2.rectangle(sheet, (left, 10), (left + 26, 26), _tint(code), cv2.FILLED)
-        cv2.rectangle(sheet, (left, 10), (left + 26, 26), _INK, 1)
-        left += 36 + _text(sheet, f"{word} {100 * share:.1f} %", (left + 34, 23)) + 24
+        cv2.rectangle(sheet, (left, 10), (left + 26, 26), INK, 1)
+        left += 36 + write(sheet, f"{word} {100 * share:.1f} %", (left + 34, 23)) + 24
     return sheet
 
 
 def _tint(code: int) -> Color:
     blue, green, red = (round(255 - _TINT * (255 - part)) for part in HEAD_STATUS_COLORS[code])
     return blue, green, red
-
-
-def _text(sheet: np.ndarray, text: str, place: tuple[int, int], color: Color = _INK) -> int:
-    style = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)
-    cv2.putText(sheet, text, place, *style, color, 1, cv2.LINE_AA)
-    return int(cv2.getTextSize(text, *style, 1)[0][0])
