@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry
+from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics
 from jaxfilters.models.rendering.depth import render_capsules
 from jaxfilters.trackers.hand_depth.drawing import color_depth, draw_skeleton
 from jaxfilters.trackers.hand_depth.tracker import synthetic_sequence
@@ -53,9 +53,9 @@ def _column(camera: Pinhole, depth: np.ndarray, pose: np.ndarray, joints: np.nda
 def _model(camera: Pinhole, pose: np.ndarray, joints: np.ndarray, near: float, far: float) -> np.ndarray:
     """The capsules of the pose, in the colours of their depth and lit from the upper left."""
     palm = np.linalg.norm(joints[9] - joints[0])
-    average = forward_kinematics(jnp.asarray(pose), hand_geometry()).joints
+    average = forward_kinematics(jnp.asarray(pose), anatomical_hand()).joints
     scale = palm / np.linalg.norm(average[9] - average[0])
-    capsules = forward_kinematics(jnp.asarray(pose), hand_geometry().scaled(jnp.asarray(scale))).capsules
+    capsules = forward_kinematics(jnp.asarray(pose), anatomical_hand().scaled(jnp.asarray(scale))).capsules
     depth = np.asarray(render_capsules(camera, capsules))
     points = np.asarray(
         camera.unproject(jnp.stack(jnp.meshgrid(*[jnp.arange(float(TILE))] * 2), -1), jnp.asarray(depth))

@@ -96,7 +96,7 @@ class _Tracker:
 
     def __init__(self, num_particles: int, key: Array, frames: np.ndarray):
         config = HandDepthConfig(num_particles=num_particles, scale=1.0)
-        self._tracker = hand_depth.build(kinect_v2(), config)
+        self._tracker = hand_depth.build(kinect_v2(), config, hand_geometry())
         self._start = self._state = self._tracker.init(key, frames[0])
         times = FRAME_INTERVAL * np.arange(len(frames), dtype=np.float32)
         self._chunks = itertools.cycle(range(0, len(frames), self.chunk))

@@ -22,7 +22,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
-from jaxfilters.benchmarks.scenarios import _keypoint_filters, people_pets
+from jaxfilters.benchmarks.scenarios import _keypoint_filters, _real_hands, people_pets
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
 from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
 from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
@@ -30,6 +30,7 @@ from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, Contender, MonoR
 from jaxfilters.benchmarks.scenarios._pets import load_pets
 from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_capture, track_lengths, true_lengths
 from jaxfilters.models.synthetic.face_sequence import sequence
+from jaxfilters.trackers import hand_depth
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.io.face_models import default_face_model
@@ -44,6 +45,9 @@ NUM_FRAMES, QUICK_NUM_FRAMES = 300, 90
 QUICK_PEOPLE_FRAMES = 60
 QUICK_CAPTURE_FRAMES, CAPTURE_FRAMES = 1000, 3000
 QUICK_KEYPOINT_FRAMES = 400
+QUICK_HANDS, QUICK_HAND_FRAMES = 2, 16
+PIP_COLUMNS = np.array([12, 15, 18, 21])
+"""Of the pose: flexion of the second joint of the four fingers."""
 SETTLED = 30
 """Frames of key points after which the start is forgotten."""
 
@@ -85,6 +89,20 @@ def mono_claims(quick: bool, seed: int) -> Claims:
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
     runs = [follow_all(talking_head(head, num_frames), {"": contender}, head)[""] for head in _heads(quick, seed)]
     return Claims("head_mono", "rendered", POSE, [_of_mono(run) for run in runs])
+
+
+def hand_claims(quick: bool, seed: int) -> Claims:
+    """Wrists and second joints of fingers in depth images of hands on which no constant was chosen."""
+    recordings = []
+    for name in _real_hands.HELD[: QUICK_HANDS if quick else None]:
+        real = _real_hands.load(name, QUICK_HAND_FRAMES if quick else _real_hands.NUM_FRAMES)
+        found = hand_depth.track(iter(real.depth), real.times_s, real.camera, hand_depth.HandDepthConfig(seed=seed))
+        wrist = 1e3 * (found.pose[:, :3] - real.joints[:, 0])
+        bent = np.degrees(found.pose[:, PIP_COLUMNS] - _real_hands.pip_flexion(real.joints))
+        deviations = np.c_[1e3 * found.pose_std[:, :3], np.degrees(found.pose_std[:, PIP_COLUMNS - 1])]
+        recordings.append(Recording(np.c_[wrist, bent], deviations))
+    fingers = tuple(f"{finger}_pip_deg" for finger in FINGERS[1:])
+    return Claims("hand_depth", "real", ("wrist_x_mm", "wrist_y_mm", "wrist_z_mm", *fingers), recordings)
 
 
 def articulated_claims(quick: bool, seed: int) -> Claims:
@@ -176,6 +194,7 @@ def _of_mono(run: MonoRun) -> Recording:
 
 
 SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
+    "hand from depth, real motions": hand_claims,
     "articulated hand, motion capture": articulated_claims,
     "people, PETS 2009": people_claims,
     "head before two cameras, rendered": stereo_claims,

@@ -6,7 +6,8 @@ The plain particle filter on the pose against the Rao-Blackwellized one, without
 adds, on data B, the other two proposals (`rbpf_plug_in`, `rbpf_plug_in_corrected`), a plain filter whose noise is as
 wide as what the Rao-Blackwellized one draws (`pf_wide`), and the tracker with its guide (`pf_guided`, `rbpf_guided`).
 Errors are means after the first ten frames; p-values are those of one-sided paired Wilcoxon signed-rank tests over the
-seeds. A folder given with `--out` receives every run as it finishes, the tables, and plots.
+seeds. Then the tracker with either filter, and registration alone, on real hands (`_real_comparison`). A folder given
+with `--out` receives every run as it finishes, the tables, and plots.
 """
 
 import sys
@@ -31,6 +32,7 @@ from jaxfilters.benchmarks.scenarios._accuracy import (
     run_all,
 )
 from jaxfilters.benchmarks.scenarios._pf_vs_rbpf_plots import plot_times, plot_tracks
+from jaxfilters.benchmarks.scenarios._real_comparison import real_metrics
 from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure, measure_variants
 from jaxfilters.filter import Filter
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
@@ -66,7 +68,7 @@ def run(
     variants = _measure_variants(num_particles, quick, seed, out)
     runs = _measure_accuracy(_filters(num_particles, quick), range(seed, seed + num_seeds), num_frames, out)
     _say(out, _accuracy_table(runs))
-    return time_metrics(times) | variants | accuracy_metrics(runs)
+    return time_metrics(times) | variants | accuracy_metrics(runs) | real_metrics(num_particles, quick)
 
 
 def time_metrics(times: dict[int, StepTimes]) -> dict[str, Metric]:
@@ -122,9 +124,8 @@ def _filtering(setting: hand.Setting, filter: Filter) -> Filtering:
 
 def _guided(name: str, num_particles: int) -> Filtering:
     """The tracker as users run it, given the size of the hand but not where it starts."""
-    tracker = hand_depth.build(
-        kinect_v2(), HandDepthConfig(filter=name, num_particles=num_particles, hand="right", scale=1.0)
-    )
+    config = HandDepthConfig(filter=name, num_particles=num_particles, hand="right", scale=1.0)
+    tracker = hand_depth.build(kinect_v2(), config, hand_geometry())
 
     def filtering(key: AnyKey, frames: jax.Array) -> hand.Estimate:
         state = tracker.init(key, np.asarray(frames[0]))

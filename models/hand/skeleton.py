@@ -59,6 +59,9 @@ class HandGeometry:
     """Unit quaternion, palm from thumb: the thumb's frame at zero angles."""
     side: Float[Array, ""]
     """+1 for a right hand, -1 for a left hand: the factor on x of everything in the palm frame."""
+    tip_reach: Float[Array, ""]
+    """Where the joint called tip lies beyond the end of the last capsule's axis, as a share of its radius: 0 is the
+    middle of the rounded end, as in the paper, 1 is the skin, as in recordings with marked joints."""
 
     def scaled(self, scale: float | Float[Array, ""]) -> "HandGeometry":
         """The same hand with every length multiplied by `scale` (may be traced; 1 = as it is)."""
@@ -97,6 +100,33 @@ def hand_geometry() -> HandGeometry:
         metacarpal_radius=jnp.array(13 * millimetre, dtype=float),
         thumb_frame=jnp.array(_thumb_frame(), dtype=float),
         side=jnp.array(1.0, dtype=float),
+        tip_reach=jnp.array(0.0, dtype=float),
+    )
+
+
+def anatomical_hand() -> HandGeometry:
+    """The average adult right hand with bones of measured lengths, whose tips are on the skin.
+
+    Bones of `hand_geometry` are as long as measured ones with the soft tissue of the tip, to which the round end of the
+    capsule then adds a second time. Here the lengths of all bones, and the soft tissue beyond the last one, are the
+    means of 66 adults (A. Buryanov and V. Kotiuk, "Proportions of hand segments", Int. J. Morphol. 28 (3), 2010). The
+    knuckles of index and little finger lie 4.5 mm nearer the palm than the two between them, by the transverse arch.
+    """
+    published, millimetre = hand_geometry(), 1e-3
+    bones = [
+        (46.22, 31.57, 21.67 + 3.92),
+        (39.78, 22.38, 15.82 + 3.84),
+        (44.63, 26.33, 17.40 + 3.95),
+        (41.37, 25.65, 17.30 + 3.95),
+        (32.74, 18.11, 15.96 + 3.73),
+    ]
+    arch = jnp.array([0.0, -2.25, 2.25, 2.25, -2.25], dtype=float) * millimetre
+    lengths = jnp.array(bones, dtype=float) * millimetre
+    return replace(
+        published,
+        bases=published.bases.at[:, 2].add(arch),
+        lengths=lengths.at[:, 2].add(-published.radii[:, 2]),
+        tip_reach=jnp.array(1.0, dtype=float),
     )
 
 
@@ -170,12 +200,15 @@ def forward_kinematics(pose: Float[Array, " 22"], geometry: HandGeometry) -> Han
 def _assemble(wrist, points, geometry) -> HandKinematics:
     """Joints and capsules from the wrist and 24 points: 4 of each of the 5 digits, 4 metacarpal starts."""
     chains = points[:20].reshape(5, 4, 3)
+    reach = geometry.tip_reach * geometry.radii[:, 2] / geometry.lengths[:, 2]
+    tips = chains[:, 3] + reach[:, None] * (chains[:, 3] - chains[:, 2])
+    joints = jnp.concatenate([chains[:, :3], tips[:, None]], axis=1).reshape(20, 3)
     capsules = Capsules(
         start=jnp.concatenate([chains[:, :3].reshape(15, 3), points[20:]]),
         end=jnp.concatenate([chains[:, 1:].reshape(15, 3), chains[1:, 0]]),
         radius=jnp.concatenate([geometry.radii.reshape(15), jnp.broadcast_to(geometry.metacarpal_radius, (4,))]),
     )
-    return HandKinematics(joints=jnp.concatenate([wrist[None], points[:20]]), capsules=capsules)
+    return HandKinematics(joints=jnp.concatenate([wrist[None], joints]), capsules=capsules)
 
 
 def phalanx_angles(angles: Float[Array, " 15"]) -> tuple[Float[Array, "5 3"], Float[Array, "5 3"]]:

@@ -33,11 +33,12 @@ SEARCH_RADIUS = 0.16
 GESTURES = np.deg2rad(
     [
         [0.0] * 15,
+        [0.0] * 3 + [0.0, 12.0, 0.0] + [0.0] * 3 + [0.0, -12.0, 0.0] + [0.0, -27.0, 0.0],
         [10.0, 10.0, 0.0] + [25.0, 0.0, 35.0] * 4,
         [30.0, 30.0, 0.0] + [75.0, 0.0, 90.0] * 4,
     ]
 )
-"""Joint angles of an open, a relaxed and a closed hand, (3, 15)."""
+"""Joint angles of an open, a spread, a relaxed and a closed hand, (4, 15)."""
 NUM_ROLLS = 12
 TILTS = np.deg2rad([-45.0, 0.0, 45.0])
 """Of the fingers towards the camera and away from it."""
@@ -46,7 +47,9 @@ STRAIGHT, BENT = np.deg2rad([[0.0, 0.0, 0.0], [45.0, 0.0, 70.0]])
 """Angles of a finger in two of the variants of a finalist."""
 TURN = 0.25
 """Radians about the palm's normal, to either side, of two more."""
-BATCH = 14
+ONE_OFF, OUTERMOST = 0.2, 0.45
+"""Radians of spread by which a finger points where its neighbour did, and of one that nothing was matched to."""
+BATCH = 20
 """Hypotheses in one compiled call; the variants of one finalist."""
 NUM_VARIED = (4, 2)
 """Finalists that are varied, in the first and in the second round."""
@@ -184,7 +187,8 @@ def _sized(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray
 def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
     """What registration cannot reach from a finalist.
 
-    One digit straight or bent, all fingers off by one, and the hand of the other side, as it is or turned over.
+    One digit straight or bent, all fingers or those on one side off by one, and the hand of the other side, as it is or
+    turned over.
     """
     poses, scales, found_sides = [], [], []
     turned_over, aside = np.array([0.0, 0.0, 1.0, 0.0]), np.array([math.cos(TURN / 2), 0.0, 0.0, math.sin(TURN / 2)])
@@ -195,6 +199,7 @@ def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
                 variant = pose.copy()
                 variant[7 + 3 * digit : 10 + 3 * digit] = angles if digit else 0.5 * angles[::-1]
                 variants.append((variant, side))
+        variants += [(_one_off(pose, first, outwards), side) for first in (1, 2, 3) for outwards in (1, -1)]
         other = -side if -side in sides else side
         for turn, to in ((turned_over, other), (np.array([1.0, 0.0, 0.0, 0.0]), other), (aside, side)):
             variants.append((_turned(pose, float(scale), turn), to))
@@ -204,6 +209,22 @@ def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
             scales.append(scale)
             found_sides.append(to)
     return Hypotheses(np.stack(poses), np.asarray(scales, np.float32), np.asarray(found_sides, np.float32))
+
+
+def _one_off(pose: np.ndarray, count: int, outwards: int) -> np.ndarray:
+    """The last `count` fingers on the little finger's side (1), or the first on the thumb's (-1), off by one.
+
+    Each takes the place of its neighbour; the outermost is stretched to where none was.
+    """
+    fingers = [4, 3, 2, 1][:count] if outwards > 0 else [1, 2, 3, 4][:count]
+    moved = pose.copy()
+    for i, finger in enumerate(fingers):
+        angles = np.array([0.0, -outwards * OUTERMOST, 0.0])
+        if i:
+            neighbour = 7 + 3 * fingers[i - 1]
+            angles = pose[neighbour : neighbour + 3] - [0.0, outwards * ONE_OFF, 0.0]
+        moved[7 + 3 * finger : 10 + 3 * finger] = angles
+    return moved
 
 
 def _turned(pose: np.ndarray, scale: float, turn: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ class ArticulatedConfig:
     """
 
     mode: Annotated[str, OneOf("recommended", "literal", "unconstrained")] = "recommended"
-    """How estimates are kept within the limits of a hand; literal is the filter of the paper, with one hypothesis, and
-    unconstrained has no limits and one hypothesis."""
+    """How estimates are kept within the limits of a hand; literal is the filter of the paper, with one hypothesis, no
+    mirrored one beside it and no gate, and unconstrained has no limits and one hypothesis."""
     hypotheses: int = 6
     """Largest number of hypotheses about the depth."""
     hand: Annotated[str, OneOf("right", "left")] = "right"

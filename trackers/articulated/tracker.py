@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.gaussian_sum import GaussianSumState, map_component
+from jaxfilters.gaussian.gaussian_sum import GaussianSumState, gaussian_sum, map_component
 from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
@@ -169,7 +169,16 @@ def _filter(setup: _Setup, prior: Gaussian) -> Filter:
         "literal": literal,
         "unconstrained": unconstrained,
     }[setup.config.mode]
-    return make(setup.hand, prior, setup.limits, gate=setup.config.gate or math.inf)
+    gate = math.inf if setup.config.mode == "literal" else setup.config.gate or math.inf
+    return make(setup.hand, prior, setup.limits, gate=gate)
+
+
+def _bank(setup: _Setup, prior: Gaussian, capacity: int, start: GaussianSumState | None) -> Filter:
+    """The filter of a bank of hypotheses; that of the paper is one filter without branches."""
+    inner = _filter(setup, prior)
+    if setup.config.mode == "literal":
+        return gaussian_sum(inner, capacity=capacity, start=start)
+    return hypotheses(inner, setup.hand, capacity=capacity, start=start)
 
 
 def _starting_bank(setup: _Setup, starts: Starts) -> GaussianSumState:
@@ -188,13 +197,17 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     else:
         starts = _keypoint_starts(setup, jax.tree.map(jnp.asarray, frame))
     slots = setup.config.hypotheses if setup.config.mode == "recommended" else 1
-    bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, 1 if setup.start is not None else NUM_STARTS))
+    least = 1 if setup.start is not None or setup.config.mode == "literal" else NUM_STARTS
+    bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, least))
     misses = jnp.where(starts.found, 0, PATIENCE + 1).astype(jnp.int32)
     return TrackState(bank, jnp.zeros((), dtype=float), misses, key)
 
 
 def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
-    filter = hypotheses(_filter(setup, _first_belief(start)), setup.hand, capacity=capacity, start=start)
+    if setup.config.mode == "literal":
+        best = jnp.argmax(start.log_weights)
+        start = GaussianSumState(jax.tree.map(lambda leaf: leaf[best][None], start.components), jnp.zeros(1))
+    filter = _bank(setup, _first_belief(start), capacity, start)
     return filter.init(filter.params, jax.random.key(0))
 
 
@@ -244,7 +257,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     """One frame: predict and update every hypothesis, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
     capacity = state.bank.log_weights.shape[0]
-    filter = hypotheses(_filter(setup, _first_belief(state.bank)), setup.hand, capacity=capacity, start=None)
+    filter = _bank(setup, _first_belief(state.bank), capacity, None)
     elapsed = (time - state.time) / FRAME_INTERVAL
     predicted = filter.predict(filter.params, predict_key, state.bank, elapsed)
     bank, info = filter.update(

@@ -40,6 +40,9 @@ FEWEST_PIXELS = 50
 """Hand pixels in the window below which nothing is there."""
 LOST_COST = 0.07
 """Metres: of the best pose above which the hand counts as not there; 0.1 is no overlap at all."""
+SUDDEN = 1.5
+"""Ratio of the cost of a frame to the least one since the last search or race above which the hand has changed faster
+than the filter follows, and new starts compete with the track at once."""
 BEHIND = 0.025
 """Metres behind the farthest part of the expected hand from which on a reading is of something else."""
 PATIENCE = 5
@@ -89,6 +92,8 @@ class TrackState(NamedTuple):
     """Whether another explanation is as good, or this one is bad."""
     race_time: Float[Array, ""]
     """Seconds: from when on the next frame is searched, or has new starts compete with the track."""
+    least_cost: Float[Array, ""]
+    """Metres: of the frames since the last search or race; infinite before the first one."""
     missing_is_background: Array
     time: Float[Array, ""]
     """Of the last frame, seconds."""

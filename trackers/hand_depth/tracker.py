@@ -19,7 +19,7 @@ from jaxtyping import Array
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.observation import HandLikelihood, union
-from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
+from jaxfilters.models.hand.skeleton import HandGeometry, anatomical_hand, forward_kinematics, open_palm
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.particle.weighting import ParticleInfo
@@ -32,6 +32,7 @@ from jaxfilters.trackers.hand_depth.filtering import (
     MAX_ERROR,
     PATIENCE,
     SIGMA,
+    SUDDEN,
     Setup,
     TrackState,
     build_filter,
@@ -50,14 +51,24 @@ SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
 SIDES = {"right": 1.0, "left": -1.0}
 
 
-def build(camera: Pinhole, config: HandDepthConfig | None = None) -> Tracker:
-    """A hand tracker for the frames of one depth camera."""
-    config = config or HandDepthConfig()
-    geometry = replace(hand_geometry(), side=jnp.asarray(SIDES.get(config.hand, 1.0), dtype=float))
+def build(camera: Pinhole, config: HandDepthConfig | None = None, average: HandGeometry | None = None) -> Tracker:
+    """A hand tracker for the frames of one depth camera.
+
+    Args:
+        camera: The depth camera.
+        config: Options of the tracker.
+        average: The hand of scale 1 (default: `anatomical_hand`); its side is that of the configuration.
+    """
+    setup = set_up(camera, config or HandDepthConfig(), average)
+    return Tracker(partial(_start, setup), partial(_advance, setup))
+
+
+def set_up(camera: Pinhole, config: HandDepthConfig, average: HandGeometry | None = None) -> Setup:
+    """What the tracker of `build` with the same arguments is made of."""
+    geometry = replace(average or anatomical_hand(), side=jnp.asarray(SIDES.get(config.hand, 1.0), dtype=float))
     surface = CapsuleHand(geometry) if config.surface == "capsules" else triangle_hand(geometry)
     likelihood = HandLikelihood(surface, jnp.asarray(SIGMA, dtype=float), MAX_ERROR, union, gibbs_abs)
-    setup = Setup(camera, likelihood, config, config.stride)
-    return Tracker(partial(_start, setup), partial(_advance, setup))
+    return Setup(camera, likelihood, config, config.stride)
 
 
 def track(
@@ -98,6 +109,7 @@ def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
         side=side,
         doubt=jnp.asarray(False),
         race_time=jnp.asarray(0.0, dtype=float),
+        least_cost=jnp.asarray(math.inf, dtype=float),
         missing_is_background=jnp.asarray(background),
         time=jnp.asarray(-FRAME_INTERVAL, dtype=float),
         misses=jnp.asarray(PATIENCE, jnp.int32),
@@ -118,9 +130,11 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
         due = float(state.race_time) <= float(times[first])
         if due and int(state.misses) >= PATIENCE:
             state = search(setup, state, frames[first], float(times[first]))
-            state = state._replace(time=jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float))
+            before = jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float)
+            state = state._replace(time=before, least_cost=jnp.asarray(math.inf, dtype=float))
         elif due:
             state = race(setup, state, frames[first], float(times[first]))
+            state = state._replace(least_cost=jnp.asarray(math.inf, dtype=float))
         if int(state.misses) >= PATIENCE:
             pieces.append(_nothing_found())
             first += 1
@@ -182,7 +196,10 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     something = image.observed_count >= FEWEST_PIXELS
     ensemble, info = jax.lax.cond(something, update, coast, predicted)
     pose, covariance = pose_moments(*particles_of(ensemble))
-    seen = something & (likelihood.cost(pose, image) < LOST_COST)
+    cost = likelihood.cost(pose, image)
+    seen = something & (cost < LOST_COST)
+    race_time = jnp.where(seen & (cost > SUDDEN * state.least_cost), time, state.race_time)
+    least_cost = jnp.where(seen, jnp.minimum(cost, state.least_cost), state.least_cost)
     misses = jnp.where(seen, 0, state.misses + 1)
     track = HandTrack(
         pose=pose,
@@ -192,7 +209,10 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
         log_evidence=info.log_evidence,
         status=jnp.where(seen, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
-    return state._replace(ensemble=ensemble, time=time, misses=misses, key=key), track
+    following = state._replace(
+        ensemble=ensemble, time=time, misses=misses, key=key, race_time=race_time, least_cost=least_cost
+    )
+    return following, track
 
 
 def _nothing_found() -> HandTrack:
@@ -206,7 +226,7 @@ def synthetic_sequence(seed: int) -> tuple[DepthSequence, np.ndarray]:
 
     Returns the recording and the true joints (T, 21, 3) in metres.
     """
-    made = simulate_sequence(jax.random.key(seed), "B")
+    made = simulate_sequence(jax.random.key(seed), "B", geometry=anatomical_hand())
     times = FRAME_INTERVAL * np.arange(len(made.poses))
     depth = np.asarray(made.depth_mm, np.float32) / 1000
     return from_array(kinect_v2(), times, depth, "synthetic hand"), np.asarray(made.joints)

@@ -3,11 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.hand.limits import limit_excess, limit_log_likelihood
-from jaxfilters.models.hand.skeleton import ANGLE_LIMITS
+from jaxfilters.models.hand.limits import SOFT_LIMITS, limit_excess, limit_log_likelihood
+from jaxfilters.models.hand.skeleton import ANGLE_LIMITS, hand_geometry
 
 pytestmark = pytest.mark.usefixtures("x64")
-LOW, HIGH = ANGLE_LIMITS.T
+LOW, HIGH = SOFT_LIMITS.T
 
 
 @pytest.mark.system
@@ -40,3 +40,13 @@ def test_gradient_leads_back_inside_and_is_finite_at_the_limit():
     np.testing.assert_array_equal(slope(jnp.asarray(HIGH)), 0)
     assert np.all(slope(jnp.asarray(HIGH + 0.1)) < 0)
     assert np.all(slope(jnp.asarray(LOW - 0.1)) > 0)
+
+
+def test_fingers_spread_by_25_degrees_about_their_metacarpals_and_all_else_is_as_published():
+    hand = hand_geometry()
+    across, along, _ = np.asarray(hand.bases[1:] - hand.metacarpal_starts).T
+    fan = np.rad2deg(np.arctan2(across, -along))
+    spread = np.rad2deg(SOFT_LIMITS[4::3])
+    np.testing.assert_allclose(spread, np.stack([np.minimum(-20, fan - 25), np.maximum(20, fan + 25)], 1), atol=1e-9)
+    others = np.setdiff1d(np.arange(15), np.arange(4, 15, 3))
+    np.testing.assert_array_equal(SOFT_LIMITS[others], ANGLE_LIMITS[others])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand import start as start_module
 from jaxfilters.models.hand.motion import per_coordinate
 from jaxfilters.models.hand.registration import (
     PosePrior,
@@ -17,7 +18,7 @@ from jaxfilters.models.hand.registration import (
     target_from_image,
 )
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, local, open_palm, retract
-from jaxfilters.models.hand.start import SCALES, find_starts
+from jaxfilters.models.hand.start import SCALES, Hypotheses, find_starts
 from jaxfilters.models.rendering.depth import render_capsules
 
 GEOMETRY = hand_geometry()
@@ -129,3 +130,25 @@ def test_a_hand_of_either_side_and_of_unknown_size_is_found_without_a_start(side
     assert 1000 * np.linalg.norm(joints(starts[0]) - np.asarray(truth.joints), axis=-1).mean() < 12
     assert starts[0].cost < 0.01
     assert all(start.cost >= starts[0].cost for start in starts)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("outwards", [1, -1])
+def test_fingers_matched_to_their_neighbours_have_a_variant_near_the_truth(count, outwards):
+    # Spread fingers; in the wrong pose the outermost explains nothing, since each of `count` points at its neighbour.
+    spread = np.deg2rad([20.0, 5.0, -10.0, -25.0])
+    truth = open_palm(jnp.array([0.0, 0.08, 0.7])).at[jnp.array([11, 14, 17, 20])].set(spread)
+    right = np.asarray(forward_kinematics(truth, GEOMETRY).joints)[[8, 12, 16, 20]]
+    wrong = truth
+    for finger in [4, 3, 2, 1][:count] if outwards > 0 else [1, 2, 3, 4][:count]:
+        aim = right[finger - 1 - outwards] - np.asarray(GEOMETRY.bases[finger]) - np.array([0.0, 0.08, 0.7])
+        wrong = wrong.at[8 + 3 * finger].set(np.arctan2(aim[0], -aim[1]))
+    one = Hypotheses(np.asarray(wrong)[None], np.ones(1, np.float32), np.ones(1, np.float32))
+    tried = start_module._variants(one, (1.0, -1.0))
+    assert len(tried.poses) == start_module.BATCH
+    tips = np.stack(
+        [np.asarray(forward_kinematics(jnp.asarray(p), GEOMETRY).joints)[[8, 12, 16, 20]] for p in tried.poses]
+    )
+    before = np.asarray(forward_kinematics(wrong, GEOMETRY).joints)[[8, 12, 16, 20]]
+    assert np.linalg.norm(before - right, axis=-1).max() > 0.03
+    assert np.linalg.norm(tips - right, axis=-1).max(axis=1).min() < 0.02

@@ -9,6 +9,7 @@ from jaxfilters.models.hand.skeleton import (
     ANGLE_LIMITS,
     JOINT_NAMES,
     PART_NAMES,
+    anatomical_hand,
     check_geometry,
     check_pose,
     forward_kinematics,
@@ -241,3 +242,18 @@ def test_bad_geometry_is_refused(field, value, message):
 def test_the_default_pose_and_geometry_are_accepted():
     check_pose(open_palm(jnp.array([0.0, 0.09, 0.7])))
     check_geometry(hand_geometry())
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.8])
+def test_tips_of_the_anatomical_hand_are_on_its_skin_and_bones_are_as_measured(scale, random_pose):
+    hand = anatomical_hand().scaled(scale)
+    check_geometry(hand)
+    found = forward_kinematics(jnp.asarray(random_pose(np.random.default_rng(3))), hand)
+    chains = np.asarray(found.joints[1:]).reshape(5, 4, 3)
+    ends, radii = np.asarray(found.capsules.end)[2:15:3], np.asarray(found.capsules.radius)[2:15:3]
+    beyond = chains[:, 3] - ends
+    np.testing.assert_allclose(np.linalg.norm(beyond, axis=1), radii, atol=EXACT)
+    np.testing.assert_allclose(np.cross(beyond, chains[:, 3] - chains[:, 2]), 0, atol=EXACT)
+    # Buryanov and Kotiuk 2010, the middle finger: three phalanges and 3.95 mm of soft tissue, millimetres.
+    bones = 1000 * np.linalg.norm(np.diff(chains, axis=1), axis=2) / scale
+    np.testing.assert_allclose(bones[2], [44.63, 26.33, 17.40 + 3.95], atol=1e-9)

@@ -5,15 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.articulated.anatomy import template_shape
 from jaxfilters.models.articulated.features import FULL, KEYPOINTS
+from jaxfilters.models.articulated.filters import FeatureObservation, belief_of, inequalities, literal
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
+from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import FeatureSequence
 from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING
+
+KEY = jax.random.key(0)
 
 
 def follow(sequence, config=None):
@@ -100,6 +105,30 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
     assert np.all(track.status[25:35] == LOST)
     assert np.all(track.status[43:] == TRACKING)
     assert all(np.all(np.isfinite(leaf)) for leaf in (track.mean, track.std, track.points))
+
+
+@pytest.mark.system
+def test_the_literal_mode_is_the_extended_kalman_filter_of_the_paper():
+    sequence = tracker.synthetic_sequence(0)
+    count = 12
+    config = ArticulatedConfig(mode="literal", gate=0.5)  # a gate that would refuse most rows
+    short = FeatureSequence(
+        2, FULL, sequence.times_s[:count], sequence.y[:count], sequence.std[:count], "short", start=sequence.start
+    )
+    track = follow(short, config)
+    assert np.all(track.num_hypotheses == 1)
+    hand = tracker.hand_model(short, config)
+    limits = inequalities(limit_rows(hand.layout, table_1()))
+    start = Gaussian(*(jnp.asarray(part, dtype=float) for part in sequence.start))
+    filter = literal(hand, start, limits)
+    belief = filter.init(filter.params, KEY)
+    for i in range(count):
+        dt = (short.times_s[i] - (short.times_s[i - 1] if i else 0.0)) * 30
+        belief = filter.predict(filter.params, KEY, belief, jnp.asarray(dt, dtype=float))
+        frame = short[i]
+        look = FeatureObservation(*(jnp.asarray(part) for part in (frame.y, frame.mask, frame.std)))
+        belief, _ = filter.update(filter.params, KEY, belief, look, jnp.asarray(dt, dtype=float))
+        np.testing.assert_allclose(track.mean[i], belief_of(belief).mean, rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxfilters.models.hand.skeleton import anatomical_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
@@ -18,7 +19,7 @@ NUM_PARTICLES = 96
 
 @pytest.fixture(scope="module")
 def sequence():
-    made = simulate_sequence(jax.random.key(1), "B", num_frames=2 * CHUNK)
+    made = simulate_sequence(jax.random.key(1), "B", num_frames=2 * CHUNK, geometry=anatomical_hand())
     depth = np.asarray(made.depth_mm, np.float32) / 1000
     return depth, np.asarray(made.joints)
 

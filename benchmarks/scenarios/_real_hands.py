@@ -1,0 +1,140 @@
+"""Depth recordings of hands with joints: motions of real hands rendered from scanned ones, and one of a depth camera.
+
+The motions are those of D. Tzionas et al., "Capturing hands in action using discriminative salient points and physics
+simulation", IJCV 2016: a scanned surface, bent by linear blend skinning as their tracker followed a real hand, is exact
+truth for what is rendered of it, and is not the shape of the tracker's model. The camera's recording (hpx) is real
+depth, whose joints are a fit of another model.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.io.depth import open_depth
+
+DEVELOPMENT = ("01_L", "01_R", "03_L", "05_R", "06_L", "07_R", "08_R", "15_R", "hpx")
+"""Recordings on which the tracker was developed."""
+HELD = ("02_L", "02_R", "03_R", "04_L", "04_R", "05_L", "06_R", "07_L", "10_R", "17_L", "17_R")
+"""Motions on which nothing was chosen; the two scanned hands are those of the others."""
+NUM_FRAMES = 48
+RATE = 30.0
+"""Frames a second of the motions."""
+NOISE_M, WALL_M = 0.0015, 1.5
+"""Standard deviation of a reading, and the distance of what is behind the hand."""
+_SPLIT = 6
+"""Parts of a triangle's side at whose corners it is sampled: a pixel or less."""
+_DIGITS = (4, 3, 2, 1, 0)
+"""Their names of thumb, index, middle, ring and little finger."""
+
+
+class HandRecording(NamedTuple):
+    """Depth frames of one hand, and its joints."""
+
+    camera: Pinhole
+    times_s: Float[np.ndarray, " t"]
+    depth: Float[np.ndarray, "t rows cols"]
+    """Metres, NaN without a reading."""
+    joints: Float[np.ndarray, "t 21 3"]
+    """Metres, camera frame, in the order of `JOINT_NAMES`; the tips are on the skin."""
+    side: float
+    """+1 for a right hand, -1 for a left one."""
+
+
+def load(name: str, num_frames: int = NUM_FRAMES) -> HandRecording:
+    """One of `DEVELOPMENT` or `HELD`: the frames in the middle of a motion, the first ones of a camera's recording.
+
+    Raises:
+        RecordingError: the data are not there.
+    """
+    if name == "hpx":
+        return _camera_recording(recording_folder("hpx_hand_rgbd") / "hpx.npz", num_frames)
+    with np.load(recording_folder("tzionas_hand_motion") / "tzionas_hand_motion.npz") as data:
+        sequence, side = name.split("_")
+        if f"seq{sequence}_{side}" not in data:
+            raise RecordingError(f"tzionas_hand_motion holds no motion seq{sequence}_{side}.")
+        motion = data[f"seq{sequence}_{side}"].astype(float)
+        hand = {part: data[f"{side}_{part}"] for part in ("bones", "verts", "faces", "weights", "bind")}
+        matrix = data["K"]
+    first = max(0, (len(motion) - num_frames) // 2)
+    motion = motion[first : first + num_frames]
+    shape, rng = (480, 640), np.random.default_rng(int(sequence))
+    depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape) for vertices in _skinned(motion, hand)])
+    depth = np.round(depth + NOISE_M * rng.normal(size=depth.shape), 3)
+    depth = np.where(np.isfinite(depth), depth, WALL_M).astype(np.float32)
+    lengths = _tip_lengths(recording_folder("tzionas_hand_motion") / f"Model_Hand_{side}.SKEL")
+    camera = Pinhole.from_matrix(matrix, shape)
+    times = np.arange(len(motion), dtype=np.float32) / np.float32(RATE)
+    return HandRecording(camera, times, depth, _joints(motion, hand, lengths, side), 1.0 if side == "R" else -1.0)
+
+
+def pip_flexion(joints: Float[np.ndarray, "t 21 3"]) -> Float[np.ndarray, "t 4"]:
+    """Angles in radians between the first two phalanges of the four fingers."""
+    fingers = joints[:, 5:].reshape(-1, 4, 4, 3)
+    bones = np.diff(fingers[:, :, :3], axis=2)
+    bones = bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+    return np.arccos(np.clip(np.sum(bones[:, :, 0] * bones[:, :, 1], axis=-1), -1.0, 1.0))
+
+
+def _camera_recording(path: Path, num_frames: int) -> HandRecording:
+    recording = open_depth(path)
+    count = min(num_frames, len(recording))
+    depth = np.stack([recording[i] for i in range(count)])
+    times = (recording.times_s - recording.times_s[0]).astype(np.float32)[:count]
+    return HandRecording(recording.camera, times, depth, np.asarray(recording.joints)[:count], 1.0)
+
+
+def _skinned(motion: Float[np.ndarray, "t b 3 4"], hand: dict[str, np.ndarray]) -> Iterator[Float[np.ndarray, "v 3"]]:
+    """Vertices in each frame, millimetres: linear blend skinning."""
+    rest = np.linalg.inv(_square(hand["bind"].astype(float)))
+    points = np.c_[hand["verts"], np.ones(len(hand["verts"]))]
+    for transforms in motion:
+        yield np.einsum("vb,bij,vj->vi", hand["weights"].astype(float), transforms @ rest, points, optimize=True)
+
+
+def _square(transforms: Float[np.ndarray, "b 3 4"]) -> Float[np.ndarray, "b 4 4"]:
+    last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(transforms), 1, 4))
+    return np.concatenate([transforms, last], axis=1)
+
+
+def _rendered(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], matrix: np.ndarray, shape: tuple[int, int]
+) -> Float[np.ndarray, "rows cols"]:
+    """Depth in metres of a dense surface, by points of its triangles; `inf` beside it."""
+    corners = [(i, j, _SPLIT - i - j) for i, j in product(range(_SPLIT + 1), repeat=2) if i + j <= _SPLIT]
+    points = np.einsum("kc,fcx->fkx", np.array(corners) / _SPLIT, vertices[faces]).reshape(-1, 3)
+    pixels = points @ matrix.T
+    u, v = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+    inside = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])
+    depth = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(depth, v[inside] * shape[1] + u[inside], 1e-3 * points[inside, 2])
+    return depth.reshape(shape)
+
+
+def _joints(
+    motion: Float[np.ndarray, "t b 3 4"], hand: dict[str, np.ndarray], lengths: dict[str, float], side: str
+) -> Float[np.ndarray, "t 21 3"]:
+    """Origins of the bones, and the ends of the last ones, metres."""
+    names = [str(name) for name in hand["bones"]]
+    joints = [motion[:, names.index(f"Lower Arm {side}"), :, 3]]
+    for digit in _DIGITS:
+        chain = [f"{side}Fing.{digit}_{part}" for part in (("Hand", 0, 1) if digit == _DIGITS[0] else (0, 1, 2))]
+        joints += [motion[:, names.index(name), :, 3] for name in chain]
+        before, last = (hand["bind"][names.index(name)].astype(float) for name in chain[1:])
+        along = before[:, :3].T @ (last[:, 3] - before[:, 3])  # a bone lies along one axis of its own frame
+        axis = int(np.argmax(np.abs(along)))
+        direction = np.sign(along[axis]) * motion[:, names.index(chain[2]), :, axis]
+        joints.append(joints[-1] + lengths[chain[2]] * direction)
+    return 1e-3 * np.stack(joints, axis=1)
+
+
+def _tip_lengths(path: Path) -> dict[str, float]:
+    """Lengths of the bones by name, millimetres, of a skeleton's file: lines of parent, name and length in turn."""
+    lines = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    lines = lines[len(lines) % 3 :]
+    return {name: float(length) for name, length in zip(lines[1::3], lines[2::3], strict=True)}

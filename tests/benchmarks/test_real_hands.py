@@ -1,0 +1,73 @@
+"""Recordings of hands: what is rendered agrees with the joints, and the comparison of filters on them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.benchmarks.scenarios import _real_comparison, _real_hands
+from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics, open_palm
+
+
+def test_the_flexion_of_second_joints_is_that_of_the_pose():
+    bent = np.array([0.1, 0.4, 0.8, 1.2])
+    pose = open_palm(jnp.array([0.0, 0.1, 0.7])).at[jnp.array([12, 15, 18, 21])].set(bent)
+    joints = np.asarray(forward_kinematics(pose.at[jnp.array([10, 14])].set(0.3), anatomical_hand()).joints)
+    np.testing.assert_allclose(_real_hands.pip_flexion(joints[None])[0], bent, atol=1e-4)
+
+
+def test_a_triangle_is_rendered_at_its_depth_and_nothing_beside_it():
+    matrix = np.array([[100.0, 0, 20], [0, 100.0, 15], [0, 0, 1]])
+    corners = np.array([[-10.0, -10, 500], [10, -10, 500], [-10, 10, 600]])
+    depth = _real_hands._rendered(corners, np.array([[0, 1, 2]]), matrix, (30, 40))
+    v, u = np.nonzero(np.isfinite(depth))
+    assert {(13, 18), (13, 22), (17, 18)} <= set(zip(v.tolist(), u.tolist(), strict=True))
+    # Depth is 550 + 5 y on the plane, y = (v - 15) z / 100; a reading is up to half a pixel from the pixel's middle.
+    plane = 0.55 / (1 - 0.05 * (v - 15))
+    np.testing.assert_allclose(depth[v, u], plane, atol=0.02)
+    assert set(u) <= set(range(18, 23))
+    assert set(v) <= set(range(13, 18))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["08_R", "03_L"])
+def test_joints_lie_within_the_hand_that_is_rendered(name, data_dir):
+    del data_dir
+    found = _real_hands.load(name, num_frames=2)
+    uv = np.asarray(found.camera.project(jnp.asarray(found.joints)))
+    u, v = np.rint(np.moveaxis(uv, -1, 0)).astype(int)
+    skin = found.depth[np.arange(2)[:, None], v, u]
+    behind = found.joints[..., 2] - skin
+    under_the_skin = np.abs(behind - 0.015) < 0.025
+    inner = np.setdiff1d(np.arange(21), (4, 8, 12, 16, 20))  # a tip's own pixel may be beside the hand
+    assert under_the_skin[:, inner].mean() > 0.8  # some lie behind a finger
+    assert np.isnan(found.depth).sum() == 0
+
+
+def test_real_hands_are_compared_recording_by_recording(monkeypatch):
+    millimetres = {"rbpf": [5.0, 6, 7, 8, 9], "pf": [6.0, 7, 8, 9, 10], "registration": [4.0, 5, 6, 7, 8]}
+    camera = Pinhole.from_intrinsics(1.0, (0.0, 0.0), (1, 1))
+    empty = (np.zeros(0, np.float32), np.zeros((0, 1, 1), np.float32), np.zeros((0, 21, 3)))
+    recordings = [_real_hands.HandRecording(camera, *empty, float(i)) for i in range(5)]
+
+    def error_of(name, each, count=1000):
+        return millimetres[name][int(each.side)] + 100 / count
+
+    monkeypatch.setattr(_real_comparison, "_recordings", lambda quick: recordings)
+    monkeypatch.setattr(_real_comparison, "registration_error", lambda each, seed: error_of("registration", each, 1e9))
+    monkeypatch.setattr(_real_comparison, "tracker_error", lambda name, count, each, seed: error_of(name, each, count))
+    found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, quick=True).items()}
+    assert found["joint_error_mm_real_rbpf"] == pytest.approx(8.0)
+    assert found["joint_error_mm_real_registration"] == pytest.approx(6.0)
+    assert found["p_value_rbpf_better_real"] == pytest.approx(1 / 32)  # all five pairs fall the same way
+    assert found["p_value_rbpf_better_than_registration_real"] == pytest.approx(1.0)
+    assert found["errors_by_n_real_rbpf_n8"] == pytest.approx(7 + 100 / 8)
+
+
+def test_without_recordings_there_is_nothing_to_compare(monkeypatch):
+    def missing(quick):
+        raise RecordingError("not here")
+
+    monkeypatch.setattr(_real_comparison, "_recordings", missing)
+    assert _real_comparison.real_metrics(16, quick=True) == {}
