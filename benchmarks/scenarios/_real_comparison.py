@@ -47,7 +47,7 @@ Follow = Callable[[HandRecording, int], float]
 
 
 def real_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
-    """Errors on the recordings that no constant was chosen on; nothing where they are not there."""
+    """Errors on the motions that nothing was chosen on, and on that of a camera; nothing where they are not there."""
     try:
         recordings = _recordings(quick)
     except RecordingError as error:
@@ -116,5 +116,5 @@ def _joint_error(joints: np.ndarray, recording: HandRecording) -> float:
 
 
 def _recordings(quick: bool) -> list[HandRecording]:
-    names = _real_hands.HELD[: QUICK_RECORDINGS if quick else None]
+    names = (*_real_hands.HELD, "hpx")[: QUICK_RECORDINGS if quick else None]
     return [_real_hands.load(name, QUICK_NUM_FRAMES if quick else _real_hands.NUM_FRAMES) for name in names]
