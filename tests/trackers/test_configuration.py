@@ -45,12 +45,12 @@ def test_fields_are_read_with_their_types_choices_defaults_and_docstrings():
 
 
 def test_options_that_are_not_given_keep_the_defaults():
-    assert config_from_args(Config, _parser().parse_args([])) == Config()
+    assert config_from_args(Config(), _parser().parse_args([])) == Config()
 
 
 def test_options_reach_their_fields():
     given = _parser().parse_args(["--method", "exact", "--rows", "3", "--gain", "2", "--no-smooth"])
-    assert config_from_args(Config, given) == Config("exact", 3, 2.0, False)
+    assert config_from_args(Config(), given) == Config("exact", 3, 2.0, False)
 
 
 def test_the_help_is_made_of_docstrings_and_defaults():

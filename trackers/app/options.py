@@ -16,11 +16,11 @@ _SHORT = {"num_particles": "--particles"}
 """Further names of options."""
 
 
-def config_from_args(config: Made | type[Made], options: argparse.Namespace) -> Made:
-    """A configuration with the options of the command line; those that are None keep what it has, or its defaults."""
+def config_from_args(config: Made, options: argparse.Namespace) -> Made:
+    """A configuration with the options of the command line; those that are None keep what it has."""
     names = (field.name for field in dataclasses.fields(config))  # type: ignore[arg-type]
     given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    return config(**given) if isinstance(config, type) else dataclasses.replace(config, **given)  # type: ignore[type-var]
+    return dataclasses.replace(config, **given)  # type: ignore[type-var]
 
 
 def add_variant(parser: argparse.ArgumentParser, variants: Iterable[str]) -> None:

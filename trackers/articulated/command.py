@@ -38,7 +38,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = as_input_error(partial(config_from_args, ArticulatedConfig, options))
+    config = as_input_error(partial(config_from_args, ArticulatedConfig(), options))
     sequence = _sequence(options, config)
     hand = as_input_error(partial(articulated_hand.hand_model, sequence, config))
     return RunSpec(

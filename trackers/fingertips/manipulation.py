@@ -153,7 +153,7 @@ def _ended(now: HandFrame, hand: int, name: str, activity: Activity | None) -> l
     change = activity.recent - activity.anchor
     quantities: dict[str, Any] = {
         MOVE: lambda: {"dx_px": float(change[0]), "dy_px": float(change[-1])},
-        ROTATE: lambda: {"angle_deg": math.degrees(float(change[0]))},
+        ROTATE: lambda: {"angle_rad": float(change[0])},
         RESIZE: lambda: {"ratio": math.exp(float(change[0]))},
     }[name]()
     return [_event(now, hand, name, "end", quantities)]

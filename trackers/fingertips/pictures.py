@@ -1,5 +1,6 @@
 """Pictures of fingertips: names, ways, palms, and what the hands do."""
 
+import math
 from collections import deque
 from typing import Any
 
@@ -65,8 +66,16 @@ def in_words(event: Event) -> str:
     numbers = {name: value for name, value in event.quantities.items() if isinstance(value, float)}
     if event.name == SYMBOL:
         return f"symbol: {event.quantities['label'] or 'unknown'}"
-    reported = ", ".join(f"{name.rsplit('_', 1)[0]} {value:.4g}" for name, value in numbers.items())
+    reported = ", ".join(_quantity(name, value) for name, value in numbers.items())
     return f"{event.name} {event.phase}s" + (f": {reported}" if reported else "")
+
+
+def _quantity(name: str, value: float) -> str:
+    """`dx 14 px`, or `angle 40 degrees` of radians."""
+    stem, _, unit = name.rpartition("_")
+    if unit == "rad":
+        return f"{stem} {math.degrees(value):.4g} degrees"
+    return f"{stem} {value:.4g} {unit}" if stem else f"{name} {value:.4g}"
 
 
 def _draw_palm(picture: np.ndarray, report: HandReport, hand: int) -> None:

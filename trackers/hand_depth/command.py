@@ -39,7 +39,7 @@ def spec(options: argparse.Namespace) -> RunSpec:
     Raises:
         InputError: the recording or an option cannot be used.
     """
-    config = as_input_error(partial(config_from_args, HandDepthConfig, options))
+    config = as_input_error(partial(config_from_args, HandDepthConfig(), options))
     sequence = open_depth(options.input) if options.input else _synthetic(config.seed)
     if warning := as_input_error(partial(check_unit, sequence[0])):
         warn(f"{sequence.name}: {warning}")

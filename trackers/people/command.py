@@ -110,7 +110,7 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _setup(options: argparse.Namespace) -> Setup:
-    config = as_input_error(partial(config_from_args, PeopleConfig, options))
+    config = as_input_error(partial(config_from_args, PeopleConfig(), options))
     if not options.sources:
         if options.camera or options.scene or options.detections:
             raise InputError("--camera, --scene, --detections: of no use without a video, as for the synthetic room.")

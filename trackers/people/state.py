@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int32, Num, UInt8
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
-from jaxfilters.trackers.people.config import PeopleConfig
+from jaxfilters.trackers.people.config import PeopleConfig as PeopleConfig
 
 FREE, TENTATIVE, TRACKED, DORMANT = range(4)
 MODE_NAMES = ("free", "tentative", "tracked", "dormant")

@@ -13,7 +13,7 @@ from jaxfilters.models.synthetic.strokes import drawn, tracked
 from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.fingertips.command import recogniser_of
-from jaxfilters.trackers.fingertips.events import SYMBOL, Event, Stroke
+from jaxfilters.trackers.fingertips.events import ROTATE, SYMBOL, Event, Stroke
 from jaxfilters.trackers.fingertips.input import LiveHands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures, in_words
 from jaxfilters.trackers.fingertips.state import HandReport
@@ -225,6 +225,8 @@ def test_pictures_leave_the_image_as_it_is():
     assert picture.std() > 5
     assert (image == 90).all()
     assert in_words(event) == "symbol: circle"
+    turned = Event(0, 0.0, 0, ROTATE, "end", {"angle_rad": np.pi / 4, "x_px": 3.25, "ratio": 1.5})
+    assert in_words(turned) == "rotate ends: angle 45 degrees, x 3.25 px, ratio 1.5"
     assert shown(np.array([[0.5, np.nan], [0.6, 0.7]], np.float32)).shape == (2, 2, 3)
 
 

@@ -106,7 +106,7 @@ def test_the_thumb_switches_from_symbols_to_manipulation():
     moves = [e for e in session.events if (e.name, e.phase) == ("move", "end")]
     assert any(abs(e.quantities["dx_px"] - 90) < 8 for e in moves)
     turned = [e for e in session.events if (e.name, e.phase) == ("rotate", "end")]
-    np.testing.assert_allclose([e.quantities["angle_deg"] for e in turned], [40], atol=4)
+    np.testing.assert_allclose(np.degrees([e.quantities["angle_rad"] for e in turned]), [40], atol=4)
     resized = [
         e.quantities["ratio"] for e in session.events if (e.name, e.phase) == ("resize", "end") and e.frame > 100
     ]

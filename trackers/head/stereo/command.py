@@ -32,7 +32,7 @@ def track(options: argparse.Namespace) -> str:
         KeyboardInterrupt: before anything was tracked.
     """
     check_unused(options)
-    settings = as_input_error(partial(config_from_args, HeadConfig, options))
+    settings = as_input_error(partial(config_from_args, HeadConfig(), options))
     place = setup_of(
         options.sources, Places(options.rig, options.camera, options.points, options.fps), options.seed or 0
     )
