@@ -10,17 +10,20 @@ An element summarises a run of frames; elements are combined by an associative o
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._xla.last_axis import batch_last
 from jaxfilters._xla.prefix_scan import prefix_scan
 from jaxfilters.gaussian import checks
+from jaxfilters.gaussian.arithmetic.factor import UNROLLED
 from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.manifold import euclidean
-from jaxfilters.math.linalg import matmul, solve_triangular, tria, tria_of_many
+from jaxfilters.math.linalg import matmul, solve_triangular, tria, tria_of_many, tria_of_many_with_zeros
 
 
 class LinearModel(NamedTuple):
@@ -115,7 +118,7 @@ def parallel_kalman(
         H=jnp.where(read[..., None], steps.H, 0.0), root_R=jnp.where(read[..., None], steps.root_R, 0.0)
     )
     residuals = jnp.where(read, jnp.where(read, ys, 0.0) - steps.d, 0.0)
-    elements = jax.vmap(_filter_element, out_axes=-1)(steps, residuals)
+    elements = jax.vmap(_of_small(_filter_element, steps), out_axes=-1)(steps, residuals)
     first = _first(prior, jax.tree.map(lambda leaf: leaf[0], steps), residuals[0])
     elements = jax.tree.map(lambda leaf, start: leaf.at[..., 0].set(start), elements, first)
     found = prefix_scan(jax.vmap(_combined, -1, -1), elements, axis=-1)
@@ -153,7 +156,7 @@ def parallel_rts(beliefs: GaussianRoot, model: LinearModel) -> GaussianRoot:
     following = jax.tree.map(lambda leaf: leaf[1:], steps)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], beliefs)
     last = _SmootherElement(jnp.zeros_like(beliefs.root[-1]), beliefs.mean[-1], beliefs.root[-1])
-    elements = jax.vmap(_smoother_element, out_axes=-1)(earlier, following)
+    elements = jax.vmap(_of_small(_smoother_element, steps), out_axes=-1)(earlier, following)
     elements = jax.tree.map(lambda many, one: jnp.concatenate([many, one[..., None]], axis=-1), elements, last)
     found = prefix_scan(jax.vmap(_chained, -1, -1), elements, axis=-1, reverse=True)
     return GaussianRoot(found.g.T, jnp.moveaxis(found.L, -1, 0))
@@ -178,6 +181,12 @@ def _check_model(model: LinearModel, n: int, m: int | None) -> None:
             raise ValueError(f"model.{name} must have the shape ({size},), after an axis of time if any; got {shape}.")
 
 
+def _of_small(function: Callable, steps: _Step) -> Callable:
+    """The function of one frame, faster under `vmap` where its matrices are small."""
+    rows = steps.F.shape[-1] + max(steps.F.shape[-1], steps.H.shape[-2])
+    return batch_last(function) if rows <= UNROLLED else function
+
+
 def _filter_element(step: _Step, y: Array) -> _FilterElement:
     """One frame, given the state before it."""
     n = step.F.shape[0]
@@ -185,7 +194,7 @@ def _filter_element(step: _Step, y: Array) -> _FilterElement:
     innovation = y - _times(step.H, step.b)
     HF = matmul(step.H, step.F)
     whitened = solve_triangular(root, HF)
-    Z = tria(whitened.T)
+    Z = tria_of_many(whitened.T)
     A = step.F - matmul(gain, HF)
     eta = _times(whitened.T, solve_triangular(root, innovation))
     return _FilterElement(A, step.b + _times(gain, innovation), rest[:, :n], eta, Z)
@@ -253,7 +262,7 @@ def _conditioned(H: Array, root_P: Array, root_R: Array) -> tuple[Array, Array, 
     m, n = H.shape
     above = jnp.hstack([matmul(H, root_P), root_R])
     below = jnp.hstack([root_P, jnp.zeros((n, root_R.shape[1]), root_P.dtype)])
-    joint = tria(jnp.vstack([above, below]))
+    joint = tria_of_many_with_zeros(jnp.vstack([above, below]))
     root = joint[:m, :m]
     return root, solve_triangular(root, joint[m:, :m].T, transpose=True).T, joint[m:, m:]
 

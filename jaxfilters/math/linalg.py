@@ -4,6 +4,7 @@ Up to 8 rows all functions but `tria` are written as algebra on the elements, wh
 ensemble and is ten times faster on a CPU than a LAPACK call for each matrix; above that LAPACK is faster.
 """
 
+from collections.abc import Callable
 from functools import reduce
 from operator import add
 
@@ -105,13 +106,25 @@ def tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     differentiable, as |x| at 0: the derivative there is finite, correct for changes that keep the row in the span, and
     ignores the part of other changes to the right of the diagonal.
     """
-    n, m = A.shape
-    zero = jnp.all(A == 0, axis=1)
+    return _with_rows_of_zeros(_wide_tria, A)
+
+
+def _with_rows_of_zeros(triangular: Callable[[Array], Array], A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     # Rows of zeros are moved to the end, so that the factorisation assigns no direction of the row space to them.
+    zero = jnp.all(A == 0, axis=1)
     place = jnp.where(zero, jnp.sum(~zero) + jnp.cumsum(zero), jnp.cumsum(~zero)) - 1
-    ordered = (place == jnp.arange(n)[:, None]).astype(A.dtype)
-    L = _tria(jnp.pad(matmul(ordered, A), ((0, 0), (0, max(0, n - m)))))
-    return matmul(matmul(ordered.T, L), ordered)
+    ordered = (place == jnp.arange(A.shape[0])[:, None]).astype(A.dtype)
+    return matmul(matmul(ordered.T, triangular(matmul(ordered, A))), ordered)
+
+
+def _wide_tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
+    n, m = A.shape
+    return _tria(jnp.pad(A, ((0, 0), (0, max(0, n - m)))))
+
+
+def tria_of_many_with_zeros(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
+    """As `tria_of_many`, and a row of zeros leads to a column of zeros, too, as in `tria`."""
+    return _with_rows_of_zeros(tria_of_many, A)
 
 
 def tria_of_many(A: Float[Array, "n m"]) -> Float[Array, "n n"]:

@@ -58,7 +58,8 @@ def resample(
     num_particles = log_weights.shape[0]
     normalized, log_sum = weights.normalize(log_weights)
     identity = jnp.arange(num_particles, dtype=jnp.int32)
-    uneven = weights.effective_sample_size(normalized) < ess_threshold * num_particles
+    # The effective sample size of weights that sum to one.
+    uneven = 1 / jnp.sum(jnp.exp(2 * normalized)) < ess_threshold * num_particles
     uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
     if isinstance(scheme, EnsembleScheme):
         unchanged = Resampled(particles, normalized, identity)
