@@ -89,6 +89,8 @@ def _of_systems(metrics: Mapping[str, Mapping[str, Any]]) -> str:
     """The table at the beginning of the page, from the run of `bench systems`."""
     rows = []
     for name, (system, quantity, simplest) in _SYSTEMS.items():
+        if name not in metrics:
+            continue
         values = [
             f"{found['value']:.3g} {found['unit']}" if (found := metrics.get(f"{name}{suffix}")) else "-"
             for suffix in ("", "_simple", "_paper")

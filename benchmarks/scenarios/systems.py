@@ -43,7 +43,6 @@ HEAD_PAPER = {"z_mm": 2.71, "yaw_deg": 1.55}
 """Oka and Sato (2006), slow motion, adaptive: table 3."""
 MONO_PAPER = {"z_mm": 9.56, "yaw_deg": 2.45}
 """Sugano (2007), known person: table 4.1."""
-FINGERTIPS_PAPER = 99.0
 SYMBOLS_PAPER = 99.2
 """Percent of symbols with one finger, Oka, Sato and Koike (2002), table 2."""
 POSE = ("x_mm", "y_mm", "z_mm", "roll_deg", "yaw_deg", "pitch_deg")
