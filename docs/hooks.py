@@ -63,3 +63,13 @@ def on_page_content(html: str, **_: Any) -> str:
         return convert(latex, display="block" if found[1] == "div" else "inline")
 
     return _FORMULA.sub(drawn, html)
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Remove the one script that the theme would load from the network, for the search of pages opened as files."""
+    return re.sub(r'<script src="https://unpkg\.com/[^"]*"></script>', "", output)
+
+
+def on_post_template(output_content: str, **_: Any) -> str:
+    """The same for the page of addresses that do not exist."""
+    return on_post_page(output_content)
