@@ -166,7 +166,7 @@ def _refined(rig, state: HeadState, images: Array, search):
 def _learnt(state: HeadState, images: Array, shape: Array):
     del images
     windows, always = state.learner.windows, jnp.ones((), bool)
-    return learning.learnt(state.learner, state.model, shape, windows, always, *_way("modern"))
+    return learning.learnt(state.learner, state.model, shape, windows, always, *_way("recommended"))
 
 
 def _recalculated(rig, state: HeadState, images: Array, x: Array):

@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL.npz",
         help="the symbols; `jaxfilters fit gestures` makes such a file (default: twelve shapes)",
     )
-    add_variant(parser, ("modern", "published"))
+    add_variant(parser, ("recommended", "published"))
     add_seed(parser, default=0)
     add_video_options(parser)
     add_resume(parser)

@@ -30,7 +30,7 @@ STILL_PX = 1.5
 
 
 USUAL = FingertipConfig()
-VARIANTS = {"modern": (USUAL, MODERN), "published": (PUBLISHED_CONFIG, PUBLISHED)}
+VARIANTS = {"recommended": (USUAL, MODERN), "published": (PUBLISHED_CONFIG, PUBLISHED)}
 """Constants and strategies by name."""
 
 

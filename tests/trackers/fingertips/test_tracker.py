@@ -25,7 +25,7 @@ from jaxfilters.trackers.fingertips.tracker import MODERN, PUBLISHED, PUBLISHED_
 
 COUNTS, SUBJECTS, FRAMES = range(1, 6), 4, 600
 CONFIG = FingertipConfig()
-METHODS = {"modern": (CONFIG, MODERN), "published": (PUBLISHED_CONFIG, PUBLISHED)}
+METHODS = {"recommended": (CONFIG, MODERN), "published": (PUBLISHED_CONFIG, PUBLISHED)}
 ANGLES = thumb.usual()
 UP = jnp.asarray([0.0, -1.0])
 
@@ -48,7 +48,7 @@ def follower(name):
 
 @pytest.fixture(scope="module")
 def modern():
-    return follower("modern")
+    return follower("recommended")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def published():
 
 @pytest.fixture(scope="module")
 def reports(hands, modern, published):
-    return {"modern": modern(hands.observed), "published": published(hands.observed)}
+    return {"recommended": modern(hands.observed), "published": published(hands.observed)}
 
 
 def accuracy(hands, num_tips):
@@ -79,7 +79,7 @@ def test_counting_is_better_with_correspondence_than_without(hands, reports):
     """Section 4.2: A falls from one to five fingers, B is above it; the two frames of confirmation count as wrong."""
     detected = accuracy(hands, np.asarray(hands.observed.is_tip).sum(axis=-1))
     assert np.all(np.diff(detected.mean(axis=1)[::2]) < 0)
-    for name, mean, least in (("published", 98.2, 97.0), ("modern", 99.3, 98.8)):
+    for name, mean, least in (("published", 98.2, 97.0), ("recommended", 99.3, 98.8)):
         found = accuracy(hands, reports[name].num_tips)
         assert np.all(found.mean(axis=1) >= mean)
         assert found.min() >= least
@@ -100,7 +100,7 @@ def test_fingers_keep_their_names_and_places(hands, reports, name):
 
 @pytest.mark.system
 def test_the_thumb_is_known_and_with_it_the_mode(hands, reports):
-    report = reports["modern"]
+    report = reports["recommended"]
     is_open = np.asarray(hands.fingers)[:, 0]
     settled = slice(30, None)
     assert (report.mode[is_open, settled] == MANIPULATION).mean() > 0.99
@@ -125,7 +125,7 @@ def test_turning_the_scene_changes_nothing_but_places(hands, reports, modern):
             axis=seen.axis @ turn.T,
         )
     )
-    straight = reports["modern"]
+    straight = reports["recommended"]
     np.testing.assert_array_equal(turned.identity, straight.identity)
     np.testing.assert_array_equal(turned.is_thumb, straight.is_thumb)
     np.testing.assert_allclose(turned.thumb_probability, straight.thumb_probability, atol=1e-2)

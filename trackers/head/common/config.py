@@ -14,7 +14,7 @@ class HeadConfig:
         ValueError: naming the field, what was expected and what came.
     """
 
-    variant: Annotated[str, OneOf("modern", "published")] = "modern"
+    variant: Annotated[str, OneOf("recommended", "published")] = "recommended"
     """Improved filter, which refines what the particles find, or the one of Oka, Sato and Sugano's papers."""
     num_particles: int = 1000
     """Number of particles."""

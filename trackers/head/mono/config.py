@@ -63,4 +63,4 @@ class MonoConfig:
 
 PUBLISHED = MonoConfig(landmarks="recalculated", selection="angles", prior_weight=0.0, offset_std=0.0)
 """The tracker of the thesis."""
-VARIANTS = {"modern": MonoConfig(), "published": PUBLISHED}
+VARIANTS = {"recommended": MonoConfig(), "published": PUBLISHED}

@@ -130,7 +130,7 @@ def _recalculated(state: HeadState, estimate: Estimate, images: Array, rig: Came
 
 
 VARIANTS = {
-    "modern": Variant(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
+    "recommended": Variant(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
     "published": Variant(
         _flat_templates, _layered_search, _around_mode, _recalculated, 1.0, learning.without_weighted_motion, False
     ),

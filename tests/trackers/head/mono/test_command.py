@@ -224,7 +224,7 @@ def mono_options(**given):
     from argparse import Namespace
 
     usual = dict(video_source=None, camera=None, points=None, fps=None, seed=None, num_particles=None, video=False)
-    usual |= dict(resume=False, variant="modern")
+    usual |= dict(resume=False, variant="recommended")
     return Namespace(**usual | dict(eyes_apart_mm=None, seconds=None, estimate_focal=False, known=None) | given)
 
 

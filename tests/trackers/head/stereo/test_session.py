@@ -316,7 +316,7 @@ def test_images_that_do_not_fit_the_rig_are_refused():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"variant": "fast"}, "variant must be one of modern, published"),
+        ({"variant": "fast"}, "variant must be one of recommended, published"),
         ({"diffusion": "none"}, "diffusion must be one of"),
         ({"detector": "eyes"}, "detector must be one of cascades, mediapipe"),
         ({"num_particles": 0}, "num_particles must be at least 1"),
