@@ -74,8 +74,8 @@ def _digest(settings: dict[str, object]) -> str:
     machine = {name: value for name, value in environment().items() if name != "load"}
     # Any package may matter: a part leaves out what needs one that is missing.
     installed = sorted(f"{one.name} {one.version}" for one in distributions())
-    told = json.dumps([settings, machine, installed, os.environ.get(VARIABLE)], sort_keys=True)
-    digest = hashlib.sha256(told.encode())
+    message = json.dumps([settings, machine, installed, os.environ.get(VARIABLE)], sort_keys=True)
+    digest = hashlib.sha256(message.encode())
     for folder in (path for package in _PACKAGES for path in package.__path__):
         for source in sorted(Path(folder).rglob("*.py")):
             digest.update(source.read_bytes())

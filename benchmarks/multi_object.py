@@ -246,8 +246,8 @@ def _coverage(truth: FloorTracks, matches: Matches) -> tuple[np.ndarray, int]:
     histories = [is_matched[truth.identity == who] for who in np.unique(truth.identity)]
     losses = 0
     for history in histories:
-        seen = np.flatnonzero(history)
-        losses += int((np.diff(seen) > 1).sum())
+        observed = np.flatnonzero(history)
+        losses += int((np.diff(observed) > 1).sum())
     return np.array([history.mean() for history in histories]), losses
 
 

@@ -45,9 +45,9 @@ def _column(camera: Pinhole, depth: np.ndarray, pose: np.ndarray, joints: np.nda
     zoom = TILE / side
     closer = Pinhole(camera.focal * zoom, (camera.center + 0.5 - corner) * zoom - 0.5, (TILE, TILE))
     to_tile = np.float32([[zoom, 0, (0.5 - corner[0]) * zoom - 0.5], [0, zoom, (0.5 - corner[1]) * zoom - 0.5]])
-    seen = cv2.warpAffine(color_depth(depth, near, far), to_tile, (TILE, TILE), flags=cv2.INTER_NEAREST)
-    draw_skeleton(seen, closer, joints)
-    return np.concatenate([seen, _model(closer, pose, joints, near, far)])
+    observed = cv2.warpAffine(color_depth(depth, near, far), to_tile, (TILE, TILE), flags=cv2.INTER_NEAREST)
+    draw_skeleton(observed, closer, joints)
+    return np.concatenate([observed, _model(closer, pose, joints, near, far)])
 
 
 def _model(camera: Pinhole, pose: np.ndarray, joints: np.ndarray, near: float, far: float) -> np.ndarray:

@@ -140,19 +140,19 @@ def fit_frames(video: HandVideo) -> Iterator[FrameFit]:
 
 def overlay(frame: np.ndarray, fit: FrameFit) -> np.ndarray:
     """Tips (red), bases, palm and axis as detected, and key points of tips (green), on the frame."""
-    image, seen = frame.copy(), fit.observation
+    image, observed = frame.copy(), fit.observation
 
     def at(point):
         return tuple(int(n) for n in np.rint(point))
 
-    for tip, base in zip(seen.tips[seen.is_tip], seen.bases[seen.is_tip], strict=True):
+    for tip, base in zip(observed.tips[observed.is_tip], observed.bases[observed.is_tip], strict=True):
         cv2.circle(image, at(tip), 6, (0, 0, 255), 1, cv2.LINE_AA)
         if base.any():
             cv2.line(image, at(tip), at(base), (0, 255, 255), 1, cv2.LINE_AA)
     for point in fit.tips:
         cv2.drawMarker(image, at(point), (0, 255, 0), cv2.MARKER_CROSS, 7)
-    cv2.circle(image, at(seen.palm), int(seen.palm_radius), (255, 255, 0), 1, cv2.LINE_AA)
-    cv2.line(image, at(seen.palm), at(seen.palm - 60 * seen.axis), (255, 255, 0), 1, cv2.LINE_AA)
+    cv2.circle(image, at(observed.palm), int(observed.palm_radius), (255, 255, 0), 1, cv2.LINE_AA)
+    cv2.line(image, at(observed.palm), at(observed.palm - 60 * observed.axis), (255, 255, 0), 1, cv2.LINE_AA)
     return image
 
 
@@ -173,13 +173,13 @@ def _projected(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _first_camera(observation: HandObservation, joints: np.ndarray, handedness: int) -> np.ndarray:
     """From an open hand, whose fingers are known by their order about the palm; the best of many starts."""
     order = np.argsort(-handedness * base_angles(observation))
-    seen = np.concatenate([observation.tips[order], observation.palm[None]]).astype(float)
+    observed = np.concatenate([observation.tips[order], observation.palm[None]]).astype(float)
     points = np.concatenate([joints[TIPS], joints[PALM].mean(axis=0)[None]])
     weights = np.array([1.0] * MAX_TIPS + [PALM_WEIGHT])[:, None]
-    scale = np.linalg.norm(seen[2] - seen[5]) / np.linalg.norm(points[2] - points[5])
-    starts = [np.array([*r.as_rotvec(), np.log(scale), *seen[5]]) for r in Rotation.create_group("O")]
+    scale = np.linalg.norm(observed[2] - observed[5]) / np.linalg.norm(points[2] - points[5])
+    starts = [np.array([*r.as_rotvec(), np.log(scale), *observed[5]]) for r in Rotation.create_group("O")]
     fits = [
-        least_squares(lambda x: (weights * (_projected(x, points) - seen)).ravel(), start, method="lm")
+        least_squares(lambda x: (weights * (_projected(x, points) - observed)).ravel(), start, method="lm")
         for start in starts
     ]
     return min(fits, key=lambda fit: fit.cost).x
@@ -220,7 +220,7 @@ def _fitted(
     """The camera of the matched tips and the palm, held near the one before."""
     slots = np.flatnonzero(finger >= 0)
     points = np.concatenate([joints[TIPS][finger[slots]], joints[PALM].mean(axis=0)[None]])
-    seen = np.concatenate([observation.tips[slots], observation.palm[None]]).astype(float)
+    observed = np.concatenate([observation.tips[slots], observation.palm[None]]).astype(float)
     weights = np.array([1.0] * len(slots) + [PALM_WEIGHT * float(observation.is_hand)])[:, None] / (TIP_STD * length)
     steps = np.array([*[ROTATION_STEP] * 3, SCALE_STEP, SHIFT_STEP * length, SHIFT_STEP * length])
     last, camera = Rotation.from_rotvec(before[:3]), before
@@ -231,7 +231,7 @@ def _fitted(
         columns = np.stack(
             [np.stack([none, z, -y, x, one, none], axis=1), np.stack([-z, none, x, y, none, one], axis=1)], axis=1
         )
-        residual = weights * (np.stack([x, y], axis=1) + camera[4:] - seen)
+        residual = weights * (np.stack([x, y], axis=1) + camera[4:] - observed)
         near = np.concatenate([(turn * last.inv()).as_rotvec(), camera[3:] - before[3:]]) / steps
         design = np.concatenate([(weights[..., None] * columns).reshape(-1, 6), np.diag(1 / steps)])
         step = np.linalg.lstsq(design, -np.concatenate([residual.ravel(), near]), rcond=None)[0]

@@ -117,7 +117,7 @@ def modern_stages(one: Prepared) -> dict[str, Callable]:
     found = particles(one.state, _floats(one), _keys())
     refinement = jax.jit(partial(_each, partial(_refined, one.truth.rig)))
     estimates = refinement(one.state, _floats(one), found)
-    learn = jax.jit(partial(_each, _learnt))
+    learn = jax.jit(partial(_each, _learned))
     return {
         "particles": lambda: particles(one.state, _floats(one), _keys()),
         "refinement": lambda: refinement(one.state, _floats(one), found),
@@ -163,16 +163,16 @@ def _refined(rig, state: HeadState, images: Array, search):
     return refined(search, state, state.model, images, rig, search.velocity[:POSE])
 
 
-def _learnt(state: HeadState, images: Array, shape: Array):
+def _learned(state: HeadState, images: Array, shape: Array):
     del images
     windows, always = state.learner.windows, jnp.ones((), bool)
-    return learning.learnt(state.learner, state.model, shape, windows, always, *_way("recommended"))
+    return learning.learned(state.learner, state.model, shape, windows, always, *_way("recommended"))
 
 
 def _recalculated(rig, state: HeadState, images: Array, x: Array):
     estimated = state.model.mean + (state.model.basis @ x[POSE:]).reshape(state.model.mean.shape)
     shape, windows = learning.recalculated(state.learner, estimated, images, state.model.templates, x[:POSE], rig)
-    return learning.learnt(state.learner, state.model, shape, windows, jnp.ones((), bool), *_way("published"))
+    return learning.learned(state.learner, state.model, shape, windows, jnp.ones((), bool), *_way("published"))
 
 
 def _way(mode: str):

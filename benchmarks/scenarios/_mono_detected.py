@@ -75,8 +75,8 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
                 one = detected_run(made, face, detector, person + seed)
                 runs.setdefault(f"{kind}{SUFFIXES[name]}", []).append(one)
                 means = {"tracked": one.errors, "solvePnP": one.pnp_errors}
-                told = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
-                sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {told}\n")
+                message = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
+                sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {message}\n")
     metrics: dict[str, Metric] = {}
     for name, of_people in runs.items():
         metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])

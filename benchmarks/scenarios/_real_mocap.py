@@ -212,8 +212,10 @@ def track_lengths(capture: Capture, seed: int) -> tuple[np.ndarray, np.ndarray, 
     start = first_belief(capture, hand.layout, rng)
     pixels = FOCAL * capture.points[..., :2] / capture.points[..., 2:]
     y = (pixels + NOISE * rng.normal(size=pixels.shape)).reshape(len(pixels), -1)
-    seen = np.isfinite(y)
-    frames = FeatureFrame(np.where(seen, y, 0.0).astype(np.float32), seen, np.full(y.shape, MODEL_NOISE, np.float32))
+    observed = np.isfinite(y)
+    frames = FeatureFrame(
+        np.where(observed, y, 0.0).astype(np.float32), observed, np.full(y.shape, MODEL_NOISE, np.float32)
+    )
     start = Start(*(jnp.asarray(part, dtype=float) for part in start))
     tracker = tracker_of(hand, limits, start, ArticulatedConfig(hypotheses=4))
     state = tracker.init(jax.random.key(seed), jax.tree.map(lambda leaf: leaf[0], frames))

@@ -97,7 +97,7 @@ def _speeds(positions: Float[np.ndarray, "t d"]) -> Float[np.ndarray, "t d"]:
     return gaussian_filter1d(np.gradient(positions, axis=0) * FPS, _SETTLED_FRAMES, axis=0, mode="nearest")
 
 
-def learnt(streams: Streams) -> Network:
+def learned(streams: Streams) -> Network:
     """A left-right model of each gesture, side by side."""
     features, lengths = hmm.pad([hand_features(clip) for clip in streams.clips])
     size = (NUM_STATES, features.shape[1])
@@ -143,7 +143,7 @@ def sfinge_metrics(folder: Path, *, most: int | None = None) -> dict[str, Metric
     """
     streams = read_sfinge(folder)
     sequences = streams.sequences[:most]
-    found = spotted(learnt(streams), sequences)
+    found = spotted(learned(streams), sequences)
     scores = [scored(own, truth) for own, truth in zip(found, streams.truth, strict=False)]
     detected, false = sum(score.detected for score in scores), sum(score.false_positives for score in scores)
     total = sum(score.total for score in scores)

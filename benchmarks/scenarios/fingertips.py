@@ -120,7 +120,7 @@ def follow(config: FingertipConfig, method: Method, observed: HandObservation) -
 @partial(jax.jit, static_argnames=("config", "method"))
 def _follow(config: FingertipConfig, method: Method, observed: HandObservation) -> HandReport:
     start = tracker.start(config, USUAL, method=method)
-    return jax.vmap(lambda seen: tracker.run(config, USUAL, start, seen, method=method)[1])(observed)
+    return jax.vmap(lambda visible: tracker.run(config, USUAL, start, visible, method=method)[1])(observed)
 
 
 def identities(report: HandReport) -> float:
@@ -183,7 +183,7 @@ def stacked(observations: list[HandObservation]) -> HandObservation:
 def time_metrics(frames: list[desk_hand.DeskFrame], parameters: HandParameters, rounds: int) -> dict[str, Metric]:
     """Milliseconds a frame with five fingers, from the image to the tips and events, one frame at a time."""
     images = [frame.image for frame in frames]
-    seen = [jax.tree.map(lambda leaf: np.asarray(leaf)[None, None], detected(i, parameters)) for i in images[:2]]
+    visible = [jax.tree.map(lambda leaf: np.asarray(leaf)[None, None], detected(i, parameters)) for i in images[:2]]
     session, tracking = (FingertipSession(USUAL, handedness=parameters.handedness) for _ in range(2))
     turn = {"whole": 0, "tracking": 0}
 
@@ -194,7 +194,7 @@ def time_metrics(frames: list[desk_hand.DeskFrame], parameters: HandParameters, 
 
     def track() -> Any:
         turn["tracking"] += 1
-        return tracking.process(seen[turn["tracking"] % 2], np.zeros(1))
+        return tracking.process(visible[turn["tracking"] % 2], np.zeros(1))
 
     seconds = interleaved({"whole": whole, "tracking": track}, rounds)
     return {
@@ -236,8 +236,8 @@ def tracked_video_metrics(video: HandVideo) -> dict[str, float]:
     rows = len(video.frames[0])
     person = thumb.calibrated(np.array([video.parameters.phi_thumb]), np.array([video.parameters.phi_index]))
     session = FingertipSession(person, handedness=video.parameters.handedness, height=float(rows))
-    seen = stacked([fit.observation for fit in fits])
-    report = session.process(jax.tree.map(lambda leaf: leaf[:, None], seen), np.arange(len(fits)) / 30)
+    visible = stacked([fit.observation for fit in fits])
+    report = session.process(jax.tree.map(lambda leaf: leaf[:, None], visible), np.arange(len(fits)) / 30)
     shown = finger_reach(video.joints)[: len(fits)] > STRETCHED
     tips = np.stack([fit.tips for fit in fits])
     there, place, name = (np.asarray(field)[:, 0] for field in (report.is_tip, report.position, report.identity))

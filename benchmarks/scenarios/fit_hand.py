@@ -136,10 +136,10 @@ def real_metrics(stills: Stills, method: object, out: Path | None) -> dict[str, 
     others = stills.part(slice(half, None))
     before = pose_costs(others, average, method)[1]
     fitted, after = pose_costs(others, found.theta.proportions, method)
-    learnt = found.theta
+    learned = found.theta
     sys.stdout.write(
-        f"real hand: palm {learnt.proportions.palm:.3f}, digits {np.round(learnt.proportions.digits, 3)}, "
-        f"thickness {learnt.proportions.thickness:.3f} of an average hand; noise {1000 * learnt.noise:.1f} mm\n"
+        f"real hand: palm {learned.proportions.palm:.3f}, digits {np.round(learned.proportions.digits, 3)}, "
+        f"thickness {learned.proportions.thickness:.3f} of an average hand; noise {1000 * learned.noise:.1f} mm\n"
         f"depth error in the other images, mm: average hand {np.round(1000 * before, 2)}, "
         f"this hand {np.round(1000 * after, 2)}\n"
     )
@@ -149,7 +149,7 @@ def real_metrics(stills: Stills, method: object, out: Path | None) -> dict[str, 
         "real_error_average_mm": Metric(1000 * float(before.mean()), "mm", "lower"),
         "real_error_learnt_mm": Metric(1000 * float(after.mean()), "mm", "lower"),
         "real_reduction_percent": Metric(100 * (1 - float(after.mean() / before.mean())), "%", "higher"),
-        "real_noise_mm": Metric(1000 * float(learnt.noise), "mm", "lower"),
+        "real_noise_mm": Metric(1000 * float(learned.noise), "mm", "lower"),
     }
 
 
@@ -201,9 +201,9 @@ def _draw(path: Path, stills: Stills, theta: HandStills) -> None:
     for i in range(len(poses)):
         camera = jax.tree.map(lambda leaf, i=i: leaf[i], stills.cameras)
         rendered_rows.append(np.asarray(render_capsules(camera, forward_kinematics(poses[i], hand).capsules)))
-    seen = np.asarray(stills.observed)
-    nearest = float(np.nanmin(seen))
-    shades = np.concatenate([np.concatenate(list(row), axis=1) for row in (seen, np.stack(rendered_rows))])
+    visible = np.asarray(stills.observed)
+    nearest = float(np.nanmin(visible))
+    shades = np.concatenate([np.concatenate(list(row), axis=1) for row in (visible, np.stack(rendered_rows))])
     bright = np.where(np.isfinite(shades), np.clip(255 - 1000 * (shades - nearest), 60, 255), 0)
     picture = cv2.resize(bright.astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     if not cv2.imwrite(str(path), picture):

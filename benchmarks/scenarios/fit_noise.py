@@ -31,9 +31,9 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     del seed  # Nothing is drawn.
     with np.load(recording_folder("handpose_tracks") / "nyu_person1.npz") as held:
         K, truth = held["K"], _points(held["gt_uvd"], held["K"])
-        seen = {name: _points(held[name], K) for name in sorted(held) if name not in ("K", "gt_uvd")}
-    names = list(seen)[: QUICK_NETWORKS if quick else None]
-    rows = np.array([_row(name, seen[name], truth, out if i == 0 else None) for i, name in enumerate(names)])
+        observed = {name: _points(held[name], K) for name in sorted(held) if name not in ("K", "gt_uvd")}
+    names = list(observed)[: QUICK_NETWORKS if quick else None]
+    rows = np.array([_row(name, observed[name], truth, out if i == 0 else None) for i, name in enumerate(names)])
     raw, filtered, smoothed, nominal, jitter = rows.mean(axis=0)
     return {
         "networks": Metric(float(len(names)), "", "higher"),
@@ -52,18 +52,18 @@ def _points(uvd: np.ndarray, K: np.ndarray) -> np.ndarray:
     return np.stack([(u - K[0, 2]) * depth / K[0, 0], (v - K[1, 2]) * depth / K[1, 1], depth], axis=-1)
 
 
-def _row(name: str, seen: np.ndarray, truth: np.ndarray, out: Path | None) -> list[float]:
+def _row(name: str, observed: np.ndarray, truth: np.ndarray, out: Path | None) -> list[float]:
     """Errors of a network, filtered, smoothed, and filtered with round numbers, mm; ratio of the jitters."""
-    half = len(seen) // 2
-    times = np.arange(len(seen)) / FPS
-    noise = learn(tracks_of(seen[:half], times[:half])[0]).theta
-    tracks, means = tracks_of(seen[half:], times[half:])
+    half = len(observed) // 2
+    times = np.arange(len(observed)) / FPS
+    noise = learn(tracks_of(observed[:half], times[:half])[0]).theta
+    tracks, means = tracks_of(observed[half:], times[half:])
     found, round_numbers = positions(tracks, noise), positions(tracks, NOMINAL)
     raw, filtered, smoothed, nominal = (
         _error(places, means, truth[half:])
         for places in (_places(tracks), found.filtered, found.smoothed, round_numbers.filtered)
     )
-    error = np.diff((seen - truth)[:half], axis=0)
+    error = np.diff((observed - truth)[:half], axis=0)
     # Of independent errors the difference has twice the variance.
     true_jitter = np.sqrt(np.mean(error**2) / 2)
     ratio = float(noise.sensor) / true_jitter
@@ -72,7 +72,7 @@ def _row(name: str, seen: np.ndarray, truth: np.ndarray, out: Path | None) -> li
         f"error {raw:.2f} -> {filtered:.2f} filtered, {smoothed:.2f} smoothed, {nominal:.2f} with round numbers\n"
     )
     if out is not None:
-        _draw(out / "fit_noise.png", seen[half:], truth[half:], np.asarray(found.smoothed) + means)
+        _draw(out / "fit_noise.png", observed[half:], truth[half:], np.asarray(found.smoothed) + means)
     return [raw, filtered, smoothed, nominal, ratio]
 
 
@@ -85,13 +85,13 @@ def _error(places: np.ndarray, means: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(points - truth, axis=-1).mean())
 
 
-def _draw(path: Path, seen: np.ndarray, truth: np.ndarray, smoothed: np.ndarray) -> None:
+def _draw(path: Path, observed: np.ndarray, truth: np.ndarray, smoothed: np.ndarray) -> None:
     """One coordinate of a fingertip over five seconds."""
     shown = slice(0, 5 * FPS)
     tip = smoothed.reshape(truth.shape)
     curves = [
         Curve(name, points[shown, 0, 0], _COLORS[name])
-        for name, points in (("true", truth), ("network", seen), ("smoothed", tip))
+        for name, points in (("true", truth), ("network", observed), ("smoothed", tip))
     ]
     seconds = np.arange(5 * FPS) / FPS
     chart = draw_chart((320, 900), "tip of the little finger, x in mm", seconds, curves, "s")

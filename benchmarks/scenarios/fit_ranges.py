@@ -118,14 +118,14 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     recording = read(recording_folder("plaza_range_slam") / "Plaza1_.mat")
     recording = recording.part(slice(QUICK_NUM_RANGES)) if quick else recording
     half = len(recording.seconds) // 2
-    learnt = {name: learn(recording.part(slice(half)), name) for name in MODELS}
-    robots = {"nominal": NOMINAL, **{name: found.theta for name, found in learnt.items()}}
+    learned = {name: learn(recording.part(slice(half)), name) for name in MODELS}
+    robots = {"nominal": NOMINAL, **{name: found.theta for name, found in learned.items()}}
     errors = {name: localisation_errors(recording, robot) for name, robot in robots.items()}
-    for name, found in learnt.items():
+    for name, found in learned.items():
         sys.stdout.write(f"{name}\n{found}\n\n")
     if out is not None:
         _draw(out / "fit_ranges.png", recording, robots, errors)
-    return _metrics(recording, robots, errors, half) | _learnt_metrics(recording, learnt["scale"])
+    return _metrics(recording, robots, errors, half) | _learned_metrics(recording, learned["scale"])
 
 
 def read(path: Path) -> Recording:
@@ -195,7 +195,7 @@ def _metrics(recording: Recording, robots: dict, errors: dict, half: int) -> dic
     return found
 
 
-def _learnt_metrics(recording: Recording, found: fit.Fit) -> dict[str, Metric]:
+def _learned_metrics(recording: Recording, found: fit.Fit) -> dict[str, Metric]:
     excess = float(mean_excess(recording, found.theta))
     sys.stdout.write(f"mean bias of the ranges: estimated {excess:.3f} m, true {_true_excess(recording):.3f} m\n")
     return {

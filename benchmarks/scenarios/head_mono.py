@@ -182,8 +182,8 @@ def errors_of(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
 def _floor(users: range) -> dict[str, Metric]:
     """How well the depth of the same unknown people can be distinguished from their exact shapes."""
     shapes = np.stack([np.asarray(_identity(FIRST_USER + user).neutral) for user in users])
-    told = DISTANCE_MM * np.abs(size_errors(shapes))
-    return {"error_b_z_of_exact_shape": Metric(float(np.mean(told)), "mm", "lower")}
+    message = DISTANCE_MM * np.abs(size_errors(shapes))
+    return {"error_b_z_of_exact_shape": Metric(float(np.mean(message)), "mm", "lower")}
 
 
 @cache

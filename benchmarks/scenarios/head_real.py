@@ -187,10 +187,10 @@ def detector_distances(images: np.ndarray, track: HeadTrack, every: int) -> Floa
     found = [np.nan]
     for i in np.flatnonzero(np.isin(track.status, TRACKED))[::every]:
         points = np.asarray(track.image_points[i, 0, list(EYES)])
-        seen = detect(images[i], near=points.mean(axis=0))
-        if seen is not None:
-            right, left = eye_centers(seen.points)
-            away = np.linalg.norm(points - seen.points[list(EYES)], axis=1)
+        observed = detect(images[i], near=points.mean(axis=0))
+        if observed is not None:
+            right, left = eye_centers(observed.points)
+            away = np.linalg.norm(points - observed.points[list(EYES)], axis=1)
             found.append(np.median(away) / np.linalg.norm(left - right))
     return np.array(found[1:] or found)
 

@@ -239,8 +239,10 @@ def shared_problem(seed: int, count: int) -> tuple[Split, Array]:
     """Frames of a shape of ten points with `NUM_SHARED` parameters, each turned and moved its own way; and a start."""
     rng = np.random.default_rng(seed)
     shared, frames = 0.5 * rng.normal(size=NUM_SHARED), 0.2 * rng.normal(size=(count, 6))
-    seen = jax.vmap(of_frame, (None, 0, 0))(jnp.asarray(shared), jnp.asarray(frames), jnp.zeros((count, NUM_POINTS, 3)))
-    data = seen.reshape(count, NUM_POINTS, 3) + 0.01 * rng.normal(size=(count, NUM_POINTS, 3))
+    observed = jax.vmap(of_frame, (None, 0, 0))(
+        jnp.asarray(shared), jnp.asarray(frames), jnp.zeros((count, NUM_POINTS, 3))
+    )
+    data = observed.reshape(count, NUM_POINTS, 3) + 0.01 * rng.normal(size=(count, NUM_POINTS, 3))
     start = Split(shared + 0.1 * rng.normal(size=NUM_SHARED), frames + 0.05 * rng.normal(size=(count, 6)))
     return jax.tree.map(jnp.asarray, start), data
 

@@ -61,7 +61,7 @@ class Setup(NamedTuple):
         """Whether a camera delivers a frame of a recording of some frames."""
         return frame % self.every[camera] == 0 and not (self.first_stops and camera == 0 and frame >= frames // 2)
 
-    def is_seen(self, shape: tuple[int, int]) -> Bool[np.ndarray, " cols"]:
+    def is_observed(self, shape: tuple[int, int]) -> Bool[np.ndarray, " cols"]:
         """Which columns of an image (rows, cols) a camera has."""
         middle = (shape[1] - 1) / 2
         return np.abs(np.arange(shape[1]) - middle) <= self.width * middle
@@ -113,13 +113,13 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
     rows: dict[str, list[tuple]] = {suffix: [] for suffix in SETUPS}
     for i in range(frames):
         images = [room.image(camera, i) for camera in range(NUM_CAMERAS)]
-        seen = [
+        observed = [
             cv2.convertScaleAbs(one.apply(image), alpha=255.0) for one, image in zip(subtractions, images, strict=True)
         ]
         for suffix, setup in SETUPS.items():
             shown = tuple(
                 CameraFrame(
-                    np.where(setup.is_seen(room.cameras[c].shape), seen[c], np.uint8(0)),
+                    np.where(setup.is_observed(room.cameras[c].shape), observed[c], np.uint8(0)),
                     images[c],
                     np.bool_(setup.delivers(c, i, frames)),
                 )
@@ -134,12 +134,12 @@ def room_tracks(seed: int, frames: int) -> dict[str, tuple[FloorTracks, FloorTra
 def truth(room: DemoRoom, setup: Setup) -> FloorTracks:
     """Who is on the floor and observed whole by a camera that is still running."""
     frames, xy = len(room), room.routes.xy
-    seen = {c: sees_whole(room.cameras[c], xy, setup.width) for c in setup.cameras}
+    observed = {c: sees_whole(room.cameras[c], xy, setup.width) for c in setup.cameras}
     on_floor = np.asarray(walkable(jnp.asarray(room.floor), jnp.asarray(xy)))
     rows = []
     for i in range(frames):
         running = [c for c in setup.cameras if any(setup.delivers(c, j, frames) for j in range(i, frames))]
-        there = np.any([seen[c][i] for c in running], axis=0) & room.present(i) & on_floor[i]
+        there = np.any([observed[c][i] for c in running], axis=0) & room.present(i) & on_floor[i]
         rows += [(i, who, *xy[i, who]) for who in np.flatnonzero(there)]
     return _tracks(rows)
 
@@ -158,10 +158,10 @@ def sees_whole(camera: FloorCamera, xy: np.ndarray, width: float = 1.0) -> np.nd
 def handovers(room: DemoRoom, width: float) -> int:
     """How often the nearest camera that sees a person whole became another one."""
     centers = np.stack([np.asarray(camera.position())[:2] for camera in room.cameras])
-    seen = np.stack([sees_whole(camera, room.routes.xy, width) for camera in room.cameras], axis=1)
+    observed = np.stack([sees_whole(camera, room.routes.xy, width) for camera in room.cameras], axis=1)
     distance = np.linalg.norm(room.routes.xy[:, None] - centers[:, None], axis=-1)
-    nearest = np.argmin(np.where(seen, distance, np.inf), axis=1)
-    somewhere = np.asarray(seen.any(axis=1))
+    nearest = np.argmin(np.where(observed, distance, np.inf), axis=1)
+    somewhere = np.asarray(observed.any(axis=1))
     changed = (np.diff(nearest, axis=0) != 0) & somewhere[1:] & somewhere[:-1]
     return int(changed.sum())
 
@@ -190,7 +190,7 @@ def _primed(room: DemoRoom, camera: int) -> Background:
 
 def _scene(room: DemoRoom, setup: Setup) -> PeopleScene:
     """What a camera does not have is as if something stood right before it."""
-    furniture = [jnp.where(setup.is_seen(room.cameras[c].shape), room.furniture[c], 0.0) for c in setup.cameras]
+    furniture = [jnp.where(setup.is_observed(room.cameras[c].shape), room.furniture[c], 0.0) for c in setup.cameras]
     config = PeopleConfig(capacity=CAPACITY)
     return people_scene([room.cameras[c] for c in setup.cameras], room.floor, furniture=furniture, config=config)
 

@@ -91,18 +91,18 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
         before = time.perf_counter()
         for i, image in enumerate(itertools.islice(images(pets), frames)):
             clock = [before, time.perf_counter()]
-            seen = probability(subtraction, image)
+            foreground = probability(subtraction, image)
             clocks.append(np.diff([*clock, time.perf_counter()]))
-            yield i / FRAMES_PER_SECOND, (CameraFrame(seen, image, np.bool_(True)),)
+            yield i / FRAMES_PER_SECOND, (CameraFrame(foreground, image, np.bool_(True)),)
             before = time.perf_counter()
 
     jax.block_until_ready(step(pets.scene, start(pets.scene), (_nothing(pets),), np.float32(0)))
     for time_s, observed in moments():
         now = people.step(observed, time_s)
         confirmed += [
-            (now.frame, who, float(seen.mean[0]), float(seen.mean[1]))
-            for who, seen in now.added
-            if seen.frame == now.frame
+            (now.frame, who, float(sighting.mean[0]), float(sighting.mean[1]))
+            for who, sighting in now.added
+            if sighting.frame == now.frame
         ]
         tracking.append(now.seconds)
         if now.frame % 100 == 99:
@@ -134,7 +134,9 @@ def read_truth(path: Path, pets: Pets) -> FloorTracks:
 def positions(tracks: dict[int, list[Sighting]]) -> list[tuple[int, int, float, float]]:
     """Frame, identity, X and Y of everybody."""
     return [
-        (seen.frame, who, float(seen.mean[0]), float(seen.mean[1])) for who, track in tracks.items() for seen in track
+        (sighting.frame, who, float(sighting.mean[0]), float(sighting.mean[1]))
+        for who, track in tracks.items()
+        for sighting in track
     ]
 
 
@@ -155,13 +157,15 @@ def score_metrics(scores: MultiObjectScores, suffix: str) -> dict[str, Metric]:
 
 def write_tracks(path: Path, tracks: dict[int, list[Sighting]]) -> None:
     """`frame,id,x_m,y_m,height_m,score,mode` of all sightings, by frame."""
-    rows = sorted((seen.frame, who, seen) for who, track in tracks.items() for seen in track)
+    rows = sorted((sighting.frame, who, sighting) for who, track in tracks.items() for sighting in track)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("frame", "id", "x_m", "y_m", "height_m", "score", "mode"))
-        for frame, who, seen in rows:
-            x, y, *_, height, _ = seen.mean
-            writer.writerow((frame, who, f"{x:.3f}", f"{y:.3f}", f"{height:.3f}", f"{seen.score:.3f}", seen.mode))
+        for frame, who, sighting in rows:
+            x, y, *_, height, _ = sighting.mean
+            writer.writerow(
+                (frame, who, f"{x:.3f}", f"{y:.3f}", f"{height:.3f}", f"{sighting.score:.3f}", sighting.mode)
+            )
 
 
 def _speed(followed: Followed) -> dict[str, Metric]:

@@ -105,9 +105,9 @@ def foreground(recording: Recording) -> np.ndarray:
     return cv2.convertScaleAbs(recording.subtraction.apply(recording.image), alpha=255.0)
 
 
-def one_frame(recording: Recording, seen: np.ndarray) -> tuple:
+def one_frame(recording: Recording, observed: np.ndarray) -> tuple:
     """What the tracker says of one more frame, from the same state every time."""
-    frame = CameraFrame(seen, recording.image, np.bool_(True))
+    frame = CameraFrame(observed, recording.image, np.bool_(True))
     return step(recording.scene, recording.people, (frame,), FRAME_S)
 
 
@@ -120,9 +120,9 @@ def recording(seed: int, count: int, shape: tuple[int, int]) -> Recording:
     subtraction = background("median")
     subtraction.prime([empty])
     made = Recording(scene, _followed(scene.config, places, sizes), subtraction, image)
-    seen = foreground(made)
+    observed = foreground(made)
     for _ in range(SETTLING_FRAMES):
-        made = made._replace(people=one_frame(made, seen)[0])
+        made = made._replace(people=one_frame(made, observed)[0])
     return made
 
 

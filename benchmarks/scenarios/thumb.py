@@ -91,7 +91,7 @@ def decisions(people: People, angles: jax.Array) -> dict[str, jax.Array]:
 def by_posterior(measured: ThumbAngles, angles: jax.Array) -> jax.Array:
     """The posterior's decisions about the fingers of a track, which are of one hand."""
     num_fingers = angles.shape[-1]
-    seen, there = jnp.asarray(True), jnp.ones(num_fingers, bool)
+    observed, there = jnp.asarray(True), jnp.ones(num_fingers, bool)
 
     def one_hand(person: ThumbAngles, angles: jax.Array) -> jax.Array:
         first = thumb.unknown(person)
@@ -99,7 +99,7 @@ def by_posterior(measured: ThumbAngles, angles: jax.Array) -> jax.Array:
 
         def step(state: tuple, angle: jax.Array) -> tuple[tuple, jax.Array]:
             beliefs, was_thumb = state
-            beliefs = jax.vmap(thumb.observe, in_axes=(0, 0, None))(beliefs, angle, seen)
+            beliefs = jax.vmap(thumb.observe, in_axes=(0, 0, None))(beliefs, angle, observed)
             decided = thumb.decided(was_thumb, thumb.probabilities(beliefs.log_odds, there))
             return (beliefs, decided), decided
 

@@ -70,8 +70,8 @@ def affine_model(
         ahead, step = model.linear_transition(before, inputs)
         b = ahead + step.value - factor.apply(step.F, before.mean)
         Q = model.process_noise_of(before, inputs)
-        seen = linear_observation(model, here, jnp.where(read, y, 0.0), own_noise, inputs)
-        return AffineModel(step.F, b, Q, step.residual_root, *seen, read)
+        observed = linear_observation(model, here, jnp.where(read, y, 0.0), own_noise, inputs)
+        return AffineModel(step.F, b, Q, step.residual_root, *observed, read)
 
     return jax.vmap(one)(earlier, here, observations, inputs, mask)
 

@@ -52,7 +52,7 @@ class Alignment(NamedTuple):
     """Pixels squared."""
     score: Float[Array, "C K"]
     """Normalised correlation there, -1 to 1."""
-    seen: Bool[Array, "C K"]
+    observed: Bool[Array, "C K"]
     """Whether the patch faces the camera and lies inside the image."""
     by_slope: Float[Array, "C K 2 S"]
     """How far the place moves, in pixels, with slopes that the skin has beyond those assumed."""
@@ -86,13 +86,13 @@ def align(
 
     found = jax.lax.fori_loop(0, ITERATIONS, iterate, jnp.where(jnp.isfinite(uv), uv, 0.0))
     _, residual, score = _look(patches, images, found[:, :, None] + offsets)
-    seen = is_facing & _inside(images.shape[1:], found, affine) & jnp.isfinite(score)
+    observed = is_facing & _inside(images.shape[1:], found, affine) & jnp.isfinite(score)
     covariance, variance = _covariance(patches, residual, affine)
-    teaching = seen & (score > LEAST_TEACHING_SCORE)
+    teaching = observed & (score > LEAST_TEACHING_SCORE)
     by_slope, information, slope_score = _slopes(
         patches, slopes.mean.shape[1], residual, variance, affine, by_shape, teaching
     )
-    return Alignment(found, covariance, score, seen, by_slope, information, slope_score)
+    return Alignment(found, covariance, score, observed, by_slope, information, slope_score)
 
 
 def relocated(
@@ -122,7 +122,7 @@ def relocated(
         rig: Cameras.
         allowed: Whether to search at all.
     """
-    doubtful = found.seen & (found.score < DOUBTFUL_SCORE) & allowed
+    doubtful = found.observed & (found.score < DOUBTFUL_SCORE) & allowed
     return jax.lax.cond(
         jnp.any(doubtful),
         lambda: _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig),
@@ -132,7 +132,7 @@ def relocated(
 
 def _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig):
     by_shape, _ = jacobian(rig, shape, pose)
-    affine = jnp.where(found.seen[..., None, None], stretch(patches, slopes, by_shape), jnp.eye(2))
+    affine = jnp.where(found.observed[..., None, None], stretch(patches, slopes, by_shape), jnp.eye(2))
     side = 2 * SEARCHED_PX + 1
     expected = jnp.where(jnp.isfinite(uv), uv, 0.0)
     origin = jnp.round(expected - (SIZE - 1) / 2) - SEARCHED_PX
@@ -141,7 +141,7 @@ def _searched(patches, slopes, images, found, doubtful, uv, shape, pose, rig):
     best = jnp.argmax(maps.reshape(*maps.shape[:2], -1), axis=-1)
     place = origin + jnp.stack([best % side, best // side], axis=-1) + (SIZE - 1) / 2
     again = align(patches, slopes, images, jnp.where(doubtful[..., None], place, found.uv), shape, pose, rig)
-    better = doubtful & again.seen & (again.score > jnp.maximum(found.score, DOUBTFUL_SCORE))
+    better = doubtful & again.observed & (again.score > jnp.maximum(found.score, DOUBTFUL_SCORE))
     return taken_over(found, again, better)
 
 

@@ -40,7 +40,7 @@ class Views(NamedTuple):
     """Pixels."""
     covariance: Float[Array, "n K 2 2"]
     """Pixels squared."""
-    seen: Bool[Array, "n K"]
+    observed: Bool[Array, "n K"]
 
 
 class Bundle(NamedTuple):
@@ -119,8 +119,8 @@ def adjust(
     posed, _ = _solved(of_poses, zero.poses, bounds[0].poses, bounds[1].poses, steps[0])
     y, taken = _solved(residuals, zero._replace(poses=posed), *bounds, steps[1])
     found = whole(y)
-    apart = jnp.where(views.seen[..., None], views.uv - projected(face, rig, found), 0.0)
-    mean = jnp.sum(apart**2) / jnp.maximum(2 * jnp.sum(views.seen), 1)
+    apart = jnp.where(views.observed[..., None], views.uv - projected(face, rig, found), 0.0)
+    mean = jnp.sum(apart**2) / jnp.maximum(2 * jnp.sum(views.observed), 1)
     rest = residuals(y, None)
     return found, Adjustment(0.5 * jnp.sum(rest**2), jnp.sqrt(mean), taken)
 
@@ -192,12 +192,12 @@ def _of_views(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundl
     apart = projected(face, rig, bundle) - views.uv
     apart = jnp.where(jnp.isfinite(apart), apart, HIDDEN_PX)
     # Unit covariance stands where nothing was observed: its root must exist.
-    covariance = jnp.where(views.seen[..., None, None], views.covariance, jnp.eye(2))
+    covariance = jnp.where(views.observed[..., None, None], views.covariance, jnp.eye(2))
     (a, b), (_, c) = jnp.moveaxis(covariance, (-2, -1), (0, 1))
     first = apart[..., 0] / jnp.sqrt(a)
     # Rounding must not take what is left of a long thin covariance below zero.
     second = (apart[..., 1] - b / a * apart[..., 0]) / jnp.sqrt(jnp.maximum(c - b * b / a, 1e-6 * c))
-    r = jnp.where(views.seen[..., None], jnp.stack([first, second], axis=-1), 0.0)
+    r = jnp.where(views.observed[..., None], jnp.stack([first, second], axis=-1), 0.0)
     length2 = jnp.sum(r * r, axis=-1, keepdims=True)
     apart_at_all = length2 > _SMALLEST
     length = jnp.sqrt(jnp.where(apart_at_all, length2, 1.0))

@@ -27,8 +27,8 @@ def scores(
         uv: Where N candidates put the landmarks, pixels.
     """
     size, image_shape = templates.shape[-1], images.shape[1:]
-    seen = inside(image_shape, jnp.moveaxis(uv, 2, -1), size)
-    held = seen[:, :, None]
+    observed = inside(image_shape, jnp.moveaxis(uv, 2, -1), size)
+    held = observed[:, :, None]
     top_left = jnp.where(held, uv - (size - 1) / 2, 0.0)
     low = jnp.floor(jnp.min(jnp.where(held, top_left, jnp.inf), axis=-1))
     reach = jnp.max(jnp.where(held, top_left, -jnp.inf), axis=-1) - low
@@ -38,7 +38,7 @@ def scores(
     in_box = lambda side: jax.vmap(partial(_score_in_box, _box_shape(side, image_shape)), (None, 0, 0, 0))
     ways = [jax.vmap(in_box(side)) for side in BOXES] + [jax.vmap(_score_one_by_one)]
     found = lax.switch(jnp.sum(jnp.stack(too_small)), ways, images, templates.astype(uv.dtype), low, top_left)
-    return jnp.where(seen, found, -1.0)
+    return jnp.where(observed, found, -1.0)
 
 
 def log_weights(
@@ -65,8 +65,8 @@ def log_weights(
     """
     if num_scores <= 0 or (not isinstance(sigma, jax.core.Tracer) and sigma <= 0):
         raise ValueError(f"num_scores and sigma must be positive; got {num_scores} and {sigma}.")
-    learnt = deviation > 0
-    relative = jnp.where(learnt[:, None], deformation / jnp.where(learnt, deviation, 1.0)[:, None], 0.0)
+    learned = deviation > 0
+    relative = jnp.where(learned[:, None], deformation / jnp.where(learned, deviation, 1.0)[:, None], 0.0)
     return -0.5 * ((num_scores - score_sum) / sigma) ** 2 - 0.5 * jnp.sum(relative**2, axis=0)
 
 

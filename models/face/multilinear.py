@@ -158,9 +158,9 @@ def completed(
     if observed.shape != shapes.shape[:2]:
         raise ValueError(f"observed must be {shapes.shape[:2]}, a face for each person and expression.")
     T = shape_tensor(jnp.where(observed[:, :, None, None], shapes, jnp.nan), pairs)
-    seen = jnp.broadcast_to(jnp.tile(observed, (2, 1)), T.shape)
-    mean = jnp.sum(jnp.where(seen, T, 0), axis=(2, 3), keepdims=True) / jnp.maximum(jnp.sum(observed) * 2, 1)
-    return complete(T - mean, seen, ranks).filled + mean
+    visible = jnp.broadcast_to(jnp.tile(observed, (2, 1)), T.shape)
+    mean = jnp.sum(jnp.where(visible, T, 0), axis=(2, 3), keepdims=True) / jnp.maximum(jnp.sum(observed) * 2, 1)
+    return complete(T - mean, visible, ranks).filled + mean
 
 
 def of_tensor(T: Float[Array, "K 3 n A"], ranks: dict[int, int]) -> MultilinearFace:

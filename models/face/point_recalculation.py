@@ -56,18 +56,18 @@ def point_equations(
     """
     rho, epsilon = jnp.asarray(rho, points.dtype), jnp.asarray(epsilon, points.dtype)
     size = first.shape[-1]
-    seen = inside(image.shape, points, size + 2)[:, None, None]
-    window = jnp.where(seen, cut(image, jnp.where(seen[..., 0], points, 0.0), size + 2), 0.0)
+    observed = inside(image.shape, points, size + 2)[:, None, None]
+    window = jnp.where(observed, cut(image, jnp.where(observed[..., 0], points, 0.0), size + 2), 0.0)
     across = (window[:, 1:-1, 2:] - window[:, 1:-1, :-2]) / 2
     down = (window[:, 2:, 1:-1] - window[:, :-2, 1:-1]) / 2
     gradient = jnp.stack([across, down], axis=-1).reshape(len(points), size**2, 2)
     here = window[:, 1:-1, 1:-1]
-    flat = lambda difference: jnp.where(seen, difference, 0.0).reshape(len(points), size**2)
+    flat = lambda difference: jnp.where(observed, difference, 0.0).reshape(len(points), size**2)
     since_first, since_previous = flat(here - first), flat(here - previous)
     product = lambda spec, *a: jnp.einsum(spec, *a, precision="highest")
     matrix = 2 * (rho + 1) * product("kpi,kpj->kij", gradient, gradient) + 2 * epsilon * jnp.eye(2, dtype=points.dtype)
     slope = product("kpi,kp->ki", gradient, rho * since_previous + since_first)
-    residual = jnp.where(seen[:, 0, 0], jnp.sqrt(jnp.mean(since_first**2, axis=-1)), jnp.nan)
+    residual = jnp.where(observed[:, 0, 0], jnp.sqrt(jnp.mean(since_first**2, axis=-1)), jnp.nan)
     return PointEquations(matrix, 2 * slope + 2 * epsilon * (points - estimated), residual)
 
 

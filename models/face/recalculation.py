@@ -77,22 +77,22 @@ def normal_equations(
     rho, epsilon = jnp.asarray(rho, shape.dtype), jnp.asarray(epsilon, shape.dtype)
     size = first.shape[-1]
     uv, _ = project_shape(rig, shape, pose)
-    seen = inside(rig.shape, uv, size + 2)[..., None, None]
-    by_shape = jnp.where(seen, jacobian(rig, shape, pose)[0], 0.0)
-    window = jnp.where(seen, patches(images, shape, pose, rig, size=size + 2), 0.0)
+    observed = inside(rig.shape, uv, size + 2)[..., None, None]
+    by_shape = jnp.where(observed, jacobian(rig, shape, pose)[0], 0.0)
+    window = jnp.where(observed, patches(images, shape, pose, rig, size=size + 2), 0.0)
     gradient = jnp.stack(
         [window[..., 1:-1, 2:] - window[..., 1:-1, :-2], window[..., 2:, 1:-1] - window[..., :-2, 1:-1]], axis=2
     )
     gradient = gradient.reshape(*uv.shape, size**2) / 2
     here = window[..., 1:-1, 1:-1]
-    since_first = jnp.where(seen, here - first, 0.0).reshape(*seen.shape[:2], size**2)
-    since_previous = jnp.where(seen, here - previous, 0.0).reshape(*seen.shape[:2], size**2)
+    since_first = jnp.where(observed, here - first, 0.0).reshape(*observed.shape[:2], size**2)
+    since_previous = jnp.where(observed, here - previous, 0.0).reshape(*observed.shape[:2], size**2)
     product = lambda spec, *a: jnp.einsum(spec, *a, precision="highest")
     structure = product("ckip,ckjp->ckij", gradient, gradient)
     slope = product("ckip,ckp->cki", gradient, rho * since_previous + since_first)
     matrix = 2 * (rho + 1) * product("ckia,ckij,ckjb->kab", by_shape, structure, by_shape)
     vector = 2 * product("ckia,cki->ka", by_shape, slope) + 2 * epsilon * (shape - estimated)
-    count = size**2 * jnp.sum(seen[..., 0, 0], axis=0)
+    count = size**2 * jnp.sum(observed[..., 0, 0], axis=0)
     mean_square = jnp.sum(since_first**2, axis=(0, 2)) / jnp.maximum(count, 1)
     residual = jnp.where(count > 0, linalg.safe_sqrt(mean_square), jnp.nan)
     return NormalEquations(matrix + 2 * epsilon * jnp.eye(3, dtype=matrix.dtype), vector, residual)

@@ -82,13 +82,13 @@ def refine(
         start: Where the iteration begins.
         is_own: Landmarks whose covariances are those of alignments alone; all if none. Only these give the scale.
     """
-    seen = found.seen & (found.score > LEAST_SCORE)
+    observed = found.observed & (found.score > LEAST_SCORE)
     precision = jnp.linalg.inv(prior.covariance)
-    per_landmark = 2.0 * jnp.sum(seen, axis=0)
+    per_landmark = 2.0 * jnp.sum(observed, axis=0)
 
     def pieces(x):
         M = shape(model, x[6:])
-        residual, H, S, by_shape = _rows(x, M, found, slopes, seen, model, model_variance, rig)
+        residual, H, S, by_shape = _rows(x, M, found, slopes, observed, model, model_variance, rig)
         distance = jnp.einsum("ki,ki->k", residual, _solve(S, residual))
         trust = (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + distance)
         return residual, H, S, by_shape, distance, trust
@@ -104,9 +104,11 @@ def refine(
     SH = _solve(S, H)
     information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
     covariance = _covariance(precision, information, trust, per_landmark, SH, H)
-    log_evidence = jnp.sum(_log_t(distance, per_landmark, S, seen)) + _laplace(x - prior.mean, precision, information)
-    excess, alignment_variance = _excess(found, seen, residual, S, by_shape, x.size)
-    own = jnp.where((seen if is_own is None else seen & is_own)[..., None, None], found.covariance, 0.0)
+    log_evidence = jnp.sum(_log_t(distance, per_landmark, S, observed)) + _laplace(
+        x - prior.mean, precision, information
+    )
+    excess, alignment_variance = _excess(found, observed, residual, S, by_shape, x.size)
+    own = jnp.where((observed if is_own is None else observed & is_own)[..., None, None], found.covariance, 0.0)
     residual_scale, share = _misfit(own, residual, S, SH, trust, information)
     return Refined(
         belief=Gaussian(x, covariance),
@@ -154,15 +156,15 @@ def _misfit(own, residual, S, SH, trust, information):
     return square / jnp.maximum(left, 0.1 * expected + 1e-6), expected / jnp.maximum(rows, 1.0)
 
 
-def _excess(found, seen, residual, S, by_shape, size):
+def _excess(found, observed, residual, S, by_shape, size):
     """What residuals hold beyond the alignments' own errors, and these, spread over the axes of the model frame."""
-    count = 2.0 * jnp.sum(seen)
+    count = 2.0 * jnp.sum(observed)
     fitted = jnp.maximum(count / jnp.maximum(count - size, 2.0), 1.0)
     squares = jnp.minimum(jnp.sum(residual**2, axis=1), MOST_DISTANCE * jnp.trace(S, axis1=1, axis2=2))
-    own = jnp.sum(jnp.where(seen[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
-    reach = jnp.maximum(jnp.sum(jnp.where(seen[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3)), 1e-6)
-    is_seen = jnp.any(seen, axis=0)
-    return jnp.where(is_seen, (fitted * squares - own) / reach, 0.0), jnp.where(is_seen, own / reach, jnp.inf)
+    own = jnp.sum(jnp.where(observed[..., None], jnp.diagonal(found.covariance, axis1=2, axis2=3), 0.0), axis=(0, 2))
+    reach = jnp.maximum(jnp.sum(jnp.where(observed[..., None, None], by_shape**2, 0.0), axis=(0, 2, 3)), 1e-6)
+    is_observed = jnp.any(observed, axis=0)
+    return jnp.where(is_observed, (fitted * squares - own) / reach, 0.0), jnp.where(is_observed, own / reach, jnp.inf)
 
 
 def running_variance(
@@ -202,23 +204,23 @@ def displaced(
 
     The posterior mean of each landmark's place in the model frame, millimetres, for a pose and mode coefficients `x`.
     """
-    seen = found.seen & (found.score > LEAST_SCORE)
+    observed = found.observed & (found.score > LEAST_SCORE)
     M = shape(model, x[6:])
-    residual, _, S, by_shape = _rows(x, M, found, slopes, seen, model, model_variance, rig)
+    residual, _, S, by_shape = _rows(x, M, found, slopes, observed, model, model_variance, rig)
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(len(M), -1, 3)
     return M + jnp.einsum("kxy,kiy,ki->kx", model_variance, stacked, _solve(S, residual))
 
 
-def _rows(x, M, found, slopes, seen, model, model_variance, rig):
+def _rows(x, M, found, slopes, observed, model, model_variance, rig):
     """Residuals (K, 2C), their derivatives by the state, their covariances, and the derivative by the shape."""
-    C, K = seen.shape
+    C, K = observed.shape
     uv, _ = project_shape(rig, M, x[:6])
     by_shape, by_pose = jacobian(rig, M, x[:6])
     modes = model.basis.reshape(K, 3, -1)
     by_state = jnp.concatenate([by_pose, jnp.einsum("ckix,kxb->ckib", by_shape, modes)], axis=-1)
-    mask = seen[..., None, None]
+    mask = observed[..., None, None]
     by_state, by_shape = (jnp.where(mask, J, 0.0) for J in (by_state, by_shape))
-    residual = jnp.where(seen[..., None], found.uv - uv, 0.0)
+    residual = jnp.where(observed[..., None], found.uv - uv, 0.0)
     noise = jnp.where(mask, found.covariance + PIXEL_FLOOR**2 * jnp.eye(2), UNSEEN**2 * jnp.eye(2))
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(K, 2 * C, 3)
     S = jnp.einsum("kix,kxy,kjy->kij", stacked, model_variance, stacked)
@@ -239,10 +241,10 @@ def _solve(S, b):
     return jnp.linalg.solve(S, b if b.ndim == 3 else b[..., None]).reshape(b.shape)
 
 
-def _log_t(distance, size, S, seen):
+def _log_t(distance, size, S, observed):
     """Log density of Student's t over the observed rows; the others have a constant share of the determinant."""
     nu = DEGREES_OF_FREEDOM
-    unseen_rows = 2.0 * jnp.sum(~seen, axis=0)
+    unseen_rows = 2.0 * jnp.sum(~observed, axis=0)
     log_det = jnp.linalg.slogdet(S)[1] - unseen_rows * 2 * math.log(UNSEEN)
     return (
         gammaln((nu + size) / 2)

@@ -66,8 +66,8 @@ class CameraRig:
 
     def project(self, points: Float[Array, "K 3"]) -> tuple[Float[Array, "C K 2"], Bool[Array, "C K"]]:
         """Pixels of world points in every camera, and whether they lie in front of it; NaN where they do not."""
-        seen, in_front = _in_cameras(self, points)
-        uv = seen[..., :2] / seen[..., 2:] * self.focal[:, None] + self.center[:, None]
+        observed, in_front = _in_cameras(self, points)
+        uv = observed[..., :2] / observed[..., 2:] * self.focal[:, None] + self.center[:, None]
         return jnp.where(in_front[..., None], uv, jnp.nan), in_front
 
 
@@ -99,8 +99,8 @@ def jacobian(
     """
     R = head.rotation(pose[3:])
     turned = head.turn(shape, R)
-    seen, in_front = _in_cameras(rig, turned + pose[:3])
-    x, y, inverse = seen[..., 0], seen[..., 1], 1 / seen[..., 2]
+    observed, in_front = _in_cameras(rig, turned + pose[:3])
+    x, y, inverse = observed[..., 0], observed[..., 1], 1 / observed[..., 2]
     zero = jnp.zeros_like(x)
     u = jnp.stack([inverse, zero, -x * inverse**2], axis=-1) * rig.focal[:, None, :1]
     v = jnp.stack([zero, inverse, -y * inverse**2], axis=-1) * rig.focal[:, None, 1:]
@@ -135,9 +135,9 @@ def _in_cameras(rig, points):
     """Points in the camera frames (C, K, 3), before the lens where they are not in front, and whether they are."""
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     R, t = rig.rotation[..., None], rig.translation[..., None]
-    seen = R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z + t
-    in_front = seen[:, 2] > NEAREST
-    return jnp.moveaxis(jnp.where(in_front[:, None], seen, 1.0), 1, 2), in_front
+    observed = R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z + t
+    in_front = observed[:, 2] > NEAREST
+    return jnp.moveaxis(jnp.where(in_front[:, None], observed, 1.0), 1, 2), in_front
 
 
 def _times(A, B):

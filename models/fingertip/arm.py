@@ -26,7 +26,7 @@ class ArmAxis(NamedTuple):
 
     direction: Float[np.ndarray, "2"]
     """Unit vector, towards the hand."""
-    is_seen: bool
+    is_observed: bool
     """Whether the forearm reaches the border; else the direction is that in which the whole hand is long."""
 
 
@@ -75,8 +75,8 @@ def find_arm(silhouette: UInt8[np.ndarray, "rows cols"], palm: Palm, contact: In
     Without contact with the border it is the principal axis of all pixels, from their centroid towards the palm.
     """
     if len(contact) == 0:
-        return ArmAxis(_principal_axis(silhouette, palm), is_seen=False)
-    return ArmAxis(_unit(palm.center - contact.mean(axis=0)), is_seen=True)
+        return ArmAxis(_principal_axis(silhouette, palm), is_observed=False)
+    return ArmAxis(_unit(palm.center - contact.mean(axis=0)), is_observed=True)
 
 
 def _principal_axis(silhouette: np.ndarray, palm: Palm) -> np.ndarray:

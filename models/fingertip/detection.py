@@ -185,7 +185,7 @@ def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservatio
         "palm": silhouette.placed(palm.center).astype(np.float32),
         "palm_radius": np.asarray(scale * palm.radius, np.float32),
         "axis": arm.direction.astype(np.float32),
-        "has_axis": np.asarray(arm.is_seen),
+        "has_axis": np.asarray(arm.is_observed),
         "is_hand": np.asarray(True),
         "coverage": cv2.resize(255 * inside, COVERAGE_SHAPE[::-1], interpolation=cv2.INTER_AREA) / np.float32(255),
         "cell": (silhouette.step * inside.shape[::-1] / COVERAGE_SHAPE[::-1]).astype(np.float32),

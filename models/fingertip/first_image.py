@@ -59,12 +59,12 @@ def fit_hand_to_mask(mask: np.ndarray, *, threshold: float = 128.0) -> HandParam
     Raises:
         ValueError: a mask that is not (rows, cols) of bool, or that shows no open hand.
     """
-    trial, seen = _looked_at(mask, threshold, MOST_AREA)
+    trial, observed = _looked_at(mask, threshold, MOST_AREA)
     radius = trial.tip_radius
-    count = int(np.sum(seen.is_tip & seen.has_base))
+    count = int(np.sum(observed.is_tip & observed.has_base))
     if count < MAX_TIPS:
         raise ValueError(f"mask must show an open hand with {MAX_TIPS} fingers spread; found {count} of them.")
-    angles = base_angles(seen)
+    angles = base_angles(observed)
     order = np.argsort(angles)
     gaps = np.diff(angles[order])
     # The thumb stands farther from its neighbour than the little finger does.
@@ -98,8 +98,8 @@ def fit_partial_hand(mask: np.ndarray) -> tuple[HandParameters, int]:
         ValueError: a mask that is not (rows, cols) of bool, that shows no finger, or a hand that is not in contact
             with the border.
     """
-    trial, seen = _looked_at(mask, 128.0, MOST_OF_NEAR)
-    return trial, int(np.sum(seen.is_tip & seen.has_base))
+    trial, observed = _looked_at(mask, 128.0, MOST_OF_NEAR)
+    return trial, int(np.sum(observed.is_tip & observed.has_base))
 
 
 def _looked_at(mask: np.ndarray, threshold: float, most: float) -> tuple[HandParameters, HandObservation]:
@@ -110,10 +110,10 @@ def _looked_at(mask: np.ndarray, threshold: float, most: float) -> tuple[HandPar
         raise ValueError(f"mask must hold a hand on {LEAST_AREA:.0%} to {most:.0%} of the image; got {share:.1%}.")
     radius = _tip_radius(hand)
     trial = HandParameters(threshold, radius, max(round(WINDOW * radius), math.ceil(radius) + 1))
-    seen = detect_hand(mask, trial)
-    if not seen.has_axis:
+    observed = detect_hand(mask, trial)
+    if not observed.has_axis:
         raise ValueError("mask must show the forearm as far as the border of the image; the hand does not touch it.")
-    return trial, seen
+    return trial, observed
 
 
 def base_angles(hand: HandObservation) -> Float[np.ndarray, " tips"]:

@@ -123,13 +123,13 @@ def skin_probability(image: np.ndarray, model: SkinModel) -> UInt8[np.ndarray, "
 
 def _refined(image: np.ndarray, chroma: np.ndarray, hand: Bool[np.ndarray, "rows cols"], levels: int) -> SkinModel:
     """From a first guess of where the hand is, and then from what the model finds."""
-    model = _learnt(chroma, hand, levels)
+    model = _learned(chroma, hand, levels)
     for _ in range(REFINEMENTS):
-        model = _learnt(chroma, _hand_component(skin_mask(image, model)), levels)
+        model = _learned(chroma, _hand_component(skin_mask(image, model)), levels)
     return model
 
 
-def _learnt(chroma: np.ndarray, hand: Bool[np.ndarray, "rows cols"], levels: int) -> SkinModel:
+def _learned(chroma: np.ndarray, hand: Bool[np.ndarray, "rows cols"], levels: int) -> SkinModel:
     share, most = float(hand.mean()), MOST_AREA if levels == 1 else MOST_OF_CLUSTER
     if not LEAST_AREA <= share <= most:
         raise ValueError(

@@ -67,8 +67,8 @@ def learn_codes(
         hmm.Codes(jnp.zeros((num_states, MOST_TIPS + 1)), float(pseudo_count)),
     )
     symbols = trained(hmm.Independent(parts), observations, lengths, by_name(labels), max_iterations=max_iterations)
-    learnt: Any = symbols.models.emission
-    directions, tips = learnt.parts
+    learned: Any = symbols.models.emission
+    directions, tips = learned.parts
     emission = hmm.Independent((jax.vmap(blurred, (0, None))(directions, spread), tips))
     return Symbols(
         hmm.HiddenMarkovModel(symbols.models.log_initial, symbols.models.log_transition, emission),
@@ -93,10 +93,10 @@ def learn_paths(
         ValueError: If there is no stroke, `labels` has another length, or a stroke has no frame or one that is not
             finite.
     """
-    seen = stacked([([points], voted(counts)) for points, counts in paths])
+    observed = stacked([([points], voted(counts)) for points, counts in paths])
     codes = codes_of([np.asarray(points, float) for points, _ in paths])
     coded = stacked([([chained(of)], voted(counts)) for of, (_, counts) in zip(codes, paths, strict=True)])
-    both = jnp.concatenate([seen, coded])
+    both = jnp.concatenate([observed, coded])
     shown = jnp.concatenate([turned(both, np.radians(degrees)) for degrees in TURNS_DEG])
     return learn(
         shown,

@@ -32,12 +32,12 @@ def threshold_log_likelihood(
 
     def step(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
         shares, total = carry
-        seen, frame = inputs
+        observed, frame = inputs
         left = leaves * shares
         predicted = jnp.where(frame == 0, shares, stays * shares + (jnp.sum(left, axis=0) - left))
-        peak = jnp.max(seen, axis=0)
+        peak = jnp.max(observed, axis=0)
         usable = peak > -jnp.inf
-        after = predicted * jnp.exp(seen - jnp.where(usable, peak, 0.0))
+        after = predicted * jnp.exp(observed - jnp.where(usable, peak, 0.0))
         mass = jnp.sum(after, axis=0)
         usable = usable & (mass > 0)
         growth = jnp.where(usable, peak + jnp.log(jnp.where(usable, mass, 1.0)), -jnp.inf)

@@ -179,11 +179,11 @@ def recognise(
     """
     leaf = jax.tree.leaves(observations)[0]
     lengths = jnp.full(leaf.shape[-1], leaf.shape[0]) if lengths is None else lengths
-    seen = _seen(symbols, observations)
-    bar = jnp.full(leaf.shape[-1], -jnp.inf, seen.dtype)
+    observed = _observed(symbols, observations)
+    bar = jnp.full(leaf.shape[-1], -jnp.inf, observed.dtype)
     if threshold is not None:
         bar = hmm.log_evidence(threshold, jax.vmap(threshold.log_likelihoods, -1, -1)(observations), lengths)
-    return _decided(symbols, seen, bar, lengths, margin, distance, sharpness)
+    return _decided(symbols, observed, bar, lengths, margin, distance, sharpness)
 
 
 def recognise_all(
@@ -224,19 +224,19 @@ def recognise_all(
 
 @jax.jit
 def _judged(symbols, observations, lengths, margin, distance):
-    seen = _seen(symbols, observations)
-    bar = threshold_log_likelihood(symbols.models, seen, lengths)
-    return _decided(symbols, seen, bar, lengths, margin, distance, None)
+    observed = _observed(symbols, observations)
+    bar = threshold_log_likelihood(symbols.models, observed, lengths)
+    return _decided(symbols, observed, bar, lengths, margin, distance, None)
 
 
-def _seen(symbols: Symbols, observations: PyTree) -> Float[Array, "m p q n"]:
+def _observed(symbols: Symbols, observations: PyTree) -> Float[Array, "m p q n"]:
     """Log-likelihoods of the states of every model."""
     return jax.vmap(lambda model: jax.vmap(model.log_likelihoods, -1, -1)(observations))(symbols.models)
 
 
-def _decided(symbols, seen, bar, lengths, margin, distance, sharpness) -> Recognition:
+def _decided(symbols, observed, bar, lengths, margin, distance, sharpness) -> Recognition:
     num_points = jnp.maximum(lengths, 1)
-    by_model = jax.vmap(hmm.log_evidence, (0, 0, None))(symbols.models, seen, lengths)
+    by_model = jax.vmap(hmm.log_evidence, (0, 0, None))(symbols.models, observed, lengths)
     own = symbols.owner == jnp.arange(len(symbols.names))[:, None]
     totals = jnp.max(jnp.where(own[..., None], by_model, -jnp.inf), axis=1)
     best = jnp.argmax(totals, axis=0).astype(jnp.int32)

@@ -150,9 +150,9 @@ def normal_equations(
     rendered = capsule_depth(camera, capsules).reshape(-1)
     covered = jnp.isfinite(rendered)
     model = target.rays * jnp.where(covered, rendered, 1.0)[:, None]
-    seen, shown = _contact(observed, capsules, motion), _contact(model, capsules, motion)
+    visible, shown = _contact(observed, capsules, motion), _contact(model, capsules, motion)
     terms = (
-        _surface_terms(seen, hand, width),
+        _surface_terms(visible, hand, width),
         _outline_terms(shown, target, model[:, 2], covered & jnp.isposinf(target.depth), width, config.outline_weight),
         _front_terms(shown, model - observed, covered & hand, width, config.front_weight),
     )
@@ -200,9 +200,9 @@ def _contact(points: Float[Array, "m 3"], capsules: Capsules, motion: _Motion) -
     return _Contact(length - capsules.radius[winner], away / length[:, None], jacobian)
 
 
-def _surface_terms(seen: _Contact, hand: Bool[Array, " m"], width: Array) -> tuple[Array, Array, Array]:
-    jacobian = -jnp.einsum("mi,mij->mj", seen.normal, seen.jacobian)
-    return seen.distance, jacobian, jnp.where(hand, _robust(seen.distance, width), 0.0)
+def _surface_terms(visible: _Contact, hand: Bool[Array, " m"], width: Array) -> tuple[Array, Array, Array]:
+    jacobian = -jnp.einsum("mi,mij->mj", visible.normal, visible.jacobian)
+    return visible.distance, jacobian, jnp.where(hand, _robust(visible.distance, width), 0.0)
 
 
 def _outline_terms(

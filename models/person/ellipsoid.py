@@ -75,13 +75,13 @@ def outline(P: Float[Array, "3 4"], body: Ellipsoid) -> Outline:
     depth = homogeneous[2]
     reach = jnp.sum((P[2, :3] * body.semi_axes) ** 2)
     code = _code(P, body, depth, reach)
-    seen = code == VISIBLE
-    at = homogeneous[:2] / jnp.where(seen, depth, 1.0)
+    visible = code == VISIBLE
+    at = homogeneous[:2] / jnp.where(visible, depth, 1.0)
     M = (P[:2, :3] - at[:, None] * P[2, :3]) * body.semi_axes
-    beyond = jnp.where(seen, depth**2 - reach, 1.0)
+    beyond = jnp.where(visible, depth**2 - reach, 1.0)
     shift = -(M @ (P[2, :3] * body.semi_axes)) / beyond
     shape = (M @ M.T) / beyond + jnp.outer(shift, shift)
-    return Outline(at + shift, jnp.where(seen, shape, jnp.eye(2, dtype=shape.dtype)), depth, code)
+    return Outline(at + shift, jnp.where(visible, shape, jnp.eye(2, dtype=shape.dtype)), depth, code)
 
 
 def _code(P, body, depth, reach):
@@ -98,30 +98,30 @@ def _position(P):
 
 
 @jax.jit  # traced once for each shape, though called at many places of a program
-def outline_radius(seen: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+def outline_radius(contour: Outline, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
     """Squared distance of pixels from the centre in units of the outline: 1 on it; 0 inside a body, inf without one."""
-    (a, b), (_, c) = seen.shape
-    d = uv - seen.center
+    (a, b), (_, c) = contour.shape
+    d = uv - contour.center
     x, y = d[..., 0], d[..., 1]
     squared = (c * x**2 - 2 * b * x * y + a * y**2) / (a * c - b**2)
-    return jnp.where(seen.code == VISIBLE, squared, jnp.where(seen.code == INSIDE, 0.0, jnp.inf))
+    return jnp.where(contour.code == VISIBLE, squared, jnp.where(contour.code == INSIDE, 0.0, jnp.inf))
 
 
-def grown(seen: Outline, pixels: Float[ArrayLike, ""]) -> Outline:
+def grown(contour: Outline, pixels: Float[ArrayLike, ""]) -> Outline:
     """An outline that reaches farther by some pixels to the left and right, above and below."""
-    reach = jnp.sqrt(jnp.diagonal(seen.shape))
+    reach = jnp.sqrt(jnp.diagonal(contour.shape))
     scale = 1 + jnp.asarray(pixels) / reach
-    return seen._replace(shape=seen.shape * jnp.outer(scale, scale))
+    return contour._replace(shape=contour.shape * jnp.outer(scale, scale))
 
 
-def ellipse_of(seen: Outline) -> Ellipse:
+def ellipse_of(contour: Outline) -> Ellipse:
     """Centre, semi-axes, angle and bounding box of an outline."""
-    (a, b), (_, c) = seen.shape
+    (a, b), (_, c) = contour.shape
     mean, half = (a + c) / 2, jnp.hypot((a - c) / 2, b)
     semi_axes = jnp.sqrt(jnp.stack([mean + half, mean - half]))
     reach = jnp.sqrt(jnp.stack([a, c]))
-    box = jnp.concatenate([seen.center - reach, seen.center + reach])
-    return Ellipse(seen.center, semi_axes, jnp.arctan2(2 * b, a - c) / 2, box)
+    box = jnp.concatenate([contour.center - reach, contour.center + reach])
+    return Ellipse(contour.center, semi_axes, jnp.arctan2(2 * b, a - c) / 2, box)
 
 
 def conic_to_ellipse(dual_conic: Float[Array, "3 3"]) -> Ellipse:
@@ -171,14 +171,14 @@ def pixel_grid(shape: tuple[int, int]) -> Float[Array, "rows cols 2"]:
     return jnp.stack([u, v], axis=-1)
 
 
-def ellipse_mask(seen: Outline, shape: tuple[int, int]) -> Bool[Array, "rows cols"]:
+def ellipse_mask(contour: Outline, shape: tuple[int, int]) -> Bool[Array, "rows cols"]:
     """Pixels whose centres lie inside an outline."""
-    return outline_radius(seen, pixel_grid(shape)) <= 1
+    return outline_radius(contour, pixel_grid(shape)) <= 1
 
 
-def soft_ellipse_mask(seen: Outline, shape: tuple[int, int], sharpness: float = 8.0) -> Float[Array, "rows cols"]:
+def soft_ellipse_mask(contour: Outline, shape: tuple[int, int], sharpness: float = 8.0) -> Float[Array, "rows cols"]:
     """`sigmoid(sharpness (1 - radius))`, differentiable in everything: 1/2 on the outline."""
-    squared = outline_radius(seen, pixel_grid(shape))
+    squared = outline_radius(contour, pixel_grid(shape))
     radius = jnp.sqrt(jnp.where(squared > 0, squared, 1.0)) * (squared > 0)
     return jax.nn.sigmoid(sharpness * (1 - radius))
 

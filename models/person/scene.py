@@ -58,8 +58,8 @@ def mesh_depth(camera: FloorCamera, vertices: np.ndarray, triangles: np.ndarray)
     pinhole = Pinhole.from_intrinsics(float(max(rows, cols)), ((cols - 1) / 2, (rows - 1) / 2), camera.shape)
     # Any projection matrix is this pinhole after a linear map of space, which leaves triangles and depths as they are.
     P = np.linalg.solve(np.asarray(pinhole.matrix(), float), np.asarray(camera.P, float))
-    seen = vertices @ P[:, :3].T + P[:, 3]
-    return render_mesh(pinhole, Mesh(jnp.asarray(seen, jnp.float32), jnp.asarray(triangles, jnp.int32)))
+    observed = vertices @ P[:, :3].T + P[:, 3]
+    return render_mesh(pinhole, Mesh(jnp.asarray(observed, jnp.float32), jnp.asarray(triangles, jnp.int32)))
 
 
 def upright_depth(camera: FloorCamera, xy: Float[Array, " 2"]) -> Float[Array, "rows cols"]:

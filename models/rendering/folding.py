@@ -37,8 +37,8 @@ def nearest_inverse(parts: Parts, plan: Plan | None, surface: Surface, shape: Wi
     """Inverse depth of the nearest part at each pixel, 0 for none; not for differentiation."""
 
     def turn(part, window, start, x, y, nearest):
-        seen, before = surface.inverse_depth(parts.coefficients[part], x, y), cut(nearest, start, window)
-        return put(nearest, jnp.where(seen > before, seen, before), start)
+        observed, before = surface.inverse_depth(parts.coefficients[part], x, y), cut(nearest, start, window)
+        return put(nearest, jnp.where(observed > before, observed, before), start)
 
     return over_parts(parts, plan, shape, turn, jnp.zeros(shape, parts.coefficients.dtype))
 
@@ -56,8 +56,8 @@ def winning_pieces(
     def turn(part, window, start, x, y, winner):
         limit, winning = cut(least, start, window), cut(winner, start, window)
         pieces = surface.pieces(parts.coefficients[part], x, y)
-        for index, seen in enumerate(pieces):
-            wins = (seen > 0) & (seen >= limit)
+        for index, observed in enumerate(pieces):
+            wins = (observed > 0) & (observed >= limit)
             winning = jnp.where(wins, (part * len(pieces) + index).astype(jnp.int32), winning)
         return put(winner, winning, start)
 
@@ -87,12 +87,12 @@ def pull_back(
     directions = jnp.eye(rows.shape[2], dtype=rows.dtype)
 
     def turn(part, window, start, x, y, gradient):
-        seen, weight = cut(winner, start, window), cut(cotangent, start, window)
+        observed, weight = cut(winner, start, window), cut(cotangent, start, window)
 
         def of_piece(piece):
             index, row = piece
             slopes = [jax.jvp(lambda r: surface.smooth(r, x, y), (row,), (along,))[1] for along in directions]
-            mine = jnp.where(seen == part * rows.shape[1] + index, weight, 0.0)
+            mine = jnp.where(observed == part * rows.shape[1] + index, weight, 0.0)
             slopes = jnp.stack([jnp.broadcast_to(slope, window).reshape(-1) for slope in slopes])
             return jnp.dot(slopes, mine.reshape(-1), precision=jax.lax.Precision.HIGHEST)
 

@@ -66,8 +66,8 @@ def _box(camera, center, square, cross_z):
         bounds.append(slopes * camera.focal[axis] + camera.center[axis])
     low, high = (jnp.stack([bounds[0][side], bounds[1][side]], axis=-1) for side in (0, 1))
     outside = jnp.where(behind, jnp.inf, -jnp.inf)[..., None]
-    seen = in_front[..., None]
-    return jnp.concatenate([jnp.where(seen, low, outside), jnp.where(seen, high, -outside)], axis=-1)
+    observed = in_front[..., None]
+    return jnp.concatenate([jnp.where(observed, low, outside), jnp.where(observed, high, -outside)], axis=-1)
 
 
 def _tangent_slopes(across, depth, square_across, square_depth, mixed, in_front):

@@ -48,8 +48,10 @@ def script(seed: int) -> Script:
         label = f"{shape} {count}"
         column = drawings.labels.index(label)
         stroke = drawings.tips[: drawings.lengths[column], 0, :, column]
-        seen = drawings.present[: drawings.lengths[column], 0, column]
-        stroke = np.stack([np.interp(np.arange(len(stroke)), np.flatnonzero(seen), axis[seen]) for axis in stroke.T], 1)
+        observed = drawings.present[: drawings.lengths[column], 0, column]
+        stroke = np.stack(
+            [np.interp(np.arange(len(stroke)), np.flatnonzero(observed), axis[observed]) for axis in stroke.T], 1
+        )
         path = MIDDLE + _PER_PIXEL * (stroke - 0.5 * (stroke.max(axis=0) + stroke.min(axis=0)))
         approach = np.linspace(at, path[0], FIST_FRAMES)
         pause = np.tile(path[0], (STILL_FRAMES, 1)), np.tile(path[-1], (STILL_FRAMES, 1))

@@ -78,11 +78,11 @@ def points(
     tips = palm[:, None] + jnp.asarray(TIP_DISTANCES, float)[:, None] * _direction(angles)
     bases = palm[:, None] + jnp.asarray(BASE_DISTANCES, float)[:, None] * _direction(angles)
 
-    seen = ~_missed(keys[1], num_frames, flaws) & fingers
+    visible = ~_missed(keys[1], num_frames, flaws) & fingers
     there, wrong = _false_tip(keys[2], palm, lean, flaws)
     measured = tips + flaws.noise_sd * jax.random.normal(keys[3], tips.shape)
     everything = jnp.concatenate([measured, wrong[:, None]], axis=1)
-    is_tip = jnp.concatenate([seen, there[:, None]], axis=1)
+    is_tip = jnp.concatenate([visible, there[:, None]], axis=1)
     based = jnp.concatenate([bases, (palm + 0.4 * (wrong - palm))[:, None]], axis=1)
     order = jnp.argsort(jax.random.uniform(keys[4], is_tip.shape), axis=1)
     everything, based = (jnp.take_along_axis(array, order[..., None], axis=1) for array in (everything, based))

@@ -93,15 +93,15 @@ def room_image(
     depths = jax.lax.map(lambda one: render_ellipsoids(camera.pinhole, body(one), camera.T_camera_world), people)
     depths = jnp.where(here[:, None, None], depths, jnp.inf)
     who, nearest = jnp.argmin(depths, axis=0), jnp.min(depths, axis=0)
-    seen = nearest < camera.furniture
+    observed = nearest < camera.furniture
     rays, origin = _world_rays(camera)
-    height = origin[2] + jnp.where(seen, nearest, 1.0) * rays[..., 2]
+    height = origin[2] + jnp.where(observed, nearest, 1.0) * rays[..., 2]
     share = height / people.height[who]
     cloth = jnp.where((share > LEGS)[..., None], clothes[who, 0], clothes[who, 1])
     color = jnp.where((share > NECK)[..., None], jnp.array(SKIN), cloth)
     lit = camera.empty * _light(camera, rays, origin, people, here)[..., None]
-    image = jnp.where(seen[..., None], color, lit) + NOISE_STD * jax.random.normal(key, (*camera.shape, 3))
-    return jnp.clip(jnp.round(image), 0, 255).astype(jnp.uint8), jnp.where(seen, who, -1)
+    image = jnp.where(observed[..., None], color, lit) + NOISE_STD * jax.random.normal(key, (*camera.shape, 3))
+    return jnp.clip(jnp.round(image), 0, 255).astype(jnp.uint8), jnp.where(observed, who, -1)
 
 
 def _world_rays(camera: RoomCamera):

@@ -103,8 +103,8 @@ def drawn(seed: int, num_trials: int, *, shapes: Sequence[str] = tuple(SHAPES), 
     lengths = np.array([len(tips) for tips, _ in found])
     tips = np.zeros((lengths.max(), 2, 2, len(found)))
     present = np.zeros((lengths.max(), 2, len(found)), bool)
-    for i, (where, seen) in enumerate(found):
-        tips[: len(where), ..., i], present[: len(where), :, i] = where, seen
+    for i, (where, visible) in enumerate(found):
+        tips[: len(where), ..., i], present[: len(where), :, i] = where, visible
     return Drawings(tips, present, lengths, tuple(labels))
 
 
@@ -119,7 +119,7 @@ def tracked(drawings: Drawings, *, still_px: float = 1.5) -> Tracked:
     missing = [(0, -len(drawings.tips) % _FRAMES)] + [(0, 0)] * 3
     tips = np.pad(drawings.tips, missing).astype(np.float32)
     present = np.pad(drawings.present, missing[:-1])
-    codes, counts, steps = (np.asarray(leaf) for leaf in _seen(jnp.asarray(tips), jnp.asarray(present), still_px))
+    codes, counts, steps = (np.asarray(leaf) for leaf in _observed(jnp.asarray(tips), jnp.asarray(present), still_px))
     places = np.cumsum(steps, axis=0)
     frames = list(enumerate(drawings.lengths))
     return Tracked(
@@ -130,7 +130,7 @@ def tracked(drawings: Drawings, *, still_px: float = 1.5) -> Tracked:
 
 
 @jax.jit
-def _seen(tips, present, still):
+def _observed(tips, present, still):
     codes, counts = jax.vmap(observed, (-1, -1, None), -1)(tips, present, still)
     return codes, counts, jax.vmap(displacements, -1, -1)(tips, present)
 

@@ -31,8 +31,8 @@ def test_without_recordings_only_what_is_drawn_is_measured(two_shapes, monkeypat
         for method in METHODS
     }
     assert metrics["accuracy_one_finger"].value >= 80
-    told = capsys.readouterr().out
-    assert all(folder in told for folder in (gestures.SFINGE, *(r[0] for r in gestures.RECORDINGS.values())))
+    message = capsys.readouterr().out
+    assert all(folder in message for folder in (gestures.SFINGE, *(r[0] for r in gestures.RECORDINGS.values())))
 
 
 def test_a_symbol_is_right_if_shape_and_fingers_are_and_wrong_if_rejected():

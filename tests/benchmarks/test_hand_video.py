@@ -24,19 +24,19 @@ def posed(seed=0):
     tips = hand_video._projected(camera, joints[hand_video.TIPS])
     palm = hand_video._projected(camera, joints[hand_video.PALM]).mean(axis=0)
     order = rng.permutation(5)
-    seen = no_hand()._replace(
+    observed = no_hand()._replace(
         tips=tips[order].astype(np.float32),
         is_tip=np.ones(5, bool),
         palm=palm.astype(np.float32),
         is_hand=np.asarray(True),
     )
-    return joints, camera, seen, order
+    return joints, camera, observed, order
 
 
 def test_the_camera_of_a_frame_is_found_from_one_nearby():
-    joints, camera, seen, order = posed()
+    joints, camera, observed, order = posed()
     before = camera + np.array([0.05, -0.05, 0.05, 0.01, 4.0, -3.0])
-    fit = hand_video._frame_fit(seen, joints, before, 0.17)
+    fit = hand_video._frame_fit(observed, joints, before, 0.17)
     np.testing.assert_array_equal(fit.finger, order)
     assert np.nanmax(fit.distance) < 1.5
     assert np.nanmax(fit.left_out) < 4.0
@@ -44,10 +44,10 @@ def test_the_camera_of_a_frame_is_found_from_one_nearby():
 
 
 def test_a_tip_that_is_far_from_every_key_point_is_nobodys():
-    joints, camera, seen, _ = posed()
-    tips = seen.tips.copy()
+    joints, camera, observed, _ = posed()
+    tips = observed.tips.copy()
     tips[2] = (600, 20)
-    fit = hand_video._frame_fit(seen._replace(tips=tips), joints, camera, 0.17)
+    fit = hand_video._frame_fit(observed._replace(tips=tips), joints, camera, 0.17)
     assert fit.finger[2] == -1
     assert np.isnan(fit.distance[2])
     assert np.sum(fit.finger >= 0) == 4

@@ -148,8 +148,8 @@ def test_deformation_is_judged_in_the_frames_in_which_it_is():
     shapes = MEAN_SHAPE + np.random.default_rng(3).normal(0, 1, (199, K, 3))
     far[39:119, 5], near[39:119, 5] = 4.0, 1.0
     far[119:, 5] = near[119:, 5] = 0.5
-    learnt = fake_run(near, shapes=shapes, contributions=(0.1, 0.2, 0.9, 0.9, 0.9))
-    of = {"rigid": [fake_run(far, shapes=shapes)], "deformable": [learnt]}
+    learned = fake_run(near, shapes=shapes, contributions=(0.1, 0.2, 0.9, 0.9, 0.9))
+    of = {"rigid": [fake_run(far, shapes=shapes)], "deformable": [learned]}
     metrics = {name: metric.value for name, metric in deformation.judged("", of, schedule).items()}
     assert metrics["deforming_rmse_pitch_rigid"] == pytest.approx(4)
     assert metrics["deforming_ratio_to_rigid_rmse_pitch"] == pytest.approx(0.25)

@@ -57,9 +57,9 @@ def test_people_are_handed_over_and_nobody_counts_who_is_not_seen(room):
 
 
 def test_a_narrow_view_is_the_middle_of_the_image():
-    seen = Setup((0,), width=0.4).is_seen((10, 100))
-    assert np.flatnonzero(seen).tolist() == list(range(30, 70))
-    assert Setup((0,)).is_seen((10, 101)).all()
+    observed = Setup((0,), width=0.4).is_observed((10, 100))
+    assert np.flatnonzero(observed).tolist() == list(range(30, 70))
+    assert Setup((0,)).is_observed((10, 101)).all()
 
 
 def test_recordings_are_kept_apart():
@@ -75,8 +75,8 @@ def test_scores_are_of_all_seeds_together(monkeypatch, capsys):
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     rows = [(i, who) for i in range(4) for who in range(3)]
     true = floor_tracks(*np.transpose(rows), [(2.0 * who, 0.1 * i) for i, who in rows])
-    seen = true.identity < 2
-    found = floor_tracks(true.frame[seen], true.identity[seen], true.xy_m[seen] + [0.1, 0.0])
+    observed = true.identity < 2
+    found = floor_tracks(true.frame[observed], true.identity[observed], true.xy_m[observed] + [0.1, 0.0])
     tracks = dict.fromkeys(SETUPS, (true, found))
     monkeypatch.setattr(people_cameras, "room_tracks", lambda seed, frames: tracks)
     monkeypatch.setattr(people_cameras, "demo_room", lambda seed, cameras, frames: seed)

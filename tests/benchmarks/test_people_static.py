@@ -203,8 +203,8 @@ class StandIns(people_static.Rooms):
 
 def aside(runs, metres):
     """Estimates that are so far off, along X."""
-    told = np.full((len(runs.truth), runs.truth.shape[2]), 0.3)
-    return Estimates(runs.truth + np.array([metres, 0.0]), told, told, told)
+    message = np.full((len(runs.truth), runs.truth.shape[2]), 0.3)
+    return Estimates(runs.truth + np.array([metres, 0.0]), message, message, message)
 
 
 def test_every_experiment_judges_its_trackers(monkeypatch):

@@ -53,8 +53,8 @@ def test_detections_lie_where_their_truth_is_seen(data_dir):
     """Median distance of a few pixels: intrinsics, axes and order of the markers fit together."""
     for chosen in motion.SETS.values():
         found = motion.load(data_dir, chosen, chosen.networks[0], 50)
-        seen = np.asarray(found.camera.project(jnp.asarray(found.truth, jnp.float32)))
-        assert np.median(np.linalg.norm(seen - found.pixels, axis=-1)) < 6.0
+        observed = np.asarray(found.camera.project(jnp.asarray(found.truth, jnp.float32)))
+        assert np.median(np.linalg.norm(observed - found.pixels, axis=-1)) < 6.0
         assert 0.5 < found.noise < 12.0
 
 

@@ -24,13 +24,13 @@ def views(noise_px=0.0, pairs=8):
         turn = Rotation.from_rotvec(rng.normal(0, 0.4, 3)).as_matrix()
         middle = rng.uniform([-0.05, -0.05, 0.5], [0.1, 0.05, 0.7])
         t = middle - turn @ [0.14, 0.10, 0]
-        for seen, K, lens, pose in (
+        for observed, K, lens, pose in (
             (left, K_LEFT, LENSES[0], (turn, t)),
             (right, K_RIGHT, LENSES[1], (R @ turn, R @ t + T)),
         ):
             kept = rng.permutation(len(BOARD))[:20]
             pixels = Calibration(K, lens, *pose, 0.0).project(BOARD[kept])
-            seen.append(BoardView(BOARD[kept], pixels + rng.normal(0, noise_px, pixels.shape)))
+            observed.append(BoardView(BOARD[kept], pixels + rng.normal(0, noise_px, pixels.shape)))
     return left, right
 
 

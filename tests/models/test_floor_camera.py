@@ -71,9 +71,9 @@ def test_pixels_above_the_horizon_see_no_floor(x64):
 def test_the_parameter_of_a_ray_is_the_depth(camera):
     uv = jnp.asarray(np.random.default_rng(1).uniform(0, [160, 120], (7, 2)))
     points = camera.position() + 3.2 * camera.rays(uv)
-    seen, depth = camera.project(points)
+    observed, depth = camera.project(points)
     np.testing.assert_allclose(depth, 3.2, rtol=1e-12)
-    np.testing.assert_allclose(seen, uv, atol=1e-9)
+    np.testing.assert_allclose(observed, uv, atol=1e-9)
 
 
 @pytest.mark.parametrize(("heading", "pitch", "roll"), [(0, 37, 0), (50, 20, 0), (-130, 70, 0), (30, 85, 20)])

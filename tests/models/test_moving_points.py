@@ -19,27 +19,27 @@ def simulated(seed=0, sensor=0.5, drive=40.0, frames=200):
         x, v = x + dt * v + push[0], v + push[1]
         places.append(x)
     places = np.array(places)
-    seen = places + sensor * rng.normal(size=places.shape)
-    seen[rng.random(seen.shape) < 0.1] = np.nan
-    return times, places, seen
+    observed = places + sensor * rng.normal(size=places.shape)
+    observed[rng.random(observed.shape) < 0.1] = np.nan
+    return times, places, observed
 
 
 @pytest.mark.system
 def test_noises_are_learnt_from_tracks_with_gaps():
-    times, places, seen = simulated()
-    tracks, means = tracks_of(seen, times)
+    times, places, observed = simulated()
+    tracks, means = tracks_of(observed, times)
     found = learn(tracks)
     for name, true in (("sensor", 0.5), ("drive", 40.0)):
         z = (float(getattr(found.theta, name)) - true) / float(getattr(found.standard_errors, name))
         assert abs(z) < 4
     smoothed = np.asarray(positions(tracks, found.theta).smoothed) + means
-    assert np.sqrt(np.mean((smoothed - places) ** 2)) < 0.8 * np.sqrt(np.nanmean((seen - places) ** 2))
+    assert np.sqrt(np.mean((smoothed - places) ** 2)) < 0.8 * np.sqrt(np.nanmean((observed - places) ** 2))
 
 
 @pytest.mark.system
 def test_the_likelihood_is_that_of_all_readings_at_once():
-    times, _, seen = simulated(frames=5)
-    tracks, _ = tracks_of(seen, times)
+    times, _, observed = simulated(frames=5)
+    tracks, _ = tracks_of(observed, times)
     y = Observation(jnp.nan_to_num(tracks.y), jnp.isfinite(tracks.y))
     noise = PointNoise(jnp.float32(0.5), jnp.float32(40.0))
     found = fit.over_sequences(jnp.zeros(2, jnp.uint32), PointFilter(tracks.extent), y, tracks.seconds)(noise)

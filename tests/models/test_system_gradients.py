@@ -63,7 +63,7 @@ def depth_hand(theta):
 
 def person(theta):
     """Height of somebody on a floor, from soft silhouettes."""
-    seen = soft_ellipse_mask(
+    observed = soft_ellipse_mask(
         outline(PERSON_P, standing(jnp.array([0.2, 0.1]), jnp.array(1.7), jnp.array(0.45))), (60, 80)
     )
 
@@ -79,7 +79,7 @@ def person(theta):
         num_particles=8,
         noise=StandardNormal(2),
     )
-    return jaxfilters.log_evidence(filter, KEY, jnp.stack([seen] * 2))
+    return jaxfilters.log_evidence(filter, KEY, jnp.stack([observed] * 2))
 
 
 def head(theta):
@@ -88,14 +88,14 @@ def head(theta):
     with jax.ensure_compile_time_eval():
         rig = nominal()  # read on the host, though the caller compiles this
 
-    def seen(pose):
+    def observed(pose):
         return project_shape(rig, theta["size"] * shape, pose)[0].ravel()
 
     start = jnp.array([0.0, 0.0, 650.0, 0.1, 0.2, -0.1])
     prior = Gaussian(start, jnp.diag(jnp.array([10.0, 10, 30, 0.2, 0.2, 0.2]) ** 2))
-    y = seen(start + jnp.array([3.0, 2, 5, 0.05, 0, 0.05]))
+    y = observed(start + jnp.array([3.0, 2, 5, 0.05, 0, 0.05]))
     filter = extended_kalman(
-        prior, lambda x, _: x, theta["step"] ** 2 * jnp.eye(6), seen, theta["noise"] ** 2 * jnp.eye(y.size)
+        prior, lambda x, _: x, theta["step"] ** 2 * jnp.eye(6), observed, theta["noise"] ** 2 * jnp.eye(y.size)
     )
     return jaxfilters.log_evidence(filter, KEY, jnp.stack([y] * 2))
 

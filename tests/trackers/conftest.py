@@ -115,16 +115,16 @@ def build_fake(camera, config):
         )
         nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(status=0.0))
         nothing = nothing._replace(status=jnp.asarray(0, jnp.int32))
-        seen = jnp.isfinite(frame).any()
-        return FakeState(key, state.frames + 1, wrist), jax.tree.map(partial(jnp.where, seen), row, nothing)
+        observed = jnp.isfinite(frame).any()
+        return FakeState(key, state.frames + 1, wrist), jax.tree.map(partial(jnp.where, observed), row, nothing)
 
     step_all = jax.jit(lambda state, frames, times: jax.lax.scan(step, state, (frames, times)))
     return Tracker(start, step_all)
 
 
 def _mean(frame):
-    seen = jnp.isfinite(frame)
-    return jnp.where(seen, frame, 0.0).sum() / jnp.maximum(seen.sum(), 1)
+    observed = jnp.isfinite(frame)
+    return jnp.where(observed, frame, 0.0).sum() / jnp.maximum(observed.sum(), 1)
 
 
 def _joints(frames):

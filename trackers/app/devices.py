@@ -28,5 +28,5 @@ def processor(*names: str) -> str:
     """What Linux says of the first processor under the first of the names that it knows; empty elsewhere."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    told = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
-    return next((told[name] for name in names if name in told), "")
+    message = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    return next((message[name] for name in names if name in message), "")

@@ -149,15 +149,15 @@ def from_keypoints(
         raise InputError(
             f"{name}: confidence must be 0 or more; frame {frame}, keypoint {keypoint}: {confidence[frame, keypoint]}."
         )
-    seen = (confidence >= LEAST_CONFIDENCE) & ~np.isnan(points).any(axis=-1)
-    if not seen.any():
+    observed = (confidence >= LEAST_CONFIDENCE) & ~np.isnan(points).any(axis=-1)
+    if not observed.any():
         raise InputError(f"{name}: no keypoint has a confidence of {LEAST_CONFIDENCE} or more in any frame.")
-    points = np.where(seen[..., None], points, np.nan)
+    points = np.where(observed[..., None], points, np.nan)
     noise_px = keypoint_noise(points) if noise_px is None else noise_px
     if not 0 < noise_px < np.inf:
         raise InputError(f"{name}: noise must be positive, in pixels; got {noise_px}.")
     check_times(times_s, name)
-    std = np.where(seen, persistence(times_s) * noise_px / np.clip(confidence, LEAST_CONFIDENCE, 1.0), 1.0)
+    std = np.where(observed, persistence(times_s) * noise_px / np.clip(confidence, LEAST_CONFIDENCE, 1.0), 1.0)
     return FeatureSequence(
         num_fingers=(NUM_KEYPOINTS - 1) // 4,
         features=KEYPOINTS,
@@ -174,11 +174,11 @@ def keypoint_noise(points: np.ndarray) -> float:
 
     Frames in which fewer than half of the keypoints were observed count only where there are no others.
     """
-    seen = np.isfinite(points).all(axis=-1)
-    counts = seen.sum(axis=-1)
+    observed = np.isfinite(points).all(axis=-1)
+    counts = observed.sum(axis=-1)
     whole = counts >= min(NUM_KEYPOINTS // 2, counts.max())
-    low = np.where(seen[..., None], points, np.inf)[whole].min(axis=1)
-    high = np.where(seen[..., None], points, -np.inf)[whole].max(axis=1)
+    low = np.where(observed[..., None], points, np.inf)[whole].min(axis=1)
+    high = np.where(observed[..., None], points, -np.inf)[whole].max(axis=1)
     # A single keypoint has no extent; a pixel is better than certainty.
     return NOISE_SHARE * float(np.median(np.linalg.norm(high - low, axis=-1))) or 1.0
 
@@ -232,12 +232,12 @@ def _check_measured(sequence: FeatureSequence) -> None:
     if np.isinf(sequence.y).any():
         frame, row = np.argwhere(np.isinf(sequence.y))[0]
         raise InputError(f"{sequence.name}: features must be finite or NaN; frame {frame}, {names[row]} is not.")
-    seen = np.isfinite(sequence.y)
-    if not seen.any():
+    observed = np.isfinite(sequence.y)
+    if not observed.any():
         raise InputError(f"{sequence.name}: no feature was measured in any frame.")
     good = np.isfinite(sequence.std) & (sequence.std > 0)
-    if not good[seen].all():
-        frame, row = np.argwhere(seen & ~good)[0]
+    if not good[observed].all():
+        frame, row = np.argwhere(observed & ~good)[0]
         raise InputError(
             f"{sequence.name}: noise must be positive where a feature was measured; frame {frame}, "
             f"{names[row]}: {sequence.std[frame, row]}."

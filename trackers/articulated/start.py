@@ -75,12 +75,12 @@ def starts_from_points(
         std: Noise of the rows, pixels.
     """
     layout = hand.layout
-    seen = mask.reshape(-1, 2).all(axis=1)
-    target = jnp.where(seen[:, None], y.reshape(-1, 2), 0.0)
-    found = jnp.sum(seen) >= FEWEST_POINTS
-    states, misfits = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, seen))(_orientations(y.dtype))
+    observed = mask.reshape(-1, 2).all(axis=1)
+    target = jnp.where(observed[:, None], y.reshape(-1, 2), 0.0)
+    found = jnp.sum(observed) >= FEWEST_POINTS
+    states, misfits = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, observed))(_orientations(y.dtype))
     order = jnp.argsort(misfits)[: 2 * NUM_STARTS]
-    fit = partial(_fitted, hand, limits, y, jnp.repeat(seen, 2), std)
+    fit = partial(_fitted, hand, limits, y, jnp.repeat(observed, 2), std)
     # One after the other: LAPACK calls in a batch stand still in jaxlib 0.10 on two cores.
     means, costs = jax.lax.map(fit, states[order])
     costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -124,9 +124,9 @@ def _template(hand: ArticulatedHand, q: Array) -> Float[Array, " n"]:
     return x.at[2].set(_DISTANCE) if in_space else x
 
 
-def _laid_over(hand: ArticulatedHand, x: Array, target: Array, seen: Array) -> tuple[Array, Array]:
+def _laid_over(hand: ArticulatedHand, x: Array, target: Array, observed: Array) -> tuple[Array, Array]:
     """The state turned in the image, moved and scaled to fit the points best, and the mean square of what remains."""
-    layout, weight = hand.layout, seen[:, None] / jnp.maximum(jnp.sum(seen), 1)
+    layout, weight = hand.layout, observed[:, None] / jnp.maximum(jnp.sum(observed), 1)
     image = hand.observe(x).reshape(-1, 2)
     here, there = jnp.sum(weight * image, axis=0), jnp.sum(weight * target, axis=0)
     a, b = image - here, target - there
@@ -151,7 +151,7 @@ def _laid_over(hand: ArticulatedHand, x: Array, target: Array, seen: Array) -> t
 
 
 def _fitted(
-    hand: ArticulatedHand, limits: LinearConstraints | None, y: Array, seen: Array, std: Array, start: Array
+    hand: ArticulatedHand, limits: LinearConstraints | None, y: Array, observed: Array, std: Array, start: Array
 ) -> tuple[Array, Array]:
     """Gauss-Newton from one state, and the cost at its end."""
     layout = hand.layout
@@ -167,7 +167,7 @@ def _fitted(
 
     def deviations(p: Array) -> Array:
         x = state(p)
-        missed = jnp.where(seen, (hand.observe(x) - y) / std, 0.0)
+        missed = jnp.where(observed, (hand.observe(x) - y) / std, 0.0)
         pair = jnp.sum(jax.lax.stop_gradient(missed).reshape(-1, 2) ** 2, axis=1)
         missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
         parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]

@@ -95,10 +95,10 @@ def _boxes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     frames = len(scene.wrist)
     points = np.concatenate([scene.measured.points, scene.joints.reshape(frames, -1, 2)], axis=1)
     points = scene.canvas.place(points)
-    seen = (np.abs(points) < 1e5).all(axis=-1)
-    low = np.where(seen[..., None], points, np.inf).min(axis=1)
-    high = np.where(seen[..., None], points, -np.inf).max(axis=1)
-    nothing = ~seen.any(axis=1)[:, None]
+    observed = (np.abs(points) < 1e5).all(axis=-1)
+    low = np.where(observed[..., None], points, np.inf).min(axis=1)
+    high = np.where(observed[..., None], points, -np.inf).max(axis=1)
+    nothing = ~observed.any(axis=1)[:, None]
     return np.where(nothing, np.nan, low), np.where(nothing, np.nan, high)
 
 

@@ -306,11 +306,11 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     nis = reported.kalman.nis / jnp.maximum(reported.kalman.rank, 1)
     # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
     rows = jnp.sum(frame.mask)
-    seen = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
+    observed = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
     bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
     searching = state.misses > PATIENCE
-    misses = jnp.where(seen, 0, state.misses + 1).astype(jnp.int32)
-    status = jnp.where(searching, SEARCHING, jnp.where(seen, TRACKING, LOST)).astype(jnp.int32)
+    misses = jnp.where(observed, 0, state.misses + 1).astype(jnp.int32)
+    status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
     misses = jnp.where(searching, state.misses, misses)
     track = _report(setup, bank, reported, nis, jnp.where(measured, info.log_evidence, jnp.nan), status)
     return TrackState(bank, time, misses, key), track

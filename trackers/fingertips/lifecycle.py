@@ -34,9 +34,9 @@ def carried(config: FingertipConfig, state: HandState, observed: HandObservation
     moved = observed.palm - state.palm
     velocity = moved / config.frame
     variance = (config.carried_sd / config.measurement_sd) ** 2 + config.drive
-    seen = observed.is_hand & (state.unseen == 0) & (jnp.sum(moved * moved) < config.gate**2)
+    visible = observed.is_hand & (state.unseen == 0) & (jnp.sum(moved * moved) < config.gate**2)
     hint = jax.vmap(motion.correct_velocity, in_axes=(0, None, None, None))
-    return hint(state.tracks.belief, jnp.where(seen, velocity, 0.0), variance, seen)
+    return hint(state.tracks.belief, jnp.where(visible, velocity, 0.0), variance, visible)
 
 
 def detected(tip: Float[Array, "2"], filtered: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -24,11 +24,11 @@ def _no_score(config: FingertipConfig, angles: ThumbAngles) -> Score:
 
 
 def _scored(
-    config: FingertipConfig, angles: ThumbAngles, memory: Score, angle: Float[Array, ""], seen: Bool[Array, ""]
+    config: FingertipConfig, angles: ThumbAngles, memory: Score, angle: Float[Array, ""], observed: Bool[Array, ""]
 ) -> Score:
     del config
-    more = thumb.increment(jnp.where(seen, angle, 0.0), angles.thumb, angles.forefinger)
-    return Score(memory.total + jnp.where(seen, more, 0.0), memory.frames + seen)
+    more = thumb.increment(jnp.where(observed, angle, 0.0), angles.thumb, angles.forefinger)
+    return Score(memory.total + jnp.where(observed, more, 0.0), memory.frames + observed)
 
 
 def _by_score(
@@ -44,10 +44,14 @@ def _unknown(config: FingertipConfig, angles: ThumbAngles) -> ThumbBelief:
 
 
 def _observed(
-    config: FingertipConfig, angles: ThumbAngles, memory: ThumbBelief, angle: Float[Array, ""], seen: Bool[Array, ""]
+    config: FingertipConfig,
+    angles: ThumbAngles,
+    memory: ThumbBelief,
+    angle: Float[Array, ""],
+    observed: Bool[Array, ""],
 ) -> ThumbBelief:
     del angles
-    return thumb.observe(memory, angle, seen, config.posture)
+    return thumb.observe(memory, angle, observed, config.posture)
 
 
 def _by_posterior(

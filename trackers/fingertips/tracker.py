@@ -239,9 +239,9 @@ def _thumbs(
 ) -> tuple[Tracks, Float[Array, " slots"]]:
     """Tracks with what the bases in this frame say of the thumb, and the probability of each to be it."""
     own = jnp.maximum(tip, 0)
-    seen = (tip >= 0) & observed.has_base[own] & _knows_axis(config, placed)
+    visible = (tip >= 0) & observed.has_base[own] & _knows_axis(config, placed)
     angle = jax.vmap(base_angle, in_axes=(0, None, None, None))(observed.bases[own], placed.palm, placed.axis, side)
-    memories = jax.vmap(partial(method.thumb.observe, config, angles))(tracks.thumb, angle, seen)
+    memories = jax.vmap(partial(method.thumb.observe, config, angles))(tracks.thumb, angle, visible)
     probability, is_thumb = method.thumb.judge(memories, tracks.is_thumb, tracks.mode == CONFIRMED)
     return tracks._replace(thumb=memories, is_thumb=is_thumb), probability
 

@@ -94,11 +94,11 @@ def of_person(key: AnyKey, model: IctModel, detectors: dict[str, Detector], imag
         scale = FOCAL / float(pose[2])
         eyes = float(np.linalg.norm(np.subtract(*eye_centers(uv))))
         for name, detector in detectors.items():
-            seen = detector.detect(image, uv.mean(axis=0))
-            if isinstance(seen, str) or not is_symmetric(seen.points):
+            observed = detector.detect(image, uv.mean(axis=0))
+            if isinstance(observed, str) or not is_symmetric(observed.points):
                 continue
-            if np.linalg.norm(seen.points.mean(axis=0) - uv.mean(axis=0)) < ELSEWHERE * eyes:
-                found[name].append(Picture((seen.points - uv) / scale, J / scale))
+            if np.linalg.norm(observed.points.mean(axis=0) - uv.mean(axis=0)) < ELSEWHERE * eyes:
+                found[name].append(Picture((observed.points - uv) / scale, J / scale))
     return found
 
 

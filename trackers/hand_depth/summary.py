@@ -108,8 +108,8 @@ def _charts(sequence: DepthSequence, results: TimedHandTrack) -> list[np.ndarray
 
 def _wrist_curves(results: TimedHandTrack) -> list[Curve]:
     wrist, spread = 1000 * results.pose[:, :3], 1000 * results.pose_std[:, :3]
-    seen = wrist[np.isfinite(wrist).all(axis=-1)]
-    middle = np.median(seen, axis=0) if len(seen) else np.zeros(3)
+    observed = wrist[np.isfinite(wrist).all(axis=-1)]
+    middle = np.median(observed, axis=0) if len(observed) else np.zeros(3)
     return [
         Curve(f"{axis} from {middle[i]:.0f}", wrist[:, i] - middle[i], _AXIS_COLORS[i], 2 * spread[:, i])
         for i, axis in enumerate("xyz")

@@ -197,17 +197,17 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     ensemble, info = jax.lax.cond(something, update, coast, predicted)
     pose, covariance = pose_moments(*particles_of(ensemble))
     cost = likelihood.cost(pose, image)
-    seen = something & (cost < LOST_COST)
-    race_time = jnp.where(seen & (cost > SUDDEN * state.least_cost), time, state.race_time)
-    least_cost = jnp.where(seen, jnp.minimum(cost, state.least_cost), state.least_cost)
-    misses = jnp.where(seen, 0, state.misses + 1)
+    observed = something & (cost < LOST_COST)
+    race_time = jnp.where(observed & (cost > SUDDEN * state.least_cost), time, state.race_time)
+    least_cost = jnp.where(observed, jnp.minimum(cost, state.least_cost), state.least_cost)
+    misses = jnp.where(observed, 0, state.misses + 1)
     track = HandTrack(
         pose=pose,
         pose_std=standard_deviations(pose, covariance),
         joints=forward_kinematics(pose, likelihood.geometry).joints,
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
-        status=jnp.where(seen, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
+        status=jnp.where(observed, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
     following = state._replace(
         ensemble=ensemble, time=time, misses=misses, key=key, race_time=race_time, least_cost=least_cost

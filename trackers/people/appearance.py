@@ -42,9 +42,9 @@ def _in_camera(scene, camera, furniture, frame, places, active):
 
     def one(turn, found):
         k = order[turn]
-        seen = jax.tree.map(lambda leaf: leaf[k], outlines)
-        shown = seen.code == VISIBLE
-        box = jnp.where(shown, ellipse_of(seen).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
+        contour = jax.tree.map(lambda leaf: leaf[k], outlines)
+        shown = contour.code == VISIBLE
+        box = jnp.where(shown, ellipse_of(contour).box, jnp.array([0.0, 0.0, 1.0, 1.0]))
         window = foreground.window(box, camera.shape, GRID)
 
         near = overlapping(camera.P, places, active.at[k].set(False), window.uv)
@@ -52,12 +52,14 @@ def _in_camera(scene, camera, furniture, frame, places, active):
 
         def hide(turn, free):
             other = nearest[turn]
-            ahead = outlines.depth[other] < seen.depth
+            ahead = outlines.depth[other] < contour.depth
             return free * (1 - presence_of(scene.config, camera.P, places[other], window.uv) * ahead)
 
-        free = jax.lax.fori_loop(0, jnp.sum(near), hide, window.inside * (seen.depth < furniture.ravel()[window.pixel]))
+        free = jax.lax.fori_loop(
+            0, jnp.sum(near), hide, window.inside * (contour.depth < furniture.ravel()[window.pixel])
+        )
         mine = presence_of(scene.config, camera.P, places[k], window.uv) * shown * (mask[window.pixel] / 255)
-        histogram, enough = _histogram(image[window.pixel], mine * free, window.uv[:, 1] < seen.center[1])
+        histogram, enough = _histogram(image[window.pixel], mine * free, window.uv[:, 1] < contour.center[1])
         return found[0].at[k].set(histogram), found[1].at[k].set(enough)
 
     nothing = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)

@@ -51,8 +51,8 @@ def cells_of(
     points = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
     xy = jnp.asarray(_filled(points), jnp.float32)
     looks = [_look(camera, depth, config, xy) for camera, depth in zip(cameras, furniture, strict=True)]
-    seen = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE
-    (kept,) = np.nonzero((seen & np.asarray(walkable(jnp.asarray(floor), xy)))[: len(points)])
+    observed = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE
+    (kept,) = np.nonzero((observed & np.asarray(walkable(jnp.asarray(floor), xy)))[: len(points)])
     if not len(kept):
         raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
     pixels, presence, share, area = zip(*(_rows(look, kept) for look in looks), strict=True)
@@ -101,16 +101,16 @@ def _look(camera, furniture, config, xy):
     reduced_rows, reduced_cols = -(-rows // step), -(-cols // step)
 
     def one(xy):
-        seen = outline(camera.P, standing(xy, config.height_m, config.width_m))
+        contour = outline(camera.P, standing(xy, config.height_m, config.width_m))
         # Ellipse coordinates along the image of the vertical axis and across, so that feet are below.
-        uv = seen.center + offsets @ jnp.linalg.cholesky(seen.shape[::-1, ::-1])[::-1, ::-1].T
+        uv = contour.center + offsets @ jnp.linalg.cholesky(contour.shape[::-1, ::-1])[::-1, ::-1].T
         u, v = jnp.round(uv[:, 0] / step).astype(jnp.int32), jnp.round(uv[:, 1] / step).astype(jnp.int32)
-        inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (seen.code == VISIBLE)
+        inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (contour.code == VISIBLE)
         u, v = jnp.clip(u, 0, reduced_cols - 1), jnp.clip(v, 0, reduced_rows - 1)
-        free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > seen.depth)
+        free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > contour.depth)
         weight = presence(camera.P, xy, config.height_m, config.width_m, uv, config.spread_px)
         index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
-        return _Look(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(seen) / step**2)
+        return _Look(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(contour) / step**2)
 
     return jax.vmap(one)(xy)
 
@@ -131,8 +131,12 @@ def birth(
     ):
         b = jnp.append(_reduced_contrast(scene, camera, depth, places, active, frame).ravel(), 0.0)
         ratio = jax.vmap(log_likelihood_ratio)(weight, b[index])
-        seen = frame.present * (share >= LEAST_SHARE)
-        total, shares, explained = total + seen * ratio, shares + seen * share, explained + seen * ratio * area
+        observed = frame.present * (share >= LEAST_SHARE)
+        total, shares, explained = (
+            total + observed * ratio,
+            shares + observed * share,
+            explained + observed * ratio * area,
+        )
     # One sample stands for this share of the ellipse's area.
     per_area = (2 * MARGIN) ** 2 / (jnp.pi * SAMPLES[0] * SAMPLES[1])
     evidence = total * per_area / jnp.maximum(shares, 1e-6)

@@ -195,9 +195,9 @@ def _report(
 def _demo_error(room: DemoRoom, tracks: dict[int, list[Sighting]]) -> float | None:
     """Mean distance of every sighting from whoever really is nearest, metres."""
     errors = [
-        np.linalg.norm(room.routes.xy[seen.frame] - seen.mean[:2], axis=1).min()
+        np.linalg.norm(room.routes.xy[sighting.frame] - sighting.mean[:2], axis=1).min()
         for track in tracks.values()
-        for seen in track
+        for sighting in track
     ]
     return round(float(np.mean(errors)), 4) if errors else None
 

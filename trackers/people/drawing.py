@@ -101,8 +101,8 @@ def _draw_band(plan, piece, color, pixels):
     for before, now in itertools.pairwise(piece):
         if {before.mode, now.mode} & _NOT_MEASURED:
             edges = [
-                seen.mean[:2] + (np.linalg.cholesky(seen.covariance[:2, :2] + 1e-9 * np.eye(2)) @ circle).T
-                for seen in (before, now)
+                sighting.mean[:2] + (np.linalg.cholesky(sighting.covariance[:2, :2] + 1e-9 * np.eye(2)) @ circle).T
+                for sighting in (before, now)
             ]
             hull = cv2.convexHull(pixels(np.concatenate(edges)).astype(np.int32))
             cv2.fillConvexPoly(band, hull, 255)

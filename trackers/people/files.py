@@ -31,9 +31,9 @@ def write_mot(
         OutputError: it cannot be written.
     """
     lines = [
-        f"{seen.frame + 1},{identity + 1},{left:.2f},{top:.2f},{width:.2f},{height:.2f},"
-        f"{np.clip(seen.score, 0, 1):.3f},{seen.mean[0]:.3f},{seen.mean[1]:.3f},0\n"
-        for identity, seen, (left, top, width, height) in _boxes(scene, undistortion, tracks, camera)
+        f"{sighting.frame + 1},{identity + 1},{left:.2f},{top:.2f},{width:.2f},{height:.2f},"
+        f"{np.clip(sighting.score, 0, 1):.3f},{sighting.mean[0]:.3f},{sighting.mean[1]:.3f},0\n"
+        for identity, sighting, (left, top, width, height) in _boxes(scene, undistortion, tracks, camera)
     ]
     _write_text(path, "".join(lines))
 
@@ -49,21 +49,23 @@ def write_coco(
     rows, cols = scene.cameras[camera].shape
     found = _boxes(scene, undistortion, tracks, camera)
     document = {
-        "images": [{"id": i, "width": cols, "height": rows} for i in sorted({seen.frame for _, seen, _ in found})],
+        "images": [
+            {"id": i, "width": cols, "height": rows} for i in sorted({sighting.frame for _, sighting, _ in found})
+        ],
         "categories": [{"id": 1, "name": "person"}],
         "annotations": [
             {
                 "id": number,
-                "image_id": seen.frame,
+                "image_id": sighting.frame,
                 "category_id": 1,
                 "track_id": identity,
                 "bbox": [round(float(edge), 2) for edge in box],
                 "area": round(float(box[2] * box[3]), 2),
                 "iscrowd": 0,
-                "score": round(float(np.clip(seen.score, 0, 1)), 3),
-                "floor_xy_m": [round(float(x), 3) for x in seen.mean[:2]],
+                "score": round(float(np.clip(sighting.score, 0, 1)), 3),
+                "floor_xy_m": [round(float(x), 3) for x in sighting.mean[:2]],
             }
-            for number, (identity, seen, box) in enumerate(found, 1)
+            for number, (identity, sighting, box) in enumerate(found, 1)
         ],
     }
     _write_text(path, json.dumps(document, allow_nan=False) + "\n")
@@ -78,16 +80,16 @@ def _boxes(
         return []
     # One compilation for each power of two.
     length = 1 << (len(everyone) - 1).bit_length()
-    means = np.stack([seen.mean for _, seen in everyone] + [everyone[0][1].mean] * (length - len(everyone)))
+    means = np.stack([sighting.mean for _, sighting in everyone] + [everyone[0][1].mean] * (length - len(everyone)))
     shown = jax.device_get(_outlines(scene, jnp.asarray(means, jnp.float32), camera))
     turns = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     circle = np.stack([np.cos(turns), np.sin(turns)])
     found = []
-    for (identity, seen), code, center, shape in zip(everyone, shown.code, shown.center, shown.shape, strict=False):
+    for (identity, sighting), code, center, shape in zip(everyone, shown.code, shown.center, shown.shape, strict=False):
         if code == VISIBLE:
             points = undistortion.distorted(center + (_root(shape) @ circle).T)
             low, high = points.min(axis=0), points.max(axis=0)
-            found.append((identity, seen, np.concatenate([low, high - low])))
+            found.append((identity, sighting, np.concatenate([low, high - low])))
     return found
 
 
@@ -114,5 +116,5 @@ def _write_text(path: Path, text: str) -> None:
 
 def by_frame(tracks: dict[int, list[Sighting]]) -> list[tuple[int, Sighting]]:
     """All sightings with their identities, by frame and identity."""
-    everything = [(identity, seen) for identity, track in tracks.items() for seen in track]
+    everything = [(identity, sighting) for identity, track in tracks.items() for sighting in track]
     return sorted(everything, key=lambda item: (item[1].frame, item[0]))

@@ -194,12 +194,12 @@ def as_measurement(
 
     def one(place, axes, steps, quadratic):
         eigenvalues, vectors = jnp.linalg.eigh(quadratic.curvature)
-        seen = eigenvalues > LEAST_CURVATURE
-        curvature = jnp.where(seen, eigenvalues, 1.0)
+        observed = eigenvalues > LEAST_CURVATURE
+        curvature = jnp.where(observed, eigenvalues, 1.0)
         limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_SHIFT_M))
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
-        return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), seen
+        return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed
 
     return jax.vmap(one)(fit.place, fit.axes, fit.steps, fit.quadratic)
 
@@ -232,6 +232,6 @@ def _nearest_first(scene, views, places, active) -> Int32[Array, " slots"]:
     Whoever no camera sees comes after all who are visible.
     """
     distance = jnp.linalg.norm(places[:, None, :2] - scene.centers(), axis=-1)
-    seen = jnp.any(views.visible > 0, axis=-1)
-    nearest = jnp.min(jnp.where(seen, distance, _FAR_M), axis=-1)
+    observed = jnp.any(views.visible > 0, axis=-1)
+    nearest = jnp.min(jnp.where(observed, distance, _FAR_M), axis=-1)
     return jnp.argsort(jnp.where(active, nearest, jnp.inf))

@@ -90,8 +90,8 @@ def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[
     good &= ~is_meeting(people.meetings)
     blank = jnp.all(people.appearance == people.appearance[:, :1], axis=-1)
     rate = jnp.where(blank, 1.0, LEARNING_RATE)[:, None]
-    learnt = people.appearance + rate * (histograms - people.appearance)
-    return people._replace(appearance=jnp.where(good[:, None], learnt, people.appearance))
+    learned = people.appearance + rate * (histograms - people.appearance)
+    return people._replace(appearance=jnp.where(good[:, None], learned, people.appearance))
 
 
 def named(people: People) -> People:

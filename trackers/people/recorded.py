@@ -51,25 +51,27 @@ class Recorder:
             if mode not in (TENTATIVE, TRACKED):
                 self.unconfirmed.pop(slot, None)
                 continue
-            seen = _sighting(frame, time_s, slot, people, report)
+            sighting = _sighting(frame, time_s, slot, people, report)
             if mode == TENTATIVE:
                 # A slot that was given up and taken again within one frame holds another person.
                 if people.log_odds[slot] == 0:
                     self.unconfirmed.pop(slot, None)
-                self.unconfirmed.setdefault(slot, []).append(seen)
+                self.unconfirmed.setdefault(slot, []).append(sighting)
                 continue
             # Whoever comes back was perhaps followed anew, unconfirmed, before the old track had ended.
             before = self.tracks.get(int(identity), [])
             ended = before[-1].frame if before else -1
-            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), seen] if one.frame > ended]
-        for identity, seen in added:
-            self.tracks.setdefault(identity, []).append(seen)
+            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), sighting] if one.frame > ended]
+        for identity, sighting in added:
+            self.tracks.setdefault(identity, []).append(sighting)
         return added
 
 
 def as_arrays(sightings: Sequence[tuple[int, Sighting]]) -> dict[str, np.ndarray]:
     """Sightings with an integer each, as arrays to save."""
-    columns = list(zip(*[(key, *seen) for key, seen in sightings], strict=True)) or [()] * (1 + len(Sighting._fields))
+    columns = list(zip(*[(key, *sighting) for key, sighting in sightings], strict=True)) or [()] * (
+        1 + len(Sighting._fields)
+    )
     arrays = dict(zip(("key", *Sighting._fields), columns, strict=True))
     modes = [MODES.index(mode) for mode in arrays.pop("mode")]
     n = len(modes)
@@ -140,14 +142,14 @@ def smoothed(config: PeopleConfig, tracks: dict[int, list[Sighting]]) -> dict[in
     who was lost and found again.
     """
     return {
-        identity: [seen for piece in pieces(track, config.hidden_s) for seen in _smoothed(config, piece)]
+        identity: [sighting for piece in pieces(track, config.hidden_s) for sighting in _smoothed(config, piece)]
         for identity, track in tracks.items()
     }
 
 
 def pieces(track: list[Sighting], longest_s: float) -> list[list[Sighting]]:
     """A track cut where nothing ties the places before to those after: parts of it by frame, as `smoothed` has them."""
-    ordered = sorted(track, key=lambda seen: seen.frame)
+    ordered = sorted(track, key=lambda sighting: sighting.frame)
     pairs = enumerate(itertools.pairwise(ordered), 1)
     cuts = [i for i, (a, b) in pairs if b.time_s - a.time_s > longest_s or b.slot != a.slot or _is_found_again(a, b)]
     return [ordered[a:b] for a, b in zip([0, *cuts], [*cuts, len(ordered)], strict=True)]
@@ -162,13 +164,13 @@ def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:
     # One compilation for each power of two.
     padding = (1 << (length - 1).bit_length()) - length
     beliefs = Gaussian(
-        jnp.asarray(np.stack([seen.mean for seen in piece] + [piece[-1].mean] * padding), float),
-        jnp.asarray(np.stack([seen.covariance for seen in piece] + [piece[-1].covariance] * padding), float),
+        jnp.asarray(np.stack([sighting.mean for sighting in piece] + [piece[-1].mean] * padding), float),
+        jnp.asarray(np.stack([sighting.covariance for sighting in piece] + [piece[-1].covariance] * padding), float),
     )
-    steps = np.diff([seen.time_s for seen in piece], append=piece[-1].time_s)
+    steps = np.diff([sighting.time_s for sighting in piece], append=piece[-1].time_s)
     found = _backward(config, beliefs, jnp.asarray(np.append(steps, np.zeros(padding)), float), length)
     mean, covariance = np.asarray(found.mean, np.float64), np.asarray(found.covariance, np.float64)
-    return [seen._replace(mean=mean[i], covariance=covariance[i]) for i, seen in enumerate(piece)]
+    return [sighting._replace(mean=mean[i], covariance=covariance[i]) for i, sighting in enumerate(piece)]
 
 
 @partial(jax.jit, static_argnums=0)

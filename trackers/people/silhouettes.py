@@ -99,11 +99,11 @@ def view_of(
     """The window in which a person is searched for: as far as `reach` along the first two `axes`, and a margin."""
     corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
     bodies = jax.vmap(body_of)(place + corners @ axes)
-    seen = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
-    boxes = jax.vmap(lambda one: ellipse_of(one).box)(seen)
+    contour = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
+    boxes = jax.vmap(lambda one: ellipse_of(one).box)(contour)
     box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])
     margin = MARGIN * (box[2:] - box[:2]) + 1
-    shown = frame.present & jnp.all(seen.code == VISIBLE)
+    shown = frame.present & jnp.all(contour.code == VISIBLE)
     box = jnp.where(shown, box + jnp.concatenate([-margin, margin]), jnp.array([0.0, 0.0, 1.0, 1.0]))
     window = foreground.window(box, camera.shape, config.grid)
     probability = jnp.asarray(frame.foreground).ravel()[window.pixel].astype(float) / 255
@@ -128,9 +128,9 @@ def views_of(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
 
 
-def area_of(seen: Outline) -> Float[Array, ""]:
+def area_of(contour: Outline) -> Float[Array, ""]:
     """Of an outline, square pixels; one at least."""
-    (a, b), (_, c) = seen.shape
+    (a, b), (_, c) = contour.shape
     return jnp.pi * jnp.sqrt(jnp.maximum(a * c - b**2, 1.0))
 
 
@@ -141,11 +141,11 @@ def overlapping(
     uv: Float[Array, "samples 2"],
 ) -> Bool[Array, " slots"]:
     """Which of the others can be present at any pixel of a window in the camera of a projection matrix."""
-    seen = jax.vmap(outline, in_axes=(None, 0))(P, jax.vmap(body_of)(places))
-    reach = OVERLAP * jnp.sqrt(jnp.diagonal(seen.shape, axis1=-2, axis2=-1))
+    contour = jax.vmap(outline, in_axes=(None, 0))(P, jax.vmap(body_of)(places))
+    reach = OVERLAP * jnp.sqrt(jnp.diagonal(contour.shape, axis1=-2, axis2=-1))
     low, high = jnp.min(uv, axis=0), jnp.max(uv, axis=0)
-    meets = jnp.all((seen.center + reach >= low) & (seen.center - reach <= high), axis=-1)
-    return others & ((meets & (seen.code == VISIBLE)) | (seen.code == INSIDE))
+    meets = jnp.all((contour.center + reach >= low) & (contour.center - reach <= high), axis=-1)
+    return others & ((meets & (contour.code == VISIBLE)) | (contour.code == INSIDE))
 
 
 def unexplained_of(

@@ -70,4 +70,4 @@ def _std(track: TimedPeopleTrack) -> np.ndarray:
 
 
 def _spreads(centers: np.ndarray, track: TimedPeopleTrack) -> np.ndarray:
-    return np.asarray([spreads(centers, seen) for _, seen in from_rows(track)]).reshape(len(track.frame), 2)
+    return np.asarray([spreads(centers, sighting) for _, sighting in from_rows(track)]).reshape(len(track.frame), 2)

@@ -135,17 +135,17 @@ def _observed_places(scene: PeopleScene, people: People) -> Array:
 
 
 def _updated(scene: PeopleScene, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:
-    y, H, R, seen = as_measurement(fit, scene.config.silhouette_sd_m)
+    y, H, R, observed = as_measurement(fit, scene.config.silhouette_sd_m)
     in_state = jnp.eye(STATE)[jnp.array(PLACE)]
 
-    def one(belief, y, H, R, seen, whole):
+    def one(belief, y, H, R, observed, whole):
         biases = H @ bias_factor(scene, belief.mean)
         H = (H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean)).at[:, BIAS].set(biases)
-        after, info = joseph.update(belief, y, H, R, mask=seen)
+        after, info = joseph.update(belief, y, H, R, mask=observed)
         size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
         return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
 
-    return jax.vmap(one)(predicted, y, H, R, seen, fit.share_seen > WHOLE)
+    return jax.vmap(one)(predicted, y, H, R, observed, fit.share_seen > WHOLE)
 
 
 def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:

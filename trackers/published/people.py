@@ -199,9 +199,9 @@ def _searched(state: PaperState) -> Array:
 
 def _drawn(scene: PaperScene, body: Ellipsoid) -> tuple[Array, Array]:
     """The silhouette behind obstacles, and whether it could be drawn: not if it reaches through the camera's plane."""
-    seen = outline(scene.camera.P, body)
-    mask = ellipse_mask(seen, scene.camera.shape)
-    return mask & scene.config.occlusion.is_in_front(scene.camera, body, scene.obstacles), seen.code != CROSSING
+    contour = outline(scene.camera.P, body)
+    mask = ellipse_mask(contour, scene.camera.shape)
+    return mask & scene.config.occlusion.is_in_front(scene.camera, body, scene.obstacles), contour.code != CROSSING
 
 
 def _together(config: PaperConfig, masks: Array, others: Array, real: Array, counted: Array) -> Array:

@@ -65,11 +65,11 @@ def endpoints_in_view(camera: FloorCamera, body: Ellipsoid) -> Bool[Array, ""]:
 
 def box_in_view(camera: FloorCamera, body: Ellipsoid) -> Bool[Array, ""]:
     """Whether the box around the outline meets the image; a camera inside the body sees it."""
-    seen = outline(camera.P, body)
-    box = ellipse_of(seen).box
+    contour = outline(camera.P, body)
+    box = ellipse_of(contour).box
     limit = jnp.array([camera.shape[1], camera.shape[0]]) - 0.5
     meets = jnp.all(box[:2] <= limit) & jnp.all(box[2:] >= -0.5)
-    return jnp.where(seen.code == VISIBLE, meets, seen.code == INSIDE)
+    return jnp.where(contour.code == VISIBLE, meets, contour.code == INSIDE)
 
 
 def whole_image(camera: FloorCamera, bodies: Ellipsoid, ring: int) -> Bool[Array, "rows cols"]:

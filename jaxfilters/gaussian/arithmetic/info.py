@@ -38,7 +38,7 @@ class Rows(NamedTuple):
 
     deviation: Float[Array, " m"]
     """`y - y_hat`, 0 in rows that do not count."""
-    seen: Bool[Array, " m"]
+    observed: Bool[Array, " m"]
     """Neither masked nor invalid."""
     num_invalid: Int[Array, ""]
     impossible: Bool[Array, ""]
@@ -63,8 +63,8 @@ def rows(
     # Products show NaN and infinity, in a fraction of the time that testing all elements takes.
     ones = jnp.where(jnp.isfinite(mean), jnp.ones_like(mean), jnp.nan)
     shown = factor.apply(H, ones) + factor.apply(noise, jnp.ones(noise.shape[1], noise.dtype)) + y_hat
-    seen = materialized(read & jnp.isfinite(shown))
-    return used_rows(jnp.where(seen, y - y_hat, 0.0), read, seen, mask)
+    is_read = materialized(read & jnp.isfinite(shown))
+    return used_rows(jnp.where(is_read, y - y_hat, 0.0), read, is_read, mask)
 
 
 def used_rows(
@@ -112,6 +112,6 @@ def report(usable: Rows, root: Float[Array, "m m"], found: Evidence) -> KalmanIn
         log_evidence=jnp.where(usable.impossible, -jnp.inf, found.log_density),
         nis=found.nis,
         rank=rank,
-        deficiency=jnp.sum(usable.seen, dtype=jnp.int32) - rank,
+        deficiency=jnp.sum(usable.observed, dtype=jnp.int32) - rank,
         num_invalid=usable.num_invalid,
     )

@@ -48,9 +48,9 @@ def update(
     """
     noise = info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root]))
     usable = info.rows(belief.mean, y, H, noise, y_hat, mask)
-    noise = info.observed(usable.seen, noise)
-    seen = linalg.matmul(info.observed(usable.seen, H), belief.root)
-    root, cross, posterior = _conditioned(seen, noise, belief.root)
+    noise = info.observed(usable.observed, noise)
+    visible = linalg.matmul(info.observed(usable.observed, H), belief.root)
+    root, cross, posterior = _conditioned(visible, noise, belief.root)
     # Rows are finite: what is not is the belief.
     sound = jnp.all(jnp.isfinite(root))
     root = jnp.where(sound, root, 0.0)

@@ -43,7 +43,7 @@ def simulate(rng, shape, rate, drift, noise):
     return np.array(ys)
 
 
-def joint_log_density(ys, seen, rate, drift, noise):
+def joint_log_density(ys, observed, rate, drift, noise):
     """Of all readings at once, from their covariance."""
     variances = [rate**2 + drift**2]
     for _ in ys[1:]:
@@ -51,25 +51,25 @@ def joint_log_density(ys, seen, rate, drift, noise):
     steps = np.arange(len(ys))
     lag = abs(steps[:, None] - steps)
     covariance = np.array(variances)[np.minimum(steps[:, None], steps)] * rate**lag + noise**2 * np.eye(len(ys))
-    return multivariate_normal(np.zeros(seen.sum()), covariance[np.ix_(seen, seen)]).logpdf(ys[seen])
+    return multivariate_normal(np.zeros(observed.sum()), covariance[np.ix_(observed, observed)]).logpdf(ys[observed])
 
 
 def test_the_log_evidence_of_sequences_is_that_of_the_joint_gaussian(x64):
     ys = simulate(RNG, (9, 3), 0.8, 0.5, 0.4)
-    seen = RNG.random((9, 3)) < 0.8
-    holes = jnp.where(seen, ys, jnp.nan)[:, None]
-    expected = [joint_log_density(ys[:, i], seen[:, i], 0.8, 0.5, 0.4) for i in range(3)]
-    one = fit.log_evidence(KEY, filter_of, holes[..., 0], mask=jnp.asarray(seen[:, 0]))
+    observed = RNG.random((9, 3)) < 0.8
+    holes = jnp.where(observed, ys, jnp.nan)[:, None]
+    expected = [joint_log_density(ys[:, i], observed[:, i], 0.8, 0.5, 0.4) for i in range(3)]
+    one = fit.log_evidence(KEY, filter_of, holes[..., 0], mask=jnp.asarray(observed[:, 0]))
     np.testing.assert_allclose(one(THETA), expected[0], rtol=1e-9)
-    together = fit.over_sequences(KEY, filter_of, holes, mask=jnp.asarray(seen))
+    together = fit.over_sequences(KEY, filter_of, holes, mask=jnp.asarray(observed))
     np.testing.assert_allclose(together(THETA), sum(expected), rtol=1e-9)
 
 
 def test_nan_is_a_missing_component_to_a_gaussian_filter_as_in_run(x64):
     ys = simulate(RNG, (9, 1), 0.8, 0.5, 0.4)
-    seen = np.arange(9) != 4
-    expected = joint_log_density(ys[:, 0], seen, 0.8, 0.5, 0.4)
-    holes = jnp.asarray(np.where(seen[:, None], ys, np.nan))
+    observed = np.arange(9) != 4
+    expected = joint_log_density(ys[:, 0], observed, 0.8, 0.5, 0.4)
+    holes = jnp.asarray(np.where(observed[:, None], ys, np.nan))
     np.testing.assert_allclose(fit.log_evidence(KEY, filter_of, holes)(THETA), expected, rtol=1e-9)
     found = fit.maximize(fit.log_evidence(KEY, filter_of, holes), THETA, LIMITS, method=fit.bfgs(max_steps=2))
     assert np.isfinite(found.log_density)

@@ -87,8 +87,8 @@ def test_a_prior_is_added(x64):
 
 def structured(data, theta):
     """Turned directions, a covariance and frequencies, each with a maximum in closed form."""
-    directions, seen, deviations, counts = data
-    off = seen - directions @ quaternion_to_matrix(theta["turn"]).T
+    directions, observed, deviations, counts = data
+    off = observed - directions @ quaternion_to_matrix(theta["turn"]).T
     root = jnp.linalg.cholesky(theta["covariance"])
     whitened = jax.scipy.linalg.solve_triangular(root, deviations.T, lower=True)
     gaussian = -0.5 * jnp.sum(whitened**2) - deviations.shape[0] * jnp.sum(jnp.log(jnp.diagonal(root)))
@@ -98,14 +98,14 @@ def structured(data, theta):
 @pytest.mark.system
 def test_rotations_covariances_and_shares_have_their_closed_forms(x64):
     directions = RNG.normal(size=(8, 3))
-    seen = Rotation.from_rotvec([0.5, 1.8, -0.6]).apply(directions) + 0.1 * RNG.normal(size=(8, 3))
+    observed = Rotation.from_rotvec([0.5, 1.8, -0.6]).apply(directions) + 0.1 * RNG.normal(size=(8, 3))
     deviations, counts = RNG.normal(size=(30, 2)) @ np.array([[1.0, 0.0], [0.7, 0.3]]), np.array([10.0, 30.0, 60.0])
-    data = tuple(map(jnp.asarray, (directions, seen, deviations, counts)))
+    data = tuple(map(jnp.asarray, (directions, observed, deviations, counts)))
     start = {"turn": np.array([1.0, 0, 0, 0]), "covariance": np.eye(2), "shares": np.full(3, 1 / 3)}
     limits = {"turn": fit.rotation, "covariance": fit.spd, "shares": fit.simplex}
     method = fit.bfgs(tolerance=1e-10)
     found = fit.maximize(jax.tree_util.Partial(structured, data), start, limits, method=method)
-    best = Rotation.align_vectors(seen, directions)[0]
+    best = Rotation.align_vectors(observed, directions)[0]
     assert (Rotation.from_quat(found.theta["turn"], scalar_first=True) * best.inv()).magnitude() < 1e-4
     covariance = deviations.T @ deviations / 30
     np.testing.assert_allclose(found.theta["covariance"], covariance, rtol=1e-3)

@@ -88,9 +88,11 @@ def test_masked_components_are_as_if_they_were_not_there(x64, rng, name):
     arithmetic = ARITHMETICS[name]
     belief = belief_in(name, rng.normal(size=3), rng.normal(size=(3, 3)))
     H, root_R, y = rng.normal(size=(4, 3)), np.tril(rng.normal(size=(4, 4))), rng.normal(size=4)
-    seen = np.array([0, 2])
-    mask = jnp.isin(jnp.arange(4), seen)
-    expected = arithmetic.update(belief, jnp.asarray(y[seen]), jnp.asarray(H[seen]), noise_in(name, root_R[seen]))
+    observed = np.array([0, 2])
+    mask = jnp.isin(jnp.arange(4), observed)
+    expected = arithmetic.update(
+        belief, jnp.asarray(y[observed]), jnp.asarray(H[observed]), noise_in(name, root_R[observed])
+    )
     bad_y, bad_H = y.copy(), H.copy()
     bad_y[1], bad_y[3], bad_H[3] = np.nan, 1e9, np.inf
     R = np.array(noise_in(name, root_R))

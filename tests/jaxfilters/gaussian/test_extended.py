@@ -58,10 +58,10 @@ def covariance_of(belief):
     return belief.covariance if isinstance(belief, Gaussian) else belief.root @ np.swapaxes(belief.root, -1, -2)
 
 
-def textbook(seen, root_noise=False):
+def textbook(observed, root_noise=False):
     """Means, covariances and log evidences of the dense Kalman filter."""
     mean, P, found = MEAN, ROOT_P @ ROOT_P.T, []
-    for y, dt, rows in zip(YS, DTS, seen, strict=True):
+    for y, dt, rows in zip(YS, DTS, observed, strict=True):
         A = np.eye(N) + dt * F
         mean, P = A @ mean, A @ P @ A.T + dt ** (2 if root_noise else 1) * ROOT_Q @ ROOT_Q.T
         C, R = H[rows], (ROOT_R @ ROOT_R.T)[np.ix_(rows, rows)]
@@ -88,24 +88,24 @@ LINEAR = {
 @pytest.mark.system
 @pytest.mark.parametrize("options", LINEAR.values(), ids=LINEAR)
 def test_all_are_the_kalman_filter_where_the_model_is_linear(x64, options):
-    seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
-    ys = Observation(jnp.where(seen, YS, jnp.nan), jnp.asarray(seen))
+    observed = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
+    ys = Observation(jnp.where(observed, YS, jnp.nan), jnp.asarray(observed))
     filter = linear_filter(**options)
     _, (beliefs, infos) = run(filter, KEY, ys, jnp.asarray(DTS))
-    means, covariances, log_evidences = textbook(seen, options.get("arithmetic") is arithmetics.square_root)
+    means, covariances, log_evidences = textbook(observed, options.get("arithmetic") is arithmetics.square_root)
     np.testing.assert_allclose(beliefs.mean, means, atol=1e-9)
     np.testing.assert_allclose(covariance_of(beliefs), covariances, atol=1e-9)
     np.testing.assert_allclose(infos.log_evidence, log_evidences, atol=1e-9)
-    np.testing.assert_array_equal(infos.rank, seen.sum(axis=1))
+    np.testing.assert_array_equal(infos.rank, observed.sum(axis=1))
     np.testing.assert_array_equal(infos.num_invalid, 0)
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("arithmetic", [arithmetics.joseph, arithmetics.square_root])
 def test_what_was_not_read_is_left_out_counted_and_differentiated(x64, arithmetic):
-    seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
-    ys = jnp.where(seen, YS, jnp.nan)
-    log_evidences = textbook(seen, arithmetic is arithmetics.square_root)[2]
+    observed = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 1], [1, 1, 1]], bool)
+    ys = jnp.where(observed, YS, jnp.nan)
+    log_evidences = textbook(observed, arithmetic is arithmetics.square_root)[2]
 
     def evidence(filter, ys):
         _, infos = run(filter, KEY, ys, jnp.asarray(DTS), collect=keep_info)
@@ -114,7 +114,7 @@ def test_what_was_not_read_is_left_out_counted_and_differentiated(x64, arithmeti
     evaluate = jax.jit(jax.value_and_grad(evidence, (0, 1), has_aux=True))
     (value, num_invalid), slopes = evaluate(linear_filter(arithmetic), ys)
     np.testing.assert_allclose(value, log_evidences.sum(), rtol=1e-10)
-    np.testing.assert_array_equal(num_invalid, (~seen).sum(axis=1))
+    np.testing.assert_array_equal(num_invalid, (~observed).sum(axis=1))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 

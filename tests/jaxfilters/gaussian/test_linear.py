@@ -29,12 +29,12 @@ def build(n, m, arithmetic=jf.arithmetic.joseph, offsets=True):
     return jf.kalman(kind(jnp.asarray(mean), P), jnp.asarray(F), Q, jnp.asarray(H), R, arithmetic=arithmetic, **more)
 
 
-def textbook(n, m, seen):
+def textbook(n, m, observed):
     """Filtered means and covariances, log densities, and smoothed means, in numpy and float64."""
     mean, roots, F, H, b, d, ys = problem(n, m)
     P, Q, R = (root @ root.T for root in roots)
     means, covariances, log_densities, ahead = [], [], [], []
-    for y, rows in zip(ys, seen, strict=True):
+    for y, rows in zip(ys, observed, strict=True):
         mean, P = F @ mean + b, F @ P @ F.T + Q
         ahead.append((mean, P))
         C, innovation = H[rows], (y - H @ mean - d)[rows]
@@ -63,29 +63,29 @@ def covariance_of(belief):
 @pytest.mark.parametrize("name", ["joseph", "square_root", "fast"])
 @pytest.mark.parametrize("wide", [False, True])
 def test_filter_and_smoother_agree_with_textbook(n, m, name, wide):
-    seen = np.random.default_rng(1).random((T, m)) > 0.2
-    seen[3] = False
-    means, covariances, log_densities, smoothed = textbook(n, m, seen)
+    observed = np.random.default_rng(1).random((T, m)) > 0.2
+    observed[3] = False
+    means, covariances, log_densities, smoothed = textbook(n, m, observed)
     tolerance = 1e-9 if wide else 3e-4
     with jax.enable_x64(wide):
         filter = build(n, m, getattr(jf.arithmetic, name))
-        ys = jnp.where(seen, problem(n, m)[-1], jnp.nan)
+        ys = jnp.where(observed, problem(n, m)[-1], jnp.nan)
         _, (beliefs, infos) = jf.run(filter, KEY, ys)
         np.testing.assert_allclose(beliefs.mean, means, rtol=tolerance, atol=tolerance)
         np.testing.assert_allclose(covariance_of(beliefs), covariances, rtol=tolerance, atol=tolerance)
         np.testing.assert_allclose(infos.log_evidence, log_densities, rtol=tolerance, atol=10 * tolerance)
         found = jf.smoothing.rts(filter, beliefs)
         np.testing.assert_allclose(found.mean, smoothed, rtol=3 * tolerance, atol=3 * tolerance)
-        np.testing.assert_array_equal(infos.num_invalid, np.sum(~seen, axis=1))
+        np.testing.assert_array_equal(infos.num_invalid, np.sum(~observed, axis=1))
 
 
 @pytest.mark.parametrize(("n", "m"), SIZES)
 def test_masked_and_missing_components_are_the_same(n, m):
     ys = jnp.asarray(problem(n, m)[-1], float)
-    seen = jnp.asarray(np.random.default_rng(1).random((T, m)) > 0.3)
+    observed = jnp.asarray(np.random.default_rng(1).random((T, m)) > 0.3)
     filter = build(n, m)
-    missing = jf.run(filter, KEY, jnp.where(seen, ys, jnp.nan))[0]
-    masked = jf.run(filter, KEY, jf.Observation(ys, seen, jnp.broadcast_to(filter.params.R, (T, m, m))))[0]
+    missing = jf.run(filter, KEY, jnp.where(observed, ys, jnp.nan))[0]
+    masked = jf.run(filter, KEY, jf.Observation(ys, observed, jnp.broadcast_to(filter.params.R, (T, m, m))))[0]
     np.testing.assert_allclose(masked.mean, missing.mean, rtol=1e-4, atol=1e-5)
 
 

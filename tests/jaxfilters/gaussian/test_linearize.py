@@ -81,13 +81,13 @@ def test_second_order_finds_the_moments_of_a_quadratic(x64, rng, form):
     np.testing.assert_allclose(found.value, h(mean), rtol=1e-12)
 
     draws = mean[:, None] + root @ rng.normal(size=(n, 400_000))
-    seen = 0.5 * np.einsum("kij,in,jn->kn", bend, draws, draws) + slope @ draws
+    observed = 0.5 * np.einsum("kij,in,jn->kn", bend, draws, draws) + slope @ draws
     # The fourth moments of a quadratic form make the relative error of a variance about 1 / sqrt(400 000 / 6) here.
     exact = found.F @ P @ found.F.T + lost
-    np.testing.assert_allclose(np.cov(seen), exact, atol=0.02 * np.diag(exact).max())
-    np.testing.assert_allclose(np.diag(np.cov(seen)), np.diag(exact), rtol=0.02)
+    np.testing.assert_allclose(np.cov(observed), exact, atol=0.02 * np.diag(exact).max())
+    np.testing.assert_allclose(np.diag(np.cov(observed)), np.diag(exact), rtol=0.02)
     error = 4 * np.sqrt(np.diag(exact) / 400_000)
-    assert (abs(seen.mean(axis=1) - biased.value) < error).all()
+    assert (abs(observed.mean(axis=1) - biased.value) < error).all()
     np.testing.assert_allclose(biased.residual_root @ biased.residual_root.T, lost, rtol=1e-9)
 
 
@@ -100,12 +100,12 @@ def textbook_unscented(h, mean, P, alpha, beta, kappa):
     weights = np.full(2 * n + 1, 0.5 / spread)
     centre = 1 - n / spread
     mean_weights, weights[0] = np.append(centre, weights[1:]), centre + 1 - alpha**2 + beta
-    seen = np.array([h(point) for point in points])
-    expected = mean_weights @ seen
+    observed = np.array([h(point) for point in points])
+    expected = mean_weights @ observed
     return (
         expected,
-        np.einsum("i,ik,il->kl", weights, seen - expected, seen - expected),
-        np.einsum("i,ik,il->kl", weights, points - mean, seen - expected),
+        np.einsum("i,ik,il->kl", weights, observed - expected, observed - expected),
+        np.einsum("i,ik,il->kl", weights, points - mean, observed - expected),
     )
 
 

@@ -63,10 +63,10 @@ def test_covariances_follow_the_tangent_space(x64, rng):
     settled = retract_belief(turning, x, Gaussian(offset, jnp.asarray(root @ root.T)))
     draws = offset[:, None] + root @ rng.normal(size=(3, 40_000))
     points = jax.vmap(turning.retract, (None, -1), -1)(x, jnp.asarray(draws))
-    seen = np.asarray(jax.vmap(turning.local, (None, -1), -1)(settled.mean, points))
+    observed = np.asarray(jax.vmap(turning.local, (None, -1), -1)(settled.mean, points))
     P = np.asarray(settled.covariance)
     # Four standard errors of a sample covariance; curvature adds 1e-3 of a standard deviation.
-    assert (abs(np.cov(seen) - P) < 4 * np.sqrt((np.outer(np.diag(P), np.diag(P)) + P**2) / 40_000)).all()
+    assert (abs(np.cov(observed) - P) < 4 * np.sqrt((np.outer(np.diag(P), np.diag(P)) + P**2) / 40_000)).all()
     assert np.linalg.norm(P - root @ root.T) > 0.05 * np.linalg.norm(P)
 
 

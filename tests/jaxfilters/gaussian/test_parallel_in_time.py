@@ -24,12 +24,12 @@ SEEN = RNG.random((T, M)) < 0.7
 SEEN[1, 0] = SEEN[4] = False
 
 
-def one_after_the_other(model, ys, seen):
+def one_after_the_other(model, ys, observed):
     """Square-root filter and smoother in a plain loop."""
     offsets = [np.broadcast_to(model.b, (T, N)), np.broadcast_to(model.d, (T, M))]
     steps = [np.broadcast_to(leaf, (T, *leaf.shape[-2:])) for leaf in model[:4]]
     belief, beliefs, evidences = GaussianRoot(jnp.asarray(MEAN), jnp.asarray(ROOT)), [], []
-    for F, root_Q, H, root_R, b, d, y, mask in zip(*steps, *offsets, ys, seen, strict=True):
+    for F, root_Q, H, root_R, b, d, y, mask in zip(*steps, *offsets, ys, observed, strict=True):
         ahead = PREDICT(belief, jnp.asarray(F), jnp.asarray(root_Q), jnp.asarray(b))
         belief, info = UPDATE(ahead, jnp.asarray(y - d), jnp.asarray(H), jnp.asarray(root_R), None, jnp.asarray(mask))
         belief = GaussianRoot(belief.mean, belief.root[:, :N])
@@ -70,17 +70,17 @@ def test_the_beliefs_are_those_of_the_sequential_filter_and_smoother(x64):
 def test_masked_readings_do_not_matter_and_the_evidence_differentiates(x64):
     prior = GaussianRoot(jnp.asarray(MEAN), jnp.asarray(ROOT))
     # Few frames: every round of the scan is compiled, and its derivative.
-    steps, seen, some_ys = jax.tree.map(lambda leaf: jnp.asarray(leaf[:3]), (VARYING, SEEN, YS))
+    steps, observed, some_ys = jax.tree.map(lambda leaf: jnp.asarray(leaf[:3]), (VARYING, SEEN, YS))
 
     def evidence(scale, ys):
         scaled = steps._replace(F=scale[0] * steps.F, root_R=scale[1] * steps.root_R)
-        return parallel_kalman(prior, scaled, ys, seen)[1].sum()
+        return parallel_kalman(prior, scaled, ys, observed)[1].sum()
 
     evaluate = jax.jit(jax.value_and_grad(evidence))
     scale = jnp.array([1.0, 1.2])
-    value, slope = evaluate(scale, jnp.where(seen, some_ys, jnp.nan))
-    np.testing.assert_allclose(evaluate(scale, jnp.where(seen, some_ys, 7.0))[0], value, rtol=1e-12)
-    ys = jnp.where(seen, some_ys, 0.0)
+    value, slope = evaluate(scale, jnp.where(observed, some_ys, jnp.nan))
+    np.testing.assert_allclose(evaluate(scale, jnp.where(observed, some_ys, 7.0))[0], value, rtol=1e-12)
+    ys = jnp.where(observed, some_ys, 0.0)
     differences = [(evaluate(scale + e, ys)[0] - evaluate(scale - e, ys)[0]) / 2e-6 for e in 1e-6 * np.eye(2)]
     np.testing.assert_allclose(slope, differences, rtol=1e-6)
 

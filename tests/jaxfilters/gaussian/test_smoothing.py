@@ -54,10 +54,10 @@ def joint_posterior():
             P[i * N : (i + 1) * N, j * N : (j + 1) * N] = block
             P[j * N : (j + 1) * N, i * N : (i + 1) * N] = block.T
     mean, P = np.concatenate(means)[N:], P[N:, N:]
-    seen = SEEN.ravel()
-    C = np.kron(np.eye(T), H)[seen]
-    R = np.kron(np.eye(T), ROOT_R @ ROOT_R.T)[np.ix_(seen, seen)]
-    S, surprise = C @ P @ C.T + R, YS.ravel()[seen] - C @ mean
+    observed = SEEN.ravel()
+    C = np.kron(np.eye(T), H)[observed]
+    R = np.kron(np.eye(T), ROOT_R @ ROOT_R.T)[np.ix_(observed, observed)]
+    S, surprise = C @ P @ C.T + R, YS.ravel()[observed] - C @ mean
     gain = P @ C.T @ np.linalg.inv(S)
     log_evidence = -0.5 * (surprise @ np.linalg.solve(S, surprise) + np.linalg.slogdet(2 * np.pi * S)[1])
     posterior = P - gain @ C @ P

@@ -52,12 +52,14 @@ def test_draws_follow_the_chain_and_the_emission():
     states, y = hmm.sample(jax.random.key(0), model(), 40_000)
     states, y = np.asarray(states), np.asarray(y)
     for i in range(3):
-        after, seen = states[1:][states[:-1] == i], y[states == i]
+        after, observed = states[1:][states[:-1] == i], y[states == i]
         count = len(after)
         # 4 standard deviations of a relative frequency; what is impossible never happens.
         np.testing.assert_allclose(np.bincount(after, minlength=3) / count, TRANSITION[i], atol=2 / np.sqrt(count))
         np.testing.assert_allclose(
-            np.bincount(seen, minlength=3) / len(seen), np.exp(model().emission.log_probability[i]), atol=2 / count**0.5
+            np.bincount(observed, minlength=3) / len(observed),
+            np.exp(model().emission.log_probability[i]),
+            atol=2 / count**0.5,
         )
         assert not np.any(np.isin(after, np.flatnonzero(TRANSITION[i] == 0)))
     firsts = jax.vmap(lambda key: hmm.sample(key, model(), 1)[0][0])(jax.random.split(jax.random.key(1), 2000))

@@ -35,11 +35,15 @@ def test_the_objective_never_falls_rows_sum_to_one_and_zeros_stay(x64, pseudo_co
     gain = np.diff(trained.objective)
     assert np.all(gain >= -1e-8 * abs(trained.objective[1:]))
     assert trained.objective[-1] > trained.objective[0] + 10
-    learnt = trained.model
-    for rows in (learnt.log_initial, learnt.log_transition, *(part.log_probability for part in learnt.emission.parts)):
+    learned = trained.model
+    for rows in (
+        learned.log_initial,
+        learned.log_transition,
+        *(part.log_probability for part in learned.emission.parts),
+    ):
         np.testing.assert_allclose(np.exp(rows).sum(-1), 1, rtol=0, atol=1e-12)
-    assert np.all(learnt.log_transition[~hmm.left_right(4)] == -np.inf)
-    assert np.all(learnt.log_initial[1:] == -np.inf)
+    assert np.all(learned.log_transition[~hmm.left_right(4)] == -np.inf)
+    assert np.all(learned.log_initial[1:] == -np.inf)
 
 
 @pytest.mark.parametrize("family", ["diagonal", "full"])
@@ -74,12 +78,12 @@ def test_one_iteration_moves_to_the_expected_counts(x64):
     model = code_model(3, pseudo_count=0.0)
     (codes, counts), _ = hmm.pad(code_sequences(4, (9,)))
     found = hmm.posterior(model, model.log_likelihoods((codes[:, 0], counts[:, 0])))
-    learnt = hmm.baum_welch(model, (codes, counts), max_iterations=1).model
+    learned = hmm.baum_welch(model, (codes, counts), max_iterations=1).model
     totals = found.transitions.sum(1, keepdims=True)
-    np.testing.assert_allclose(np.exp(learnt.log_transition), found.transitions / totals, atol=1e-12)
+    np.testing.assert_allclose(np.exp(learned.log_transition), found.transitions / totals, atol=1e-12)
     own = np.stack([found.states[codes[:, 0] == c].sum(0) for c in range(NUM_CODES)], axis=1)
     np.testing.assert_allclose(
-        np.exp(learnt.emission.parts[0].log_probability), own / own.sum(1, keepdims=True), atol=1e-12
+        np.exp(learned.emission.parts[0].log_probability), own / own.sum(1, keepdims=True), atol=1e-12
     )
 
 
@@ -108,16 +112,18 @@ def test_the_model_that_drew_the_data_is_found_again():
         hmm.ergodic(2), hmm.DiagonalGaussian(jnp.zeros((2, 1)), jnp.ones((2, 1))), initial=np.array([True, True])
     )
     trained = hmm.best_of_restarts(jax.random.key(10), start, y, jnp.full(60, 100), num_restarts=4)
-    learnt = trained.model
-    order = np.argsort(np.asarray(learnt.emission.mean[:, 0]))
+    learned = trained.model
+    order = np.argsort(np.asarray(learned.emission.mean[:, 0]))
     # Some 4000 and 2000 frames: 4 standard deviations, roughly.
-    np.testing.assert_allclose(learnt.emission.mean[order, 0], [-1, 2], atol=0.1)
-    np.testing.assert_allclose(learnt.emission.variance[order, 0], [0.25, 1], rtol=0.15)
-    np.testing.assert_allclose(np.exp(learnt.log_transition)[np.ix_(order, order)], [[0.9, 0.1], [0.2, 0.8]], atol=0.04)
+    np.testing.assert_allclose(learned.emission.mean[order, 0], [-1, 2], atol=0.1)
+    np.testing.assert_allclose(learned.emission.variance[order, 0], [0.25, 1], rtol=0.15)
+    np.testing.assert_allclose(
+        np.exp(learned.log_transition)[np.ix_(order, order)], [[0.9, 0.1], [0.2, 0.8]], atol=0.04
+    )
     assert trained.converged
     assert trained.num_iterations < 30
     likelihood = lambda model: hmm.log_evidence(model, jax.vmap(model.log_likelihoods, -1, -1)(y)).sum()
-    assert likelihood(learnt) >= likelihood(truth) - 1
+    assert likelihood(learned) >= likelihood(truth) - 1
 
 
 def test_frames_that_were_not_seen_teach_nothing_but_take_time(x64):

@@ -177,11 +177,11 @@ def test_moments_are_those_of_numpy_wherever_the_data_lie(x64):
     x = samples(12, 200) + 1e3
     x = np.insert(x, [0, 50], np.nan, axis=0)
     moments = moments_of(x)
-    seen = x[np.all(np.isfinite(x), axis=1)]
-    np.testing.assert_allclose(moments.mean, seen.mean(0), rtol=1e-13)
-    np.testing.assert_allclose(moments.scatter / 199, np.cov(seen.T), rtol=1e-10, atol=1e-10)
+    observed = x[np.all(np.isfinite(x), axis=1)]
+    np.testing.assert_allclose(moments.mean, observed.mean(0), rtol=1e-13)
+    np.testing.assert_allclose(moments.scatter / 199, np.cov(observed.T), rtol=1e-10, atol=1e-10)
     basis, variances = incremental_pca.exact_principal_components(moments, 3)
-    values, vectors = np.linalg.eigh(np.cov(seen.T))
+    values, vectors = np.linalg.eigh(np.cov(observed.T))
     np.testing.assert_allclose(variances, values[:-4:-1], rtol=1e-10)
     np.testing.assert_allclose(np.abs(np.sum(basis * vectors[:, :-4:-1], axis=0)), 1, rtol=1e-10)
 

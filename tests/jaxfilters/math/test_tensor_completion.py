@@ -24,15 +24,15 @@ def X(x64):
 @pytest.fixture
 def observed():
     """48 of 56 cells."""
-    seen = np.ones(SHAPE[1:], bool)
-    seen[[0, 1, 2, 3, 4, 5, 6, 7], [3, 0, 6, 2, 3, 5, 1, 4]] = False
-    return jnp.asarray(seen)
+    visible = np.ones(SHAPE[1:], bool)
+    visible[[0, 1, 2, 3, 4, 5, 6, 7], [3, 0, 6, 2, 3, 5, 1, 4]] = False
+    return jnp.asarray(visible)
 
 
-def weighted_least_squares(X, seen, core, people, actions, sweeps):
+def weighted_least_squares(X, visible, core, people, actions, sweeps):
     """Observed squared error after solving for the core, for each person's and each action's row in turn."""
     X, core, people, actions = (np.array(a) for a in (X, core, people, actions))
-    cells = np.argwhere(seen)
+    cells = np.argwhere(visible)
     for _ in range(sweeps):
         for i in range(len(people)):
             basis = [np.einsum("fjk,k->fj", core, actions[a]) for s, a in cells if s == i]
@@ -45,7 +45,7 @@ def weighted_least_squares(X, seen, core, people, actions, sweeps):
         design = np.stack([np.kron(people[s], actions[a]) for s, a in cells])
         core = np.linalg.lstsq(design, np.stack([X[:, s, a] for s, a in cells]))[0].T.reshape(core.shape)
     left = X - np.einsum("fjk,sj,ak->fsa", core, people, actions)
-    return np.sum(left[:, seen] ** 2)
+    return np.sum(left[:, visible] ** 2)
 
 
 def test_with_nothing_missing_it_is_the_best_approximation(X):

@@ -13,11 +13,11 @@ from jaxfilters.optimize.shared_least_squares import Split, solve_shared
 NUM_FRAMES, NUM_POINTS = 6, 7
 
 
-def residuals(shared, frame, seen):
+def residuals(shared, frame, observed):
     """A flat shape, scaled, turned and moved in each frame: points (K, 2) against those seen."""
     c, s = jnp.cos(frame["angle"]), jnp.sin(frame["angle"])
     turned = jnp.array([[c, -s], [s, c]])
-    return (frame["size"] * shared @ turned.T + frame["place"] - seen).ravel()
+    return (frame["size"] * shared @ turned.T + frame["place"] - observed).ravel()
 
 
 def prior(shared):
@@ -116,10 +116,12 @@ def test_scipy_finds_nothing_better(x64):
 def test_it_runs_in_single_precision_and_under_vmap():
     starts, data = zip(*(problem(seed) for seed in range(3)), strict=True)
     stack = lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in leaves])
-    start, seen = jax.tree.map(stack, *starts), jnp.stack(data).astype(jnp.float32)
-    found = jax.vmap(lambda start, seen: solve_shared(residuals, start, seen, prior=prior, steps=30))(start, seen)
+    start, observed = jax.tree.map(stack, *starts), jnp.stack(data).astype(jnp.float32)
+    found = jax.vmap(lambda start, observed: solve_shared(residuals, start, observed, prior=prior, steps=30))(
+        start, observed
+    )
     assert found.energy.shape == (3,)
-    one = solve_shared(residuals, jax.tree.map(lambda leaf: leaf[1], start), seen[1], prior=prior, steps=30)
+    one = solve_shared(residuals, jax.tree.map(lambda leaf: leaf[1], start), observed[1], prior=prior, steps=30)
     np.testing.assert_allclose(found.energy[1], one.energy, rtol=1e-4)
 
 

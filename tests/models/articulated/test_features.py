@@ -138,23 +138,23 @@ def test_undirected_residual_does_not_depend_on_the_notation(seed):
 def test_no_jump_across_the_end_of_the_angles(residual):
     y, names = random_rows(0)
     is_alpha = np.char.find(names, "alpha") >= 0
-    y_hat, seen = y.copy(), y.copy()
-    y_hat[is_alpha], seen[is_alpha] = np.pi - 0.01, -np.pi + 0.02
-    change = np.asarray(residual(jnp.asarray(seen), jnp.asarray(y_hat), FULL, 2))
+    y_hat, observed = y.copy(), y.copy()
+    y_hat[is_alpha], observed[is_alpha] = np.pi - 0.01, -np.pi + 0.02
+    change = np.asarray(residual(jnp.asarray(observed), jnp.asarray(y_hat), FULL, 2))
     np.testing.assert_allclose(change, np.where(is_alpha, 0.03, 0), atol=1e-12)
 
 
 def test_a_small_error_seen_the_other_way_round_is_small():
     y_hat, names = random_rows(3)
-    seen = in_other_notation(y_hat, names, ["12", "palm"])
-    change = undirected_residual(jnp.asarray(seen + 1e-3), jnp.asarray(y_hat), FULL, 2)
+    observed = in_other_notation(y_hat, names, ["12", "palm"])
+    change = undirected_residual(jnp.asarray(observed + 1e-3), jnp.asarray(y_hat), FULL, 2)
     np.testing.assert_allclose(np.abs(change), 1e-3, atol=1e-12)
 
 
 def test_directed_lines_are_not_turned_round():
     y, names = random_rows(4)
-    seen = in_other_notation(y, names, ["11"])
-    change = np.asarray(directed_residual(jnp.asarray(seen), jnp.asarray(y), FULL, 2))
+    observed = in_other_notation(y, names, ["11"])
+    change = np.asarray(directed_residual(jnp.asarray(observed), jnp.asarray(y), FULL, 2))
     assert abs(change[names == "alpha_11"].item()) == pytest.approx(np.pi)
     assert change[names == "rho_11"].item() == pytest.approx(-2 * y[names == "rho_11"].item())
 

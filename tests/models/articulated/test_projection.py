@@ -50,9 +50,9 @@ def test_perspective_is_weak_perspective_for_a_far_camera(layouts, random_state)
             camera = pinhole(focal)
             hand = perspective_hand(space, camera)
             shifted = [i for i, name in enumerate(hand.feature_names) if name.startswith(("wrist", "p_"))]
-            seen = np.array(hand.observe(jnp.asarray(y)))
-            seen[shifted] -= np.tile(camera.center, len(shifted) // 2)
-            errors.append(np.max(np.abs(hand.residual(jnp.asarray(seen), jnp.asarray(expected)))))
+            observed = np.array(hand.observe(jnp.asarray(y)))
+            observed[shifted] -= np.tile(camera.center, len(shifted) // 2)
+            errors.append(np.max(np.abs(hand.residual(jnp.asarray(observed), jnp.asarray(expected)))))
         # A point 300 pixels off the axis and 300 deep moves by 300^2 / distance; the rest is its effect on short lines.
         assert errors[1] < 0.1
         assert errors[1] < errors[0] / 50
@@ -66,11 +66,11 @@ def test_perspective_points_are_projected_by_the_camera(random_state):
     # The first finger begins at the palm's end, a quarter of its width from the middle.
     width, height, _ = x[layout.palm]
     base = R @ (height, 0, width / 4) + x[layout.position]
-    seen = dict(zip(hand.feature_names, np.asarray(hand.observe(jnp.asarray(x))), strict=True))
+    observed = dict(zip(hand.feature_names, np.asarray(hand.observe(jnp.asarray(x))), strict=True))
     expected = 500 * base[:2] / base[2] + (320, 240)
-    np.testing.assert_allclose([seen["p_10_x"], seen["p_10_y"]], expected, rtol=1e-12)
+    np.testing.assert_allclose([observed["p_10_x"], observed["p_10_y"]], expected, rtol=1e-12)
     wrist = 500 * x[:2] / x[2] + (320, 240)
-    np.testing.assert_allclose([seen["wrist_x"], seen["wrist_y"]], wrist, rtol=1e-12)
+    np.testing.assert_allclose([observed["wrist_x"], observed["wrist_y"]], wrist, rtol=1e-12)
 
 
 def test_perspective_ignores_the_length_of_the_quaternion(random_state):

@@ -40,8 +40,8 @@ class PlaneScene:
         return points @ Rotation.from_euler("ZYX", pose[3:]).as_matrix().T + pose[:3]
 
     def pixels(self, camera, world):
-        seen = world + PLACES[camera]
-        return FOCAL * seen[..., :2] / seen[..., 2:] + MIDDLES[camera]
+        observed = world + PLACES[camera]
+        return FOCAL * observed[..., :2] / observed[..., 2:] + MIDDLES[camera]
 
     def uv(self, pose, points=SHAPE):
         return np.stack([self.pixels(c, self.world(pose, points)) for c in range(2)])

@@ -55,7 +55,7 @@ def test_shifts_by_fractions_of_a_pixel_are_found(face):
         pose = face.scene.registered + np.array([*rng.uniform(-1, 1, 2), 0, 0, 0, 0])
         found = face.align(face.scene.images(pose), pose, rng.uniform(-2, 2, (2, 6, 2)))
         assert np.abs(found.uv - face.scene.uv(pose)).max() < 0.02
-        assert np.all(found.seen)
+        assert np.all(found.observed)
         assert found.score.min() > 0.998
 
 
@@ -193,16 +193,16 @@ def test_a_patch_faces_a_camera_up_to_a_given_angle(face, head_poses):
 def test_what_cannot_be_seen_is_not_seen(face):
     pose = face.scene.registered.copy()
     images = jnp.asarray(face.scene.images(pose))
-    seen = lambda pose, uv: align(face.patches, face.slopes, images, uv, face.shape, jnp.asarray(pose), face.rig)
+    observed = lambda pose, uv: align(face.patches, face.slopes, images, uv, face.shape, jnp.asarray(pose), face.rig)
     uv = jnp.asarray(face.scene.uv(pose)).at[0, 0].set(jnp.array([-30.0, 40])).at[1, 5].set(jnp.nan)
-    found = seen(pose, uv)
+    found = observed(pose, uv)
     expected = np.ones((2, 6), bool)
     expected[0, 0] = expected[1, 5] = False
-    np.testing.assert_array_equal(found.seen, expected)
-    turned_away = seen(pose + np.array([0, 0, 0, 0, np.pi, 0]), jnp.asarray(face.scene.uv(pose)))
-    behind = seen(pose - np.array([0, 0, 2000.0, 0, 0, 0]), jnp.full((2, 6, 2), jnp.nan))
+    np.testing.assert_array_equal(found.observed, expected)
+    turned_away = observed(pose + np.array([0, 0, 0, 0, np.pi, 0]), jnp.asarray(face.scene.uv(pose)))
+    behind = observed(pose - np.array([0, 0, 2000.0, 0, 0, 0]), jnp.full((2, 6, 2), jnp.nan))
     for nothing in (turned_away, behind):
-        assert not np.any(nothing.seen)
+        assert not np.any(nothing.observed)
         assert np.all(np.isfinite(nothing.uv))
         np.testing.assert_array_equal(nothing.slope_information, 0)
 

@@ -145,10 +145,10 @@ def test_the_box_is_never_empty_and_holds_the_clipped_start(x64, far):
 def test_landmarks_that_are_not_seen_say_nothing(x64):
     true = truth(6)
     views = views_of(true)
-    hidden = views.seen.at[2, 4:].set(False)
+    hidden = views.observed.at[2, 4:].set(False)
     wrong = views.uv.at[2, 4:].add(50.0).at[2, 5].set(jnp.nan)
-    one, _ = _adjusted(views._replace(seen=hidden), preset(), HELD)
-    other, _ = _adjusted(views._replace(seen=hidden, uv=wrong), preset(), HELD)
+    one, _ = _adjusted(views._replace(observed=hidden), preset(), HELD)
+    other, _ = _adjusted(views._replace(observed=hidden, uv=wrong), preset(), HELD)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
@@ -198,14 +198,14 @@ def test_a_past_is_the_gaussian_that_it_says(x64):
     def energy(bundle, prior):
         return 0.5 * np.sum(np.square(all_residuals(face(), rig(), views, bundle, prior)))
 
-    def told(bundle):
+    def message(bundle):
         p = np.asarray(parameters(bundle.person))
         return 0.5 * np.sum((root @ p - values) ** 2)
 
     other = true._replace(person=truth(12).person._replace(offset=jnp.asarray(rng.normal(0, 0.5, (10, 3)))))
     held = HELD._replace(past=past)
     added = [energy(bundle, held) - energy(bundle, HELD) for bundle in (true, other)]
-    assert added[0] - added[1] == pytest.approx(told(true) - told(other), rel=1e-4)
+    assert added[0] - added[1] == pytest.approx(message(true) - message(other), rel=1e-4)
 
 
 def test_a_past_that_tells_nothing_changes_nothing(x64):

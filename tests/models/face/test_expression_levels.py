@@ -65,8 +65,8 @@ def test_people_are_aligned_whatever_their_heads_did(x64):
     aligned = aligned_people(jnp.asarray(shapes), 1, jnp.asarray(SKULL))
     assert np.isnan(aligned[2, 5]).all()
     expected = aligned_people(straight, 1, jnp.asarray(SKULL))
-    seen = ~np.isnan(shapes)
-    np.testing.assert_allclose(np.asarray(aligned)[seen], np.asarray(expected)[seen], atol=1e-6)
+    observed = ~np.isnan(shapes)
+    np.testing.assert_allclose(np.asarray(aligned)[observed], np.asarray(expected)[observed], atol=1e-6)
     assert np.sqrt(np.mean(np.square(expected - straight))) < 2.0
     sizes = lambda faces: np.linalg.norm(faces - np.mean(faces, axis=2, keepdims=True), axis=(2, 3))
     np.testing.assert_allclose(sizes(np.asarray(expected)), sizes(np.asarray(straight)), rtol=1e-9)

@@ -130,7 +130,7 @@ def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, sc
 @pytest.mark.system
 def test_hidden_landmarks_tell_less(x64, scene):
     face, rig, view, frame = scene
-    some = view._replace(seen=view.seen.at[0, :4].set(False))
+    some = view._replace(observed=view.observed.at[0, :4].set(False))
     more, less = (frame_information(face, rig, v, frame, Prior(1.0, 1.0)).information for v in (view, some))
     assert np.linalg.eigvalsh(np.asarray(more - less)).min() > -1e-8
     assert np.trace(more) > np.trace(less)
@@ -153,14 +153,14 @@ def test_the_gradient_is_that_of_the_energy_with_the_frame_at_its_best(x64, scen
     def residuals(own, y):
         who = Person(frame.person.identity + y[:10], y[10:].reshape(10, 3))
         bundle = Bundle(frame.poses + POSE_UNITS * own[:6], frame.expressions + face.expression_std * own[6:], who)
-        seen = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
+        observed = all_residuals(face, rig, noisy, bundle, Prior(0.0, 0.0))
         apart = bundle.expressions[0] - face.expression_mean
         # What it moves in proportion to the size of the face.
         spread = lambda who, a: jnp.linalg.norm(jnp.std(shape(face, who, a)[:, :2], axis=0))
         moved = lambda who: jnp.linalg.norm(expression_basis(face, who) @ root)
         ratio = spread(who.identity, bundle.expressions[0]) / spread(face.identity_mean, face.expression_mean)
         ratio = ratio * moved(face.identity_mean) / moved(who.identity)
-        return jnp.concatenate([seen, jax.scipy.linalg.solve_triangular(root, apart, lower=True) / ratio])
+        return jnp.concatenate([observed, jax.scipy.linalg.solve_triangular(root, apart, lower=True) / ratio])
 
     jacobian = jax.jit(jax.jacfwd(residuals))
 

@@ -176,10 +176,10 @@ def test_turned_templates_are_what_the_images_show(plane_scene, head_poses, x64)
     gained = []
     windows = jax.vmap(cut)
     for pose in head_poses.more:
-        seen = windows(jnp.asarray(plane_scene.images(pose)), jnp.asarray(plane_scene.uv(pose)))
+        observed = windows(jnp.asarray(plane_scene.images(pose)), jnp.asarray(plane_scene.uv(pose)))
         affine = stretched(plane_scene, found, pose)
-        still = compare(seen, found.template.reshape(seen.shape))
-        gained.append((np.asarray(still), np.asarray(compare(seen, turned(found, affine)))))
+        still = compare(observed, found.template.reshape(observed.shape))
+        gained.append((np.asarray(still), np.asarray(compare(observed, turned(found, affine)))))
     before, after = np.stack(gained, axis=1)
     assert before.min() < 0.85
     assert after.min() > 0.99
@@ -216,10 +216,10 @@ def test_views_add_up_as_bayes_has_it(x64):
     for _ in range(4):
         rows = rng.normal(0, 3, (3, 5, 2))
         one = np.einsum("kri,krj->kij", rows, rows)
-        seen = np.einsum("kri,kri->kr", rows, true[:, None]) + 0.1 * rng.normal(size=(3, 5))
-        information, score = information + one, score + np.einsum("kri,kr->ki", rows, seen)
+        observed = np.einsum("kri,kri->kr", rows, true[:, None]) + 0.1 * rng.normal(size=(3, 5))
+        information, score = information + one, score + np.einsum("kri,kr->ki", rows, observed)
         # What a view says is measured against the slopes so far.
-        apart = np.einsum("kri,kr->ki", rows, seen - np.einsum("kri,ki->kr", rows, slopes.mean))
+        apart = np.einsum("kri,kr->ki", rows, observed - np.einsum("kri,ki->kr", rows, slopes.mean))
         slopes = learn_slopes(slopes, jnp.asarray(one), jnp.asarray(apart))
     np.testing.assert_allclose(slopes.mean, np.linalg.solve(information, score[..., None])[..., 0], rtol=1e-9)
     np.testing.assert_allclose(slopes.covariance, np.linalg.inv(information), rtol=1e-9)

@@ -162,9 +162,9 @@ def test_a_landmark_in_one_image_alone_is_judged_by_that_one(scene):
     """Half of the first image is away: the equations of its landmarks are those of the second camera."""
     aside = scene.pose.at[0].set(-230.0)
     uv, _ = project_shape(scene.rig, scene.start, aside)
-    seen = np.asarray(inside(scene.rig.shape, uv, 18))
-    assert seen[0].any()
-    assert not seen[1].all()
+    observed = np.asarray(inside(scene.rig.shape, uv, 18))
+    assert observed[0].any()
+    assert not observed[1].all()
     images, previous, first, _, rig = scene.arguments
     both = normal_equations(scene.start, scene.estimated, images, previous, first, aside, rig)
     halves = [
@@ -175,7 +175,7 @@ def test_a_landmark_in_one_image_alone_is_judged_by_that_one(scene):
     ]
     prior = 2 * EPSILON * np.eye(3)
     np.testing.assert_allclose(both.matrix, halves[0].matrix + halves[1].matrix - prior, rtol=1e-10)
-    only_left = ~seen[1] & seen[0]
+    only_left = ~observed[1] & observed[0]
     assert only_left.any()
     np.testing.assert_allclose(both.residual[only_left], halves[0].residual[only_left], rtol=1e-12)
 

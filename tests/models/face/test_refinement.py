@@ -54,13 +54,13 @@ class Face:
         self.by_slope = jnp.asarray(rng.normal(0, 0.3, (2, 10, 2, 2)))
         self.prior = Gaussian(jnp.asarray([*POSE, 0.0, 0.0]), jnp.diag(jnp.asarray(PRIOR_STD**2)))
 
-    def found(self, uv, seen=None):
-        seen = jnp.ones((2, 10), bool) if seen is None else seen
+    def found(self, uv, observed=None):
+        observed = jnp.ones((2, 10), bool) if observed is None else observed
         return Alignment(
             uv=jnp.asarray(uv),
             covariance=jnp.broadcast_to(jnp.asarray(NOISE), (2, 10, 2, 2)),
             score=jnp.ones((2, 10)),
-            seen=seen,
+            observed=observed,
             by_slope=self.by_slope,
             slope_information=jnp.zeros((10, 2, 2)),
             slope_score=jnp.zeros((10, 2)),
@@ -99,21 +99,21 @@ def the_face():
     return Face()
 
 
-def covariances(face, x, seen):
+def covariances(face, x, observed):
     """Of the seen rows of each landmark, as the module's text has them, in NumPy."""
     blocks = []
     for k in range(10):
         J, bend = (np.concatenate([a[c, k] for c in range(2)]) for a in (face.by_shape(x), np.asarray(face.by_slope)))
         S = LOOSE_STD**2 * J @ J.T + SLOPE_STD**2 * bend @ bend.T
         S += np.kron(np.eye(2), NOISE + PIXEL_FLOOR**2 * np.eye(2))
-        rows = np.repeat(np.asarray(seen)[:, k], 2)
+        rows = np.repeat(np.asarray(observed)[:, k], 2)
         blocks.append(S[np.ix_(rows, rows)])
     return blocks
 
 
-def residuals(face, uv, x, seen):
+def residuals(face, uv, x, observed):
     off = np.asarray(uv) - np.asarray(face.project(x))
-    return [off[:, k][np.asarray(seen)[:, k]].ravel() for k in range(10)]
+    return [off[:, k][np.asarray(observed)[:, k]].ravel() for k in range(10)]
 
 
 def some_seen():
@@ -127,13 +127,13 @@ def test_the_fit_is_the_least_squares_of_scipy(face, outlier):
     Five rounds of reweighting leave a few hundredths of a standard deviation.
     """
     _, uv = face.draw(jax.random.key(1))
-    seen = some_seen()
+    observed = some_seen()
     uv = uv.at[:, 5].add(outlier)
-    found = face.refine(face.found(uv, seen))
-    whiten = [np.linalg.inv(np.linalg.cholesky(S)) for S in covariances(face, found.belief.mean, seen)]
+    found = face.refine(face.found(uv, observed))
+    whiten = [np.linalg.inv(np.linalg.cholesky(S)) for S in covariances(face, found.belief.mean, observed)]
 
     def function(x):
-        white = [L @ r for L, r in zip(whiten, residuals(face, uv, x, seen), strict=True)]
+        white = [L @ r for L, r in zip(whiten, residuals(face, uv, x, observed), strict=True)]
         student = [np.sqrt((NU + len(w)) * np.log1p(w @ w / NU)) for w in white]
         return np.concatenate([student, (x - np.asarray(face.prior.mean)) / PRIOR_STD])
 
@@ -143,14 +143,14 @@ def test_the_fit_is_the_least_squares_of_scipy(face, outlier):
     assert np.abs(fit.x - np.asarray(face.prior.mean)).max() > 1
 
 
-def information_at(face, found, uv, seen, fisher=False):
+def information_at(face, found, uv, observed, fisher=False):
     """Of the prior and all landmarks, written out; and the landmarks' residuals and covariances."""
     x = np.asarray(found.belief.mean)
-    S, off = covariances(face, x, seen), residuals(face, uv, x, seen)
+    S, off = covariances(face, x, observed), residuals(face, uv, x, observed)
     H = np.asarray(by_state(face.rig, face.model, found.belief.mean, jnp.asarray(0.0)))
     information = np.diag(PRIOR_STD**-2.0)
     for k, (r, C) in enumerate(zip(off, S, strict=True)):
-        h = H[:, k][np.asarray(seen)[:, k]].reshape(-1, 8)
+        h = H[:, k][np.asarray(observed)[:, k]].reshape(-1, 8)
         trust = (NU + r.size) / (NU + r @ np.linalg.solve(C, r)) if r.size else 1.0
         assert float(found.trust[k]) == pytest.approx(trust, rel=1e-6)
         trust *= (NU + r.size) / (NU + r.size + 2) if fisher else 1.0
@@ -160,9 +160,9 @@ def information_at(face, found, uv, seen, fisher=False):
 
 def test_the_evidence_is_that_of_student_and_laplace(face):
     _, uv = face.draw(jax.random.key(2))
-    seen = some_seen()
-    found = face.refine(face.found(uv, seen))
-    information, off, S = information_at(face, found, uv, seen)
+    observed = some_seen()
+    found = face.refine(face.found(uv, observed))
+    information, off, S = information_at(face, found, uv, observed)
     evidence = multivariate_normal.logpdf(found.belief.mean, face.prior.mean, np.diag(PRIOR_STD**2.0))
     evidence += sum(multivariate_t.logpdf(r, shape=C, df=NU) for r, C in zip(off, S, strict=True) if r.size)
     evidence += 4 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
@@ -176,11 +176,13 @@ def test_the_covariance_is_inverse_expected_information_and_a_bias_of_whole_imag
     The bias is how far the fit goes when all landmarks of an image are a little off; central differences.
     """
     _, uv = face.draw(jax.random.key(2))
-    seen = some_seen()
-    found = face.refine(face.found(uv, seen))
-    ends = [[face.refine(face.found(uv.at[c, :, i].add(s), seen)) for s in (0.02, -0.02)] for c, i in np.ndindex(2, 2)]
+    observed = some_seen()
+    found = face.refine(face.found(uv, observed))
+    ends = [
+        [face.refine(face.found(uv.at[c, :, i].add(s), observed)) for s in (0.02, -0.02)] for c, i in np.ndindex(2, 2)
+    ]
     moved = COMMON_BIAS_PX * np.array([(a.belief.mean - b.belief.mean) / 0.04 for a, b in ends])
-    information, _, _ = information_at(face, found, uv, seen, fisher=True)
+    information, _, _ = information_at(face, found, uv, observed, fisher=True)
     scale = np.sqrt(np.diagonal(found.belief.covariance))
     expected = np.linalg.inv(information) + moved.T @ moved
     np.testing.assert_allclose(
@@ -301,11 +303,11 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
 @pytest.mark.parametrize("garbage", [1e3, np.nan, np.inf])
 def test_landmarks_that_are_not_seen_or_score_low_do_not_count(face, garbage):
     _, uv = face.draw(jax.random.key(6))
-    seen = some_seen()
-    expected = face.refine(face.found(uv, seen))
-    wrong = face.found(jnp.where(seen[..., None], uv, garbage), seen)
-    again = face.refine(wrong._replace(covariance=jnp.where(seen[..., None, None], wrong.covariance, garbage)))
-    low = wrong._replace(seen=jnp.ones((2, 10), bool), score=jnp.where(seen, 1.0, LEAST_SCORE - 0.01))
+    observed = some_seen()
+    expected = face.refine(face.found(uv, observed))
+    wrong = face.found(jnp.where(observed[..., None], uv, garbage), observed)
+    again = face.refine(wrong._replace(covariance=jnp.where(observed[..., None, None], wrong.covariance, garbage)))
+    low = wrong._replace(observed=jnp.ones((2, 10), bool), score=jnp.where(observed, 1.0, LEAST_SCORE - 0.01))
     for found in (again, face.refine(low)):
         np.testing.assert_allclose(found.belief.mean, expected.belief.mean, atol=1e-9)
         np.testing.assert_allclose(found.belief.covariance, expected.belief.covariance, rtol=1e-9, atol=1e-12)

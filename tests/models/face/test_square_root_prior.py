@@ -94,7 +94,7 @@ def test_single_precision_holds_what_hundreds_of_frames_tell():
     rng = np.random.default_rng(6)
     true = STD * rng.normal(size=SIZE)
     open_to_all = np.linalg.qr(rng.normal(size=(SIZE, 2)))[0]
-    told, past = jax.jit(of_energy), nothing(SIZE, jnp.float32)
+    message, past = jax.jit(of_energy), nothing(SIZE, jnp.float32)
     join, indefinite = jax.jit(joined), 0
     total = np.zeros((SIZE, SIZE))
     for _ in range(300):
@@ -105,7 +105,7 @@ def test_single_precision_holds_what_hundreds_of_frames_tell():
         indefinite += np.linalg.eigvalsh(rounded.astype(float))[0] < 0
         at = true + STD * 0.1 * rng.normal(size=SIZE)
         gradient = J.T @ J @ ((at - true) / STD)
-        past = join(past, told(*(jnp.asarray(a, jnp.float32) for a in (rounded, gradient, at, STD))))
+        past = join(past, message(*(jnp.asarray(a, jnp.float32) for a in (rounded, gradient, at, STD))))
     assert indefinite > 250
     root, towards = np.asarray(past.root, float) * STD, np.asarray(past.towards, float)
     assert np.isfinite(root).all()

@@ -33,7 +33,7 @@ def test_the_arm_points_along_the_bar(angle):
     """Also where it leaves the image around a corner."""
     image = silhouette(angle=angle)
     arm = find_arm(image, palm_of(image), border_contact(image))
-    assert arm.is_seen
+    assert arm.is_observed
     assert arm.direction @ [math.sin(angle), -math.cos(angle)] > math.cos(math.radians(0.5))
 
 
@@ -62,5 +62,5 @@ def test_away_from_the_border_the_arm_is_the_principal_axis_towards_the_palm():
     cv2.line(image, (100, 300), (200, 200), 255, 30)
     cv2.circle(image, (200, 200), 35, 255, -1)
     arm = find_arm(image, palm_of(image), border_contact(image))
-    assert not arm.is_seen
+    assert not arm.is_observed
     assert arm.direction @ np.array([1, -1]) / math.sqrt(2) > math.cos(math.radians(2))

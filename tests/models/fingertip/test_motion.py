@@ -19,16 +19,16 @@ def moves(x64):
 
 
 @jax.jit
-def steps(moves, belief, measured, seen):
+def steps(moves, belief, measured, observed):
     """Predicted beliefs and innovations of a run; every frame corrects with what is seen and predicts."""
 
     def step(belief, inputs):
-        position, seen = inputs
-        corrected, info = motion.correct(belief, position, seen)
+        position, observed = inputs
+        corrected, info = motion.correct(belief, position, observed)
         following = motion.predict(moves, corrected, Q)
         return following, (following, info.innovation)
 
-    return jax.lax.scan(step, belief, (measured, seen))[1]
+    return jax.lax.scan(step, belief, (measured, observed))[1]
 
 
 def uncertainties(beliefs):
@@ -93,8 +93,8 @@ def test_predictions_ahead_are_predictions_one_after_the_other(moves):
 def test_uncertainty_grows_and_shrinks_as_the_specification_has_it(moves):
     """Oracle 4: after misses within 0.1, of a new track within 0.02."""
     start = motion.predict(moves, motion.new_belief(jnp.zeros(2)), Q)
-    seen = jnp.arange(205) < 200
-    U = uncertainties(steps(moves, start, jnp.zeros((205, 2)), seen)[0])
+    observed = jnp.arange(205) < 200
+    U = uncertainties(steps(moves, start, jnp.zeros((205, 2)), observed)[0])
     np.testing.assert_allclose(U[200:], [28.0, 70.8, 143.8, 255.0, 412.4], atol=0.1)
     fresh = [float(motion.uncertainty(start)), *U[:3]]
     np.testing.assert_allclose(fresh, [534.33, 8.98, 7.40, 7.36], atol=0.02)

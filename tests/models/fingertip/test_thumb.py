@@ -23,14 +23,14 @@ def covariance(frames, posture, offset_variance):
 
 
 @partial(jax.jit, static_argnames="posture")
-def observed(angles, seen, person, posture=POSTURE):
+def observed(angles, visible, person, posture=POSTURE):
     """Beliefs after each frame of one finger."""
 
     def step(belief, inputs):
         found = thumb.observe(belief, *inputs, posture)
         return found, found
 
-    return jax.lax.scan(step, thumb.unknown(person, posture), (angles, seen))[1]
+    return jax.lax.scan(step, thumb.unknown(person, posture), (angles, visible))[1]
 
 
 @pytest.mark.system
@@ -64,8 +64,8 @@ def test_the_evidence_is_that_of_the_whole_sequence(x64):
 
 def test_frames_without_an_angle_change_no_odds_and_let_the_drift_go_on(x64):
     angles = jnp.full(30, T)
-    seen = jnp.arange(30) < 10
-    beliefs = observed(angles.at[10:].set(jnp.nan), seen, thumb.usual())
+    visible = jnp.arange(30) < 10
+    beliefs = observed(angles.at[10:].set(jnp.nan), visible, thumb.usual())
     log_odds = np.asarray(beliefs.log_odds)
     np.testing.assert_array_equal(log_odds[10:], log_odds[9])
     drift = np.asarray(beliefs.angle.covariance)[:, 0, 0, 0]

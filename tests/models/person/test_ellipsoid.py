@@ -69,11 +69,13 @@ def random_camera(rng):
 @pytest.mark.system
 def test_the_outline_holds_a_million_projected_points_tightly(camera, person):
     uv, _ = camera.project(jnp.asarray(surface(person)))
-    seen = outline(camera.P, person)
-    assert float(jnp.max(outline_radius(seen, uv))) <= 1 + 1e-9
+    contour = outline(camera.P, person)
+    assert float(jnp.max(outline_radius(contour, uv))) <= 1 + 1e-9
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     normals = np.stack([np.cos(angles), np.sin(angles)])
-    support = np.asarray(seen.center) @ normals + np.sqrt(np.sum(normals * (np.asarray(seen.shape) @ normals), axis=0))
+    support = np.asarray(contour.center) @ normals + np.sqrt(
+        np.sum(normals * (np.asarray(contour.shape) @ normals), axis=0)
+    )
     # A million points are 0.003 rad apart: they miss the outline by up to 30 px * 0.003^2 / 8.
     np.testing.assert_allclose((np.asarray(uv) @ normals).max(axis=0), support, atol=1e-3)
 
@@ -151,8 +153,8 @@ def test_dual_conic_and_outline_are_the_same_ellipse(camera, person):
 
 
 def test_the_mask_agrees_with_opencv_and_with_its_area(camera, person):
-    seen = outline(camera.P, person)
-    mask, ellipse = np.asarray(ellipse_mask(seen, SHAPE)), ellipse_of(seen)
+    contour = outline(camera.P, person)
+    mask, ellipse = np.asarray(ellipse_mask(contour, SHAPE)), ellipse_of(contour)
     drawn = np.zeros(SHAPE, np.uint8)
     center, axes = (tuple(round(256 * float(x)) for x in pair) for pair in (ellipse.center, ellipse.semi_axes))
     cv2.ellipse(drawn, center, axes, np.rad2deg(float(ellipse.angle)), 0, 360, 1, -1, shift=8)
@@ -236,10 +238,10 @@ def test_depth_outside_is_where_rays_pass_nearest(camera, person):
 )
 def test_bodies_that_are_no_ellipse_are_told(x64, center, radius, code, pixels):
     P = jnp.array([[139.0, 0, 79.5, 0], [0, 139, 59.5, 0], [0, 0, 1, 0]])
-    seen = outline(P, sphere(center, radius))
-    assert int(seen.code) == code
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(seen))
-    count = int(ellipse_mask(seen, SHAPE).sum())
+    contour = outline(P, sphere(center, radius))
+    assert int(contour.code) == code
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(contour))
+    count = int(ellipse_mask(contour, SHAPE).sum())
     assert count == pixels if pixels is not None else 0 < count < 120 * 160
 
 
@@ -253,9 +255,9 @@ def test_c1_is_positive_exactly_outside(x64):
 
 @pytest.mark.system
 def test_the_soft_mask_is_one_half_on_the_outline_and_differentiable(camera, person):
-    seen = outline(camera.P, person)
-    soft = np.asarray(soft_ellipse_mask(seen, SHAPE, 8.0))
-    np.testing.assert_array_equal(soft >= 0.5, np.asarray(ellipse_mask(seen, SHAPE)))
+    contour = outline(camera.P, person)
+    soft = np.asarray(soft_ellipse_mask(contour, SHAPE, 8.0))
+    np.testing.assert_array_equal(soft >= 0.5, np.asarray(ellipse_mask(contour, SHAPE)))
     assert soft[43, 96] > 0.99
 
     @jax.jit

@@ -35,9 +35,9 @@ def test_the_ratio_is_that_of_the_probabilities_of_what_was_observed():
     """A pixel observed as foreground with probability p (even prior) has likelihood p f + (1 - p) (1 - f)."""
     rng = np.random.default_rng(0)
     p, T, q = rng.random(300), rng.uniform(0.01, 1, 300), rng.random(300)
-    seen = np.clip(p, LEAST, MOST)
+    observed = np.clip(p, LEAST, MOST)
     with_nobody, with_somebody = 1 - T, 1 - T * (1 - q)
-    ratio = [seen * f + (1 - seen) * (1 - f) for f in (with_somebody, with_nobody)]
+    ratio = [observed * f + (1 - observed) * (1 - f) for f in (with_somebody, with_nobody)]
     expected = np.log(ratio[0] / ratio[1]).sum()
     found = log_likelihood_ratio(jnp.asarray(q), contrast(jnp.asarray(p), jnp.asarray(T)))
     np.testing.assert_allclose(found, expected, rtol=1e-10)
@@ -86,8 +86,8 @@ def test_the_truth_is_likelier_than_its_neighbours():
 
 @pytest.mark.system
 def test_a_window_is_an_even_grid_of_pixels():
-    seen = window(jnp.array([-4.0, 10.0, 12.0, 50.0]), (40, 60), (10, 8))
-    uv, index, inside = (np.asarray(leaf) for leaf in seen[:3])
+    observed = window(jnp.array([-4.0, 10.0, 12.0, 50.0]), (40, 60), (10, 8))
+    uv, index, inside = (np.asarray(leaf) for leaf in observed[:3])
     np.testing.assert_array_equal(uv, np.round(uv))
     np.testing.assert_allclose(np.unique(uv[:, 0]), np.arange(-3, 12, 2))
     np.testing.assert_allclose(np.unique(uv[:, 1]), np.arange(12, 50, 4))
@@ -95,7 +95,7 @@ def test_a_window_is_an_even_grid_of_pixels():
     within = inside > 0
     np.testing.assert_array_equal(index[within], (uv[:, 1] * 60 + uv[:, 0])[within])
     assert np.all((index >= 0) & (index < 40 * 60))
-    np.testing.assert_allclose(seen.area, 16 * 40 / 80)
+    np.testing.assert_allclose(observed.area, 16 * 40 / 80)
 
 
 @pytest.mark.parametrize(("dimensions", "reach"), [(1, 2), (2, 1), (3, 1), (2, 2)])

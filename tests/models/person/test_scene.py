@@ -115,8 +115,10 @@ def test_what_is_behind_the_camera_hides_nothing(camera):
 def test_upright_things_stand_in_a_plane_that_faces_the_camera(camera):
     xy = np.array([-0.3, 1.5])
     depth = np.asarray(upright_depth(camera, jnp.asarray(xy)))
-    seen = np.isfinite(depth)
-    points = np.asarray(camera.position()) + depth[seen, None] * np.asarray(camera.rays(pixel_grid(SHAPE)))[seen]
+    observed = np.isfinite(depth)
+    points = (
+        np.asarray(camera.position()) + depth[observed, None] * np.asarray(camera.rays(pixel_grid(SHAPE)))[observed]
+    )
     away = xy - np.array([-1, -1.74])
     np.testing.assert_allclose((points[:, :2] - xy) @ away, 0, atol=1e-9)
 

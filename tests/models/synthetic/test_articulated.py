@@ -213,8 +213,8 @@ def test_one_link_is_seen_by_the_length_of_its_image():
 def test_one_link_near_the_image_plane_has_two_solutions():
     case = one_link_near_image_plane()
     for degrees in (20, -20):
-        seen = one_link_length(jnp.array([35.0, np.deg2rad(degrees)]))
-        np.testing.assert_allclose(seen, case.y, rtol=1e-6)
+        observed = one_link_length(jnp.array([35.0, np.deg2rad(degrees)]))
+        np.testing.assert_allclose(observed, case.y, rtol=1e-6)
     # Modes of the posterior on a grid, found by the specification at +19.8 and -19.8.
     theta = np.deg2rad(np.linspace(-40, 40, 80001))
     mean, std = float(case.mean[1]), float(np.sqrt(case.covariance[1, 1]))

@@ -126,15 +126,15 @@ def test_an_occluder_hides_what_is_behind_it_in_every_camera(scene):
     occluder = Occluder(jnp.array([60.0, 40.0, 600.0]), jnp.array([40.0, 20.0]), jnp.asarray(120.0), jnp.asarray(1.0))
     key = jax.random.key(4)
     hidden = np.asarray(render_face(key, scene, nominal(), POSE, SHAPE, occluder=occluder), float)
-    seen = np.asarray(render_face(key, scene, nominal(), POSE, SHAPE), float)
+    observed = np.asarray(render_face(key, scene, nominal(), POSE, SHAPE), float)
     for camera, left in ((0, 0.0), (1, -120.0)):
         u, v = 800 * (60 + left) / 600 + 319.5, 800 * 40 / 600 + 239.5
         rows, columns = np.mgrid[0:480, 0:640]
         inside = (np.abs(columns - u) <= 800 * 40 / 600) & (np.abs(rows - v) <= 800 * 20 / 600)
         assert hidden[camera][inside].std() == pytest.approx(2.02, abs=0.1)
-        np.testing.assert_array_equal(hidden[camera][~inside], seen[camera][~inside])
+        np.testing.assert_array_equal(hidden[camera][~inside], observed[camera][~inside])
     absent = replace(occluder, opacity=jnp.asarray(0.0))
-    np.testing.assert_array_equal(render_face(key, scene, nominal(), POSE, SHAPE, occluder=absent), seen)
+    np.testing.assert_array_equal(render_face(key, scene, nominal(), POSE, SHAPE, occluder=absent), observed)
 
 
 def test_a_head_behind_the_camera_is_not_seen(scene):

@@ -59,15 +59,15 @@ def test_the_occluder_covers_mouth_and_nostrils_in_both_cameras_and_nothing_else
         jax.random.key(0), disturbed.poses[:216], expressions=disturbed.expressions[:216], covered=np.ones(216, bool)
     )
     frame = int(np.flatnonzero(disturbed.covered)[0]) - 1
-    seen, hidden = disturbed.frames(frame, frame + 1)[0], covered.frames(frame, frame + 1)[0]
+    observed, hidden = disturbed.frames(frame, frame + 1)[0], covered.frames(frame, frame + 1)[0]
     for camera in (0, 1):
         for k, (u, v) in enumerate(np.round(disturbed.uv[frame, camera]).astype(int)):
             window = (camera, slice(v - 8, v + 8), slice(u - 8, u + 8))
             if k in (4, 5, 6, 7):
                 assert hidden[window].std() < 3
-                assert seen[window].std() > 5
+                assert observed[window].std() > 5
             else:
-                np.testing.assert_array_equal(hidden[window], seen[window])
+                np.testing.assert_array_equal(hidden[window], observed[window])
 
 
 @pytest.mark.system

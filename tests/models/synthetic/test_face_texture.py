@@ -34,9 +34,9 @@ def test_texture_has_the_rms_and_the_wavelengths_of_the_specification(texture):
 def test_a_patch_is_the_waves_within_a_window(texture):
     x, y = np.random.default_rng(0).uniform(-15, 15, (2, 50))
     for k in (0, 5):
-        seen = patch(texture.wave[k], texture.phase[k], texture.amplitude[k], jnp.asarray(x), jnp.asarray(y))
+        observed = patch(texture.wave[k], texture.phase[k], texture.amplitude[k], jnp.asarray(x), jnp.asarray(y))
         expected = np.exp(-(x**2 + y**2) / 72) * summed_waves(texture, k, x, y)
-        np.testing.assert_allclose(seen, expected, atol=1e-3)
+        np.testing.assert_allclose(observed, expected, atol=1e-3)
 
 
 def test_the_subjects_left_is_the_mirror_image_of_the_right(texture):

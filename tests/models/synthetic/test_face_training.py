@@ -83,8 +83,8 @@ def test_missing_expressions_are_named():
 def test_the_ict_model_is_learnt_in_68_landmarks(x64, data_dir):
     model = read_ict(data_dir / "ict_face_model")
     shapes = ict_shapes(jax.random.key(0), model, 30, landmarks=tuple(range(68)))
-    learnt = learn(shapes, identities=20, expressions=8, pairs=PAIRS_68)
+    learned = learn(shapes, identities=20, expressions=8, pairs=PAIRS_68)
     centred = np.sum(np.var(np.asarray(shapes), axis=(0, 1)))
-    assert learnt.tensor.shape == (68, 3, 20, 8)
+    assert learned.tensor.shape == (68, 3, 20, 8)
     # Faces are nearly symmetric: what both halves' model captures is most of what the faces vary.
-    assert np.sum(np.square(learnt.tensor)) / (60 * len(ICT_EXPRESSIONS)) > 0.9 * centred
+    assert np.sum(np.square(learned.tensor)) / (60 * len(ICT_EXPRESSIONS)) > 0.9 * centred

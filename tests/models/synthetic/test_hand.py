@@ -107,10 +107,10 @@ def test_sequence_shows_the_true_hand_before_a_wall(kind):
         np.testing.assert_allclose(joints, forward_kinematics(pose, hand_geometry()).joints, atol=1e-6)
         digits = joints[1:]
         uv = np.round(np.asarray(camera.project(digits))).astype(int)
-        seen = image[uv[:, 1], uv[:, 0]] / 1000.0
+        observed = image[uv[:, 1], uv[:, 0]] / 1000.0
         # Each joint is at most a radius (14 mm) and the noise behind the surface, and nothing of the hand is 60 mm
         # before another part in an almost open hand. A dropped or flying pixel may lie on one of the 20 joints.
-        behind = np.asarray(digits[:, 2]) - seen
+        behind = np.asarray(digits[:, 2]) - observed
         assert np.sum((behind > -0.01) & (behind < 0.06)) >= 19
         hand = (image > 400) & (image < 1000)
         assert 3000 < hand.sum() < 8000

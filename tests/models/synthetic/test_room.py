@@ -63,9 +63,9 @@ def hulls(people, P):
 def test_the_matrix_of_a_camera_projects_as_its_pinhole_does(pinhole):
     transform = looking(POSITION, 70.0, 25.0)
     points = np.random.default_rng(0).uniform((-1, 0, 0), (2, 4, 2), (50, 3))
-    seen = pinhole.project(transform.apply(jnp.asarray(points, jnp.float32)))
+    observed = pinhole.project(transform.apply(jnp.asarray(points, jnp.float32)))
     uv, depth = floor_camera(pinhole, transform).project(jnp.asarray(points, jnp.float32))
-    np.testing.assert_allclose(uv, seen, atol=1e-2)
+    np.testing.assert_allclose(uv, observed, atol=1e-2)
     np.testing.assert_allclose(depth, transform.apply(jnp.asarray(points, jnp.float32))[:, 2], atol=1e-4)
 
 

@@ -15,8 +15,8 @@ def many():
 def paths(drawings):
     """The first finger's tips where it is seen, one symbol after the other."""
     for i, length in enumerate(drawings.lengths):
-        seen = drawings.present[:length, 0, i]
-        yield drawings.labels[i], drawings.tips[:length, 0, :, i][seen]
+        observed = drawings.present[:length, 0, i]
+        yield drawings.labels[i], drawings.tips[:length, 0, :, i][observed]
 
 
 def test_the_same_writer_draws_the_same_and_another_does_not(many):
@@ -58,7 +58,7 @@ def test_tips_are_missed_and_invented_as_often_as_specified():
     found = drawn(5, 15)
     frames = np.arange(len(found.tips))[:, None] < found.lengths
     two = np.char.endswith(found.labels, "2")
-    seen = found.present.sum(axis=1)
+    observed = found.present.sum(axis=1)
     lost = (1 - strokes.LOST) if strokes.LOST else 1.0
     for wanted, chosen, count in (
         (strokes.DROPPED * lost, two, 1),
@@ -67,7 +67,7 @@ def test_tips_are_missed_and_invented_as_often_as_specified():
         (strokes.LOST, ~two, 0),
     ):
         inside = frames[:, chosen]
-        share = np.mean(seen[:, chosen][inside] == count)
+        share = np.mean(observed[:, chosen][inside] == count)
         assert abs(share - wanted) < 4 * np.sqrt(wanted / inside.sum())
 
 

@@ -151,12 +151,12 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
 
 
 def test_progress_counts_up_and_measures_from_the_second_chunk(recording, fake_tracker, tmp_path):
-    seen = []
-    track(recording, fake_tracker, tmp_path, on_progress=seen.append)
-    assert [progress.done for progress in seen] == [16, 32, 40]
-    assert {progress.total for progress in seen} == {40}
-    assert np.isnan(seen[0].frames_per_second)
-    assert seen[1].frames_per_second > 0
+    observed = []
+    track(recording, fake_tracker, tmp_path, on_progress=observed.append)
+    assert [progress.done for progress in observed] == [16, 32, 40]
+    assert {progress.total for progress in observed} == {40}
+    assert np.isnan(observed[0].frames_per_second)
+    assert observed[1].frames_per_second > 0
     assert json.loads((tmp_path / "report.json").read_text()) == {"frames": 40}
 
 

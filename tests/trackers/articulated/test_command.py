@@ -78,9 +78,9 @@ def test_track_writes_all_results(npz, tmp_path, features, capsys):
     lengths = np.abs(mean[-1] - features.truth[-1])[layout.lengths]
     assert report["mean_length_error_px"] == pytest.approx(lengths.mean(), abs=1e-3)
     assert report["lengths_within_2_sigma_percent"] == pytest.approx(100 * (lengths <= 1).mean(), abs=0.1)
-    told = capsys.readouterr().out
-    assert f"mean length error {report['mean_length_error_px']:.1f} px" in told
-    assert "lengths within 2 sigma" in told
+    text = capsys.readouterr().out
+    assert f"mean length error {report['mean_length_error_px']:.1f} px" in text
+    assert "lengths within 2 sigma" in text
     assert cv2.imread(str(out / "summary.png")).shape[1] == 960
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == len(features)
 

@@ -19,7 +19,7 @@ def room(seed=0):
     return cv2.resize(coarse, SHAPE[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def seen(seed, *, x=None, brightness=1.0):
+def observed(seed, *, x=None, brightness=1.0):
     """One noisy picture of the room, with somebody in red at column x."""
     image = room().astype(float) * brightness
     if x is not None:
@@ -34,7 +34,7 @@ def person(x):
 
 
 def walking(n):
-    return [seen(i, x=int(10 + 100 * i / (n - 1))) for i in range(n)]
+    return [observed(i, x=int(10 + 100 * i / (n - 1))) for i in range(n)]
 
 
 def made(name, **options):
@@ -45,7 +45,7 @@ def made(name, **options):
 def test_somebody_who_stands_still_is_found_after_priming(name):
     model = made(name)
     model.prime(walking(40))
-    probability = model.apply(seen(100, x=60))
+    probability = model.apply(observed(100, x=60))
     assert (probability.shape, probability.dtype) == (SHAPE, np.float32)
     assert 0 <= probability.min() <= probability.max() <= 1
     wrong = (probability > 0.5) != person(60)
@@ -56,11 +56,11 @@ def test_somebody_who_stands_still_is_found_after_priming(name):
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_camera_that_was_not_primed_is_unsure_and_then_finds_people(name):
     model = made(name)
-    first = model.apply(seen(0, x=10))
+    first = model.apply(observed(0, x=10))
     assert np.abs(first - 0.5).max() <= 0.5 / SAMPLES + 1e-6
     for i in range(1, 5 * SAMPLES + 1):
-        model.apply(seen(i, x=10 + i % 100))
-    wrong = (model.apply(seen(300, x=60)) > 0.5) != person(60)
+        model.apply(observed(i, x=10 + i % 100))
+    wrong = (model.apply(observed(300, x=60)) > 0.5) != person(60)
     assert wrong.mean() < 0.03
 
 
@@ -71,27 +71,27 @@ def test_somebody_who_is_kept_is_not_learnt_in_a_minute(name):
     model.prime(walking(40))
     keep = cv2.dilate(person(60).astype(np.uint8), np.ones((7, 7), np.uint8))
     for i in range(600):
-        probability = model.apply(seen(i, x=60), keep=keep)
+        probability = model.apply(observed(i, x=60), keep=keep)
     assert (probability[person(60)] > 0.5).mean() > 0.95
-    assert (model.apply(seen(700))[person(60)] > 0.5).mean() < 0.05
+    assert (model.apply(observed(700))[person(60)] > 0.5).mean() < 0.05
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("name", LEARNING)
 def test_slow_changes_of_light_are_followed(name):
     model = made(name)
-    model.prime([seen(i) for i in range(30)])
+    model.prime([observed(i) for i in range(30)])
     for i in range(600):
-        probability = model.apply(seen(i, brightness=1 + 0.15 * i / 600))
+        probability = model.apply(observed(i, brightness=1 + 0.15 * i / 600))
     assert (probability > 0.5).mean() < 0.02
 
 
 @pytest.mark.system
 def test_a_chair_that_is_left_behind_is_learnt_in_the_end():
     model = MedianBackground(learn_every=1)
-    model.prime([seen(i) for i in range(10)])
-    assert (model.apply(seen(50, x=60))[person(60)] > 0.5).mean() > 0.9
-    later = [seen(i, x=60) for i in range(20)]
+    model.prime([observed(i) for i in range(10)])
+    assert (model.apply(observed(50, x=60))[person(60)] > 0.5).mean() > 0.9
+    later = [observed(i, x=60) for i in range(20)]
     for i in range(2400):
         probability = model.apply(later[i % 20])
     assert (probability[person(60)] > 0.5).mean() < 0.1
@@ -100,8 +100,8 @@ def test_a_chair_that_is_left_behind_is_learnt_in_the_end():
 @pytest.mark.parametrize("name", ["median", "mog2", "knn"])
 def test_shadows_are_less_likely_than_not(name):
     model = made(name)
-    model.prime([seen(i) for i in range(30)])
-    image = seen(40)
+    model.prime([observed(i) for i in range(30)])
+    image = observed(40)
     image[30:60, 30:70] = (image[30:60, 30:70] * 0.7).astype(np.uint8)
     assert (model.apply(image)[32:58, 32:68] < 0.5).mean() > 0.85
 
@@ -110,9 +110,9 @@ def test_shadows_are_less_likely_than_not(name):
 def test_what_was_learnt_can_be_saved(name):
     first, second = made(name), made(name)
     first.prime(walking(40))
-    first.apply(seen(1))
+    first.apply(observed(1))
     second.restore(first.state())
-    difference = np.abs(first.apply(seen(2, x=60)) - second.apply(seen(2, x=60)))
+    difference = np.abs(first.apply(observed(2, x=60)) - second.apply(observed(2, x=60)))
     assert (difference > 0.1).mean() < (0.001 if name in ("median", "reference") else 0.02)
 
 
@@ -121,7 +121,7 @@ def test_nothing_learnt_is_nothing_saved(name):
     model = made(name)
     assert model.state() == {}
     model.restore({})
-    assert np.abs(model.apply(seen(0)) - 0.5).max() <= 0.5 / SAMPLES + 1e-6
+    assert np.abs(model.apply(observed(0)) - 0.5).max() <= 0.5 / SAMPLES + 1e-6
 
 
 def test_the_median_of_people_who_walk_is_the_empty_room():
@@ -132,17 +132,17 @@ def test_the_median_of_people_who_walk_is_the_empty_room():
 
 def test_probabilities_are_the_callers_own():
     model = made("reference")
-    first = model.apply(seen(0, x=30))
+    first = model.apply(observed(0, x=30))
     before = first.copy()
-    model.apply(seen(1, x=90))
+    model.apply(observed(1, x=90))
     np.testing.assert_array_equal(first, before)
 
 
 @pytest.mark.parametrize("name", ["median", "mog2", "knn"])
 def test_grey_images_work_as_well(name):
     model = made(name)
-    model.prime([cv2.cvtColor(seen(i), cv2.COLOR_BGR2GRAY) for i in range(20)])
-    image = cv2.cvtColor(seen(30), cv2.COLOR_BGR2GRAY)
+    model.prime([cv2.cvtColor(observed(i), cv2.COLOR_BGR2GRAY) for i in range(20)])
+    image = cv2.cvtColor(observed(30), cv2.COLOR_BGR2GRAY)
     image[person(60)] = 255
     assert ((model.apply(image) > 0.5) != person(60)).mean() < 0.02
 
@@ -165,9 +165,9 @@ def test_wrong_choices_are_named(name, options, message):
 @pytest.mark.parametrize("name", ["median", "mog2", "knn", "reference"])
 def test_images_of_another_shape_are_named(name):
     model = made(name)
-    model.apply(seen(0))
+    model.apply(observed(0))
     with pytest.raises(ValueError, match=r"image must be uint8 \(90, 120, 3\) like the background; got uint8 \(89,"):
-        model.apply(seen(0)[1:])
+        model.apply(observed(0)[1:])
 
 
 def test_wrong_images_are_named():

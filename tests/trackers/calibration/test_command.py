@@ -40,10 +40,10 @@ def calibrate(*arguments):
 def test_points_in_space_with_distortion(tmp_path, capsys):
     file, out = points_file(tmp_path, CAMERA, n=60), tmp_path / "hall.json"
     assert calibrate("points", file, "--image-size", SIZE, "--distortion", "--out", out) == 0
-    told = capsys.readouterr().out
-    assert "camera at (-1.00, -1.74) m, 2.64 m above the floor" in told
-    assert "reprojection error 0.0" in told
-    assert "floor error 0.00" in told
+    text = capsys.readouterr().out
+    assert "camera at (-1.00, -1.74) m, 2.64 m above the floor" in text
+    assert "reprojection error 0.0" in text
+    assert "floor error 0.00" in text
     opened = open_camera(out, image_size=(640, 480))
     assert opened.name == "hall"
     np.testing.assert_allclose(opened.camera.P, CAMERA.P, rtol=1e-3, atol=0.05)
@@ -126,10 +126,10 @@ def test_pictures_of_a_board(tmp_path, capsys):
     size = ("--squares", "7x5", "--square-m", 0.04, "--marker-m", 0.03)
     out = tmp_path / "camera.json"
     assert calibrate("charuco", *files[:-1], *size, "--floor", files[-1], "--out", out) == 0
-    told = capsys.readouterr().out
-    assert "in 5 pictures: reprojection error 0." in told
-    assert "the pose over the board on the floor" in told
-    assert re.search(r"floor error 0\.00\d m on average", told)
+    text = capsys.readouterr().out
+    assert "in 5 pictures: reprojection error 0." in text
+    assert "the pose over the board on the floor" in text
+    assert re.search(r"floor error 0\.00\d m on average", text)
     np.testing.assert_allclose(open_camera(out).camera.position(), position, atol=0.01)
 
     assert calibrate("charuco", *files, *size, "--out", out) == 0
@@ -156,8 +156,8 @@ def test_pictures_that_do_not_fit_are_named(tmp_path, capsys):
 def test_parameters_of_pets(data_dir, tmp_path, capsys):
     folder, out = data_dir / "pets09_s2l1_view001", tmp_path / "camera.json"
     assert calibrate("tsai", folder / "View_001.xml", "--image-size", "480x360", "--out", out) == 0
-    told = capsys.readouterr().out
-    assert "camera at (-28.94, -19.53) m, 7.07 m above the floor" in told
+    text = capsys.readouterr().out
+    assert "camera at (-28.94, -19.53) m, 7.07 m above the floor" in text
     theirs = json.loads((folder / "calibration.json").read_text())
     opened = open_camera(out, image_size=(480, 360))
     np.testing.assert_allclose(opened.camera.P, theirs["P_480x360"], rtol=1e-5, atol=1e-3)

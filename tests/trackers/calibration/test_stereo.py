@@ -65,9 +65,9 @@ def test_the_rig_comes_back(pictures, tmp_path, capsys):
     """Seven pictures of 24 corners that are good to 0.1 px or so: 0.3 % in focal length, 2 mm, half a degree."""
     out = tmp_path / "rig.json"
     assert calibrate(pictures / "left", pictures / "right", *BOARD, "--out", out) == 0
-    told = capsys.readouterr().out
-    baseline, pairs = re.search(r"baseline (\d+\.\d) mm, .* from 7 of (\d) pairs", told).groups()
-    epipolar = re.search(r"epipolar error (\d\.\d+) px rms, (\d\.\d+) px in the worst pair", told).groups()
+    message = capsys.readouterr().out
+    baseline, pairs = re.search(r"baseline (\d+\.\d) mm, .* from 7 of (\d) pairs", message).groups()
+    epipolar = re.search(r"epipolar error (\d\.\d+) px rms, (\d\.\d+) px in the worst pair", message).groups()
     assert abs(float(baseline) - 1000 * np.linalg.norm(T)) < 2
     assert pairs == "7"
     assert 0 < float(epipolar[0]) <= float(epipolar[1]) < 0.5
@@ -81,8 +81,8 @@ def test_the_rig_comes_back(pictures, tmp_path, capsys):
     # What the rig is for: a head at 600 mm in true pixels is found to 0.5 % of its distance. Errors of the principal
     # points and of the rotation, larger by themselves, cancel here.
     head = np.array([[-60.0, -60, 600], [120, -60, 650], [120, 80, 600], [0, 80, 650], [60, 0, 600]])
-    seen = [head, head @ R.T + 1000 * T]
-    uv = np.stack([x[:, :2] / x[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2] for x, k in zip(seen, K, strict=True)])
+    observed = [head, head @ R.T + 1000 * T]
+    uv = np.stack([x[:, :2] / x[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2] for x, k in zip(observed, K, strict=True)])
     np.testing.assert_allclose(triangulate(opened.rig, jnp.asarray(uv, jnp.float32)), head, atol=3)
 
 

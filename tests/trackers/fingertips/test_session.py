@@ -25,8 +25,8 @@ def observed(frames, hands=2):
     shape = (len(frames), hands)
     tips, is_tip = np.zeros((*shape, CAPACITY, 2), np.float32), np.zeros((*shape, CAPACITY), bool)
     bases, palm, there = tips.copy(), np.zeros((*shape, 2), np.float32), np.zeros(shape, bool)
-    for i, seen in enumerate(frames):
-        for h, (place, own) in enumerate(seen):
+    for i, visible in enumerate(frames):
+        for h, (place, own) in enumerate(visible):
             n = len(own)
             palm[i, h], there[i, h], is_tip[i, h, :n] = place, True, True
             tips[i, h, :n] = np.asarray(place) + own
@@ -41,10 +41,10 @@ def follow(frames, **options):
     """Session and reports; in pieces of one length, as a command does, so that all share a compiled program."""
     session = FingertipSession(ANGLES, num_hands=2, **options)
     frames = [*frames, *[[]] * (FRAMES - len(frames))]
-    seen = observed(frames)
+    visible = observed(frames)
     times = np.arange(FRAMES) / 30
     reports = [
-        session.process(jax.tree.map(lambda leaf, i=i: leaf[i : i + PIECE], seen), times[i : i + PIECE])
+        session.process(jax.tree.map(lambda leaf, i=i: leaf[i : i + PIECE], visible), times[i : i + PIECE])
         for i in range(0, FRAMES, PIECE)
     ]
     session.finish()

@@ -115,14 +115,14 @@ def test_the_thumb_is_known_and_with_it_the_mode(hands, reports):
 def test_turning_the_scene_changes_nothing_but_places(hands, reports, modern):
     """Oracle 14: a quarter turn about a place leaves names, thumbs and counts; direction codes advance by four."""
     turn, shift = jnp.asarray([[0.0, 1.0], [-1.0, 0.0]]), jnp.asarray([40.0, 700.0])
-    seen = hands.observed
+    visible = hands.observed
     placed = lambda array, there=True: jnp.where(there, array @ turn.T + shift, 0.0)
     turned = modern(
-        seen._replace(
-            tips=placed(seen.tips, seen.is_tip[..., None]),
-            bases=placed(seen.bases, seen.has_base[..., None]),
-            palm=placed(seen.palm),
-            axis=seen.axis @ turn.T,
+        visible._replace(
+            tips=placed(visible.tips, visible.is_tip[..., None]),
+            bases=placed(visible.bases, visible.has_base[..., None]),
+            palm=placed(visible.palm),
+            axis=visible.axis @ turn.T,
         )
     )
     straight = reports["recommended"]

@@ -45,10 +45,10 @@ def written(path, names, people=("Ann", "Bob"), trials=3, axes=("x", "y")):
 def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     data, model, more = written(tmp_path / "vl.csv", "VL"), tmp_path / "vl.npz", tmp_path / "vlz.npz"
     assert run("fit", "gestures", data, "--out", model, "--states", 6, "--held-out", "person") == 0
-    told = capsys.readouterr().out
-    assert "vl.csv: 12 strokes of 2 symbols" in told
-    assert "people left out in turn: 100.00 % right if none is rejected; 100.00 % accepted" in told
-    assert "Ann: 100.0 % of 6; 100.00 % accepted, 100.00 % of these right" in told
+    message = capsys.readouterr().out
+    assert "vl.csv: 12 strokes of 2 symbols" in message
+    assert "people left out in turn: 100.00 % right if none is rejected; 100.00 % accepted" in message
+    assert "Ann: 100.0 % of 6; 100.00 % accepted, 100.00 % of these right" in message
     five = written(tmp_path / "z.csv", "Z", people=("Ann",), trials=5)
     assert run("fit", "gestures", five, "--out", more, "--add", model) == 0
     assert "3 symbols, 3 models of 6 states" in capsys.readouterr().out
@@ -59,8 +59,8 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     with everything.open("a") as file:
         file.write("dot,,,1,1\nhole,,,nan,1\n")
     assert run("recognise", more, everything, "--out", tmp_path / "out" / "table.csv") == 0
-    told = capsys.readouterr().out
-    assert "14 strokes, 2 rejected; of 12 with a label 100.00 % right if none is rejected; 100.00 % accepted" in told
+    message = capsys.readouterr().out
+    assert "14 strokes, 2 rejected; of 12 with a label 100.00 % right if none is rejected; 100.00 % accepted" in message
     with (tmp_path / "out" / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["symbol"] for row in rows] == ["Z"] * 4 + ["L"] * 4 + ["V"] * 4 + [""] * 2
@@ -72,9 +72,9 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
 def test_without_data_symbols_are_drawn(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(gesture_command, "_SHOWN_TRIALS", 1)
     assert run("recognise", "default", "--margin", 0.3) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].split() == list(gesture_command.COLUMNS)
-    assert told[-1] == (
+    message = capsys.readouterr().out.splitlines()
+    assert message[0].split() == list(gesture_command.COLUMNS)
+    assert message[-1] == (
         "24 strokes, 0 rejected; of 24 with a label 100.00 % right if none is rejected; 100.00 % accepted, "
         "100.00 % of these right"
     )

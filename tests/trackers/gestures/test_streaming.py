@@ -44,9 +44,9 @@ def test_gestures_of_a_folder_are_learnt_and_found(tmp_path, capsys, monkeypatch
     monkeypatch.setattr(streams.learn_streams, "__kwdefaults__", {"num_steps": 40})
     folder, model, table = written(tmp_path / "data" / "some.npz", 6, 0).parent, tmp_path / "m.npz", tmp_path / "t.csv"
     assert main(["fit", "gestures", str(folder), "--stream", "--out", str(model)]) == 0
-    told = capsys.readouterr().out
-    assert "2 gestures, 18 in 6 streams of 0.8 minutes" in told
-    assert "1.00 s after its last frame at the earliest" in told
+    message = capsys.readouterr().out
+    assert "2 gestures, 18 in 6 streams of 0.8 minutes" in message
+    assert "1.00 s after its last frame at the earliest" in message
     other = written(tmp_path / "other.npz", 2, 7)
     assert main(["recognise", str(model), str(other), "--stream", "--out", str(table)]) == 0
     assert "100.0 % of 6 gestures found, 0.00 false alarms a minute" in capsys.readouterr().out

@@ -194,5 +194,5 @@ def test_a_real_recording_opens_with_its_truth(data_dir):
     # The wrist-to-index length of the hand in it, from the description of the recording: 94.3 +- 3.8 mm.
     lengths = np.linalg.norm(sequence.joints[:, 5] - sequence.joints[:, 0], axis=-1)
     assert abs(lengths.mean() - 0.0943) < 0.0038
-    seen = sequence[0][np.isfinite(sequence[0])]
-    assert 0.3 < seen.min() < np.median(seen) < 0.9
+    observed = sequence[0][np.isfinite(sequence[0])]
+    assert 0.3 < observed.min() < np.median(observed) < 0.9

@@ -28,12 +28,12 @@ def of_codes():
 
 @pytest.mark.system
 @pytest.mark.parametrize("learnt", [of_shape, of_codes])
-def test_models_are_read_as_they_were_written(learnt, tmp_path):
-    symbols = replace(learnt(), sharpness=0.07, lapse=0.01, margins=np.array([0.25, -0.5]))
+def test_models_are_read_as_they_were_written(learned, tmp_path):
+    symbols = replace(learned(), sharpness=0.07, lapse=0.01, margins=np.array([0.25, -0.5]))
     write_symbols(tmp_path / "new" / "model.npz", SymbolsFile(symbols, "two lines", {"strokes": 2}))
     read = read_symbols(tmp_path / "new" / "model.npz")
     assert (read.source, read.parameters, read.symbols.names) == ("two lines", {"strokes": 2}, symbols.names)
-    assert read.dimensions == (2 if learnt is of_shape else 0)
+    assert read.dimensions == (2 if learned is of_shape else 0)
     assert (read.symbols.sharpness, read.symbols.lapse) == (0.07, 0.01)
     np.testing.assert_array_equal(read.symbols.margins, [0.25, -0.5])
     models, again = symbols.models, read.symbols.models

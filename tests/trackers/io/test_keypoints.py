@@ -60,10 +60,10 @@ def edit(folder, index, frame):
 
 def test_openpose_has_a_file_a_frame(openpose):
     found = read(openpose, "right", 25.0)
-    seen = np.ones((FRAMES, 21), bool)
-    seen[1], seen[2, 7] = False, False
-    np.testing.assert_array_equal(found.points, np.where(seen[..., None], POINTS, np.nan))
-    np.testing.assert_array_equal(found.confidence, np.where(seen, CONFIDENCE, 0))
+    observed = np.ones((FRAMES, 21), bool)
+    observed[1], observed[2, 7] = False, False
+    np.testing.assert_array_equal(found.points, np.where(observed[..., None], POINTS, np.nan))
+    np.testing.assert_array_equal(found.confidence, np.where(observed, CONFIDENCE, 0))
     np.testing.assert_allclose(found.times_s, (np.arange(FRAMES) + 3) / 25)
     sequence = open_features(openpose, noise_px=2.0)
     assert not sequence[1].mask.any()
@@ -276,9 +276,9 @@ def table(tmp_path):
 @pytest.mark.parametrize("rows", [long_rows(), wide_rows()], ids=["a landmark a row", "a frame a row"])
 def test_both_tables_say_the_same(table, rows):
     found = read(table(rows), "right", 10.0)
-    seen = np.arange(FRAMES) != 1
-    np.testing.assert_array_equal(found.points, np.where(seen[:, None, None], POINTS, np.nan))
-    np.testing.assert_array_equal(found.confidence, np.where(seen[:, None], CONFIDENCE, 0))
+    observed = np.arange(FRAMES) != 1
+    np.testing.assert_array_equal(found.points, np.where(observed[:, None, None], POINTS, np.nan))
+    np.testing.assert_array_equal(found.confidence, np.where(observed[:, None], CONFIDENCE, 0))
     np.testing.assert_allclose(found.times_s, (2 * np.arange(FRAMES) + 4) / 10)
 
 
@@ -287,8 +287,8 @@ def test_tables_may_have_times_and_lack_confidence_and_landmarks(table):
     np.testing.assert_allclose(found.times_s, 0.5 * np.arange(FRAMES))
     rows = [row[:4] for row in long_rows() if row[1] != "7"]
     found = read(table(rows), "right", 10.0)
-    seen = (np.arange(FRAMES) != 1)[:, None] & (np.arange(21) != 7)
-    np.testing.assert_array_equal(found.confidence, seen)
+    observed = (np.arange(FRAMES) != 1)[:, None] & (np.arange(21) != 7)
+    np.testing.assert_array_equal(found.confidence, observed)
     found = read(table([row[1:] for row in wide_rows(with_confidence=False)]), "right", 10.0)
     np.testing.assert_allclose(found.times_s, np.arange(FRAMES) / 10)
     np.testing.assert_array_equal(found.confidence, np.repeat(np.arange(FRAMES)[:, None] != 1, 21, axis=1))

@@ -30,10 +30,10 @@ def test_a_file_becomes_a_rig_and_what_straightens_its_images(tmp_path):
     np.testing.assert_array_equal(undistortions[0].distortion, LENS)
     points = np.array([[-40.0, 20, 600], [30, -50, 700]])
     uv, _ = rig.project(points)
-    for seen, R, t in zip(np.asarray(uv), (np.eye(3), TURN), (np.zeros(3), [-120.0, 1, 4]), strict=True):
+    for observed, R, t in zip(np.asarray(uv), (np.eye(3), TURN), (np.zeros(3), [-120.0, 1, 4]), strict=True):
         theirs = cv2.projectPoints(points, cv2.Rodrigues(R)[0], np.asarray(t), np.asarray(K), np.zeros(5))[0]
         # Single precision: 1e-7 of 800 px, a few operations.
-        np.testing.assert_allclose(seen, theirs.reshape(-1, 2), atol=2e-3)
+        np.testing.assert_allclose(observed, theirs.reshape(-1, 2), atol=2e-3)
 
 
 def test_what_is_written_is_read(tmp_path):

@@ -58,8 +58,8 @@ def found(camera, draw, floor):
     look = jax.jit(appearances)
     places = jnp.array([PLACES[0], (0.0, 0.0, 1.7, 0.4), PLACES[1]])
 
-    def run(active=(True, False, True), present=(True, True), places=places, seen=mask):
-        frames = tuple(CameraFrame(seen, image, np.bool_(here)) for here in present)
+    def run(active=(True, False, True), present=(True, True), places=places, observed=mask):
+        frames = tuple(CameraFrame(observed, image, np.bool_(here)) for here in present)
         histograms, good = look(scene, places, jnp.array(active), frames)
         return np.asarray(histograms).reshape(-1, 2, 3, BINS), np.asarray(good)
 
@@ -95,4 +95,4 @@ def test_nothing_is_said_of_whoever_is_hidden_or_no_foreground(found):
     behind = jnp.array([(0.9, 0.9, 1.6, 0.4), (0.0, 0.0, 1.7, 0.4), PLACES[1]])
     assert run(places=behind)[1].tolist() == [False, False, True]
     assert run(places=behind, active=(True, False, False))[1].tolist() == [True, False, False]
-    assert not run(seen=np.zeros_like(mask))[1].any()
+    assert not run(observed=np.zeros_like(mask))[1].any()

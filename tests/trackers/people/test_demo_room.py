@@ -48,8 +48,8 @@ def test_everybody_walks_through_the_room_and_around_the_furniture(room):
 
 def test_furniture_stands_in_front_of_some_floor_in_every_view(room):
     for camera, depth in zip(room.cameras, room.furniture, strict=True):
-        seen = np.isfinite(depth)
-        assert 0.01 < seen.mean() < 0.5
+        observed = np.isfinite(depth)
+        assert 0.01 < observed.mean() < 0.5
         assert depth.shape == camera.shape
         box = np.array([center for _, center in BOXES])
         uv, far = (np.asarray(a) for a in camera.project(jnp.asarray(box, jnp.float32)))

@@ -43,8 +43,8 @@ def parabolas(seed, n):
 def test_readings_of_an_exact_parabola_are_its_gaussian():
     """Information H^T R^-1 H and information times mean, added up over the four readings."""
     fit, mean, precision = parabolas(0, 20)
-    y, H, R, seen = (np.asarray(leaf) for leaf in as_measurement(fit, 0.0))
-    assert seen.all()
+    y, H, R, observed = (np.asarray(leaf) for leaf in as_measurement(fit, 0.0))
+    assert observed.all()
     weighted = np.einsum("nri,nrs->nis", H, np.linalg.inv(R))
     np.testing.assert_allclose(
         np.einsum("nis,nsj->nij", weighted, H), precision, rtol=1e-9, atol=1e-9 * precision.max()
@@ -65,8 +65,8 @@ def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_m
     fit, *_ = parabolas(2, 1)
     curvature = jnp.diag(jnp.array([0.0, 500.0, -20.0, 2.0]))[None]
     fit = fit._replace(quadratic=Quadratic(jnp.zeros(1), jnp.full((1, 4), 1e6), curvature))
-    y, H, R, seen = (np.asarray(leaf)[0] for leaf in as_measurement(fit, 0.0))
-    assert seen.sum() == 2
+    y, H, R, observed = (np.asarray(leaf)[0] for leaf in as_measurement(fit, 0.0))
+    assert observed.sum() == 2
     assert np.isfinite(R).all()
     assert np.abs(y - H @ np.asarray(fit.place)[0]).max() <= 1.001 * MOST_SHIFT_M
 
@@ -145,7 +145,7 @@ def test_people_are_searched_for_from_the_camera_that_sees_them_outwards():
     places = jnp.array(
         [(4.0, 0, 1.7, 0.4), (9.0, 0, 1.7, 0.4), (7.5, 0, 1.7, 0.4), (5.0, 0, 1.7, 0.4), (0, 0, 1.7, 0.4)]
     )
-    seen = jnp.array([(1, 0), (1, 0), (1, 1), (0, 0), (1, 1)], float)
-    views = SimpleNamespace(visible=seen[..., None] * jnp.array([0.0, 1.0]))
+    observed = jnp.array([(1, 0), (1, 0), (1, 1), (0, 0), (1, 1)], float)
+    views = SimpleNamespace(visible=observed[..., None] * jnp.array([0.0, 1.0]))
     order = _nearest_first(scene, views, places, jnp.array([True, True, True, True, False]))
     assert order.tolist() == [2, 0, 1, 3, 4]

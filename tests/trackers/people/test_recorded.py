@@ -33,7 +33,7 @@ def test_frames_before_the_confirmation_follow_with_the_identity():
     assert recorder.add(0, 0.0, *_frame(TENTATIVE, -1, 1.0)) == []
     assert recorder.add(1, 0.1, *_frame(TENTATIVE, -1, 2.0)) == []
     added = recorder.add(2, 0.2, *_frame(TRACKED, 5, 3.0))
-    assert [(identity, seen.frame, seen.mean[0], seen.mode) for identity, seen in added] == [
+    assert [(identity, sighting.frame, sighting.mean[0], sighting.mode) for identity, sighting in added] == [
         (5, 0, 1.0, "tentative"),
         (5, 1, 2.0, "tentative"),
         (5, 2, 3.0, "tracked"),
@@ -49,32 +49,32 @@ def test_a_person_who_comes_back_stands_once_in_each_frame():
         recorder.add(i, 0.1 * i, people, report)
     people, report = _frame(DORMANT, -1, 2.0)
     added = recorder.add(3, 0.3, people._replace(mode=np.array([FREE, TRACKED]), identity=np.array([-1, 5])), report)
-    assert [(identity, seen.frame) for identity, seen in added] == [(5, 3)]
-    assert [seen.frame for seen in recorder.tracks[5]] == [0, 1, 2, 3]
+    assert [(identity, sighting.frame) for identity, sighting in added] == [(5, 3)]
+    assert [sighting.frame for sighting in recorder.tracks[5]] == [0, 1, 2, 3]
 
 
 def test_whoever_is_given_up_leaves_nothing():
     recorder = Recorder()
     recorder.add(0, 0.0, *_frame(TENTATIVE, -1))
     recorder.add(1, 0.1, *_frame(FREE, -1))
-    assert [seen.frame for _, seen in recorder.add(2, 0.2, *_frame(TRACKED, 0))] == [2]
+    assert [sighting.frame for _, sighting in recorder.add(2, 0.2, *_frame(TRACKED, 0))] == [2]
 
 
 @pytest.mark.parametrize(
     ("share", "depth", "mode"), [(0.1, True, "hidden"), (0.9, False, "no_depth"), (0.9, True, "tracked")]
 )
 def test_what_cannot_be_measured_is_said(share, depth, mode):
-    ((_, seen),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
-    assert seen.mode == mode
+    ((_, sighting),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
+    assert sighting.mode == mode
 
 
 def test_spreads_are_along_and_across_the_line_of_sight():
     covariance = np.zeros((STATE, STATE))
     covariance[0, 0], covariance[1, 1] = 0.04, 0.01
-    seen = Sighting(0, 0.0, np.array([3.0, 0, 0, 0, 1.7, 0.4]), covariance, 1.0, 0, "tracked")
-    assert spreads(np.array([[0.0, 0.0]]), seen) == pytest.approx((0.2, 0.1))
+    sighting = Sighting(0, 0.0, np.array([3.0, 0, 0, 0, 1.7, 0.4]), covariance, 1.0, 0, "tracked")
+    assert spreads(np.array([[0.0, 0.0]]), sighting) == pytest.approx((0.2, 0.1))
     # The second camera is nearer, and looks along Y.
-    assert spreads(np.array([[0.0, 0.0], [3.0, -1.0]]), seen) == pytest.approx((0.1, 0.2))
+    assert spreads(np.array([[0.0, 0.0], [3.0, -1.0]]), sighting) == pytest.approx((0.1, 0.2))
 
 
 @pytest.mark.system
@@ -106,11 +106,11 @@ def test_smoothed_tracks_are_the_batch_solution(x64):
     found = smoothed(CONFIG, {3: sightings})[3]
     expected = np.linalg.solve(blocks, rhs).reshape(n, STATE)
     # Beliefs are kept in single precision.
-    np.testing.assert_allclose([seen.mean for seen in found], expected, atol=2e-4)
+    np.testing.assert_allclose([sighting.mean for sighting in found], expected, atol=2e-4)
     spread = np.linalg.inv(blocks)
-    for t, seen in enumerate(found):
+    for t, sighting in enumerate(found):
         now = slice(t * STATE, (t + 1) * STATE)
-        np.testing.assert_allclose(seen.covariance, spread[now, now], atol=2e-4)
+        np.testing.assert_allclose(sighting.covariance, spread[now, now], atol=2e-4)
 
 
 @pytest.mark.system
@@ -120,5 +120,5 @@ def test_a_long_gap_another_slot_and_a_new_start_part_a_track(time, slot, mode):
         Sighting(f, t, np.full(STATE, float(f)), np.eye(STATE), 0.0, at, kind)
         for f, t, at, kind in ((0, 0.0, 0, "tracked"), (1, time, slot, mode))
     ]
-    for seen, kept in zip(smoothed(CONFIG, {0: here})[0], here, strict=True):
-        np.testing.assert_array_equal(seen.mean, kept.mean)
+    for sighting, kept in zip(smoothed(CONFIG, {0: here})[0], here, strict=True):
+        np.testing.assert_array_equal(sighting.mean, kept.mean)

@@ -52,7 +52,7 @@ def test_frames_come_in_turn_with_the_seconds_between_them(scene, given):
     np.testing.assert_allclose([dt for _, dt in given], [0.0, 0.1, 0.3, 0.1], rtol=1e-6)
     assert [(now.frame, now.time_s) for now in found] == list(enumerate(times))
     assert [len(now.added) for now in found] == [0, 0, 3, 1]
-    assert [seen.frame for seen in people.recorder.tracks[4]] == [0, 1, 2, 3]
+    assert [observed.frame for observed in people.recorder.tracks[4]] == [0, 1, 2, 3]
     assert all(now.seconds > 0 and isinstance(now.people.mode, np.ndarray) for now in found)
 
 

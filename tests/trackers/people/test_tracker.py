@@ -135,8 +135,8 @@ def test_time_that_stands_still_or_jumps_harms_nothing(scene, frames, followed, 
 @pytest.mark.system
 def test_outlines_surround_the_silhouettes(scene, frames, followed):
     """The middle of each lies within the foreground of the last frame."""
-    (seen,) = outlines(scene, followed[-1][0])
-    u, v = np.asarray(seen.center).round().astype(int).T
+    (observed,) = outlines(scene, followed[-1][0])
+    u, v = np.asarray(observed.center).round().astype(int).T
     assert np.all(frames[-1][0].foreground[v, u] == 255)
 
 

@@ -125,15 +125,15 @@ def refined(
     lacking = lambda fit: fit.misfit_share * (fit.residual_scale - 1)
     residual_scale = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
     drift = recent.drifted(state.recent, is_followed)
-    seen = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
+    observed = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
     return Estimate(
         belief,
         doubt,
         M,
         measured,
         is_found,
-        jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
-        seen,
+        jnp.sum(jnp.any(~observed.has_changed, axis=0)).astype(x.dtype),
+        observed,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
         jnp.clip(MEMORY * state.model_variance + (1 - MEMORY) * average(fits.excess), *MODEL_VARIANCE),
         jnp.clip(state.residual_scale * (1 + (1 - MEMORY) * residual_scale), *RESIDUAL_SCALE),
@@ -152,8 +152,8 @@ def _shares(rest: Refined, fits: Refined) -> tuple[Array, Array]:
 def _looseness(state: HeadState, strength: Array | float) -> Array:
     """Covariance of each landmark about the model of a face whose expression is so strong, mm^2."""
     expression = jnp.asarray(EXPRESSION_STD**2, state.model_variance.dtype)
-    learnt = jnp.minimum(state.model_variance[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
-    return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learnt, strength**2 * expression))
+    learned = jnp.minimum(state.model_variance[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
+    return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learned, strength**2 * expression))
 
 
 def _at_rest(

@@ -176,11 +176,11 @@ class Following:
 
     def _look_at(self, image: np.ndarray, points: np.ndarray) -> None:
         """Give the track up if a face is detected elsewhere time after time; that none is detected says nothing."""
-        seen = detect(image, near=points.mean(axis=0))
-        if seen is None:
+        observed = detect(image, near=points.mean(axis=0))
+        if observed is None:
             return
-        right, left = eye_centers(seen.points)
-        apart = np.median(np.linalg.norm(points[: len(seen.points)] - seen.points, axis=1))
+        right, left = eye_centers(observed.points)
+        apart = np.median(np.linalg.norm(points[: len(observed.points)] - observed.points, axis=1))
         is_elsewhere = apart > SAME_PLACE * np.linalg.norm(left - right)
         self._contradictions = self._contradictions + 1 if is_elsewhere else 0
         if self._contradictions == MOST_CONTRADICTIONS:
@@ -211,16 +211,16 @@ class Following:
     def _found(self, images: np.ndarray, time: float) -> Any:
         """What a track can begin with; in a live session that of earlier frames."""
         if self._pool is None or not self._tracker.can_wait:
-            return self._told(self._tracker.search(images, time))
+            return self._message(self._tracker.search(images, time))
         if self._wait is None:
             self._wait = self._pool.submit(self._tracker.search, images.copy(), time)
             return None
         if not self._wait.done():
             return None
         wait, self._wait = self._wait, None
-        return self._told(wait.result())
+        return self._message(wait.result())
 
-    def _told(self, outcome: tuple[Any, list[str]]) -> Any:
+    def _message(self, outcome: tuple[Any, list[str]]) -> Any:
         """What was found; each thing that is wrong is said once in every search."""
         found, wrong = outcome
         for reason in wrong:

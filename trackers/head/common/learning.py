@@ -60,7 +60,7 @@ def recalculated(
     return shape, patches(images, shape, pose, rig)
 
 
-def learnt(
+def learned(
     learner: Learner,
     model: FaceModel,
     shape: Float[Array, "K 3"],

@@ -52,9 +52,9 @@ def nothing_changed(
 ) -> Recent:
     """What is known at registration, of a shape posed in these images."""
     uv, _ = project_shape(rig, shape, pose)
-    seen = windows(images, uv)
+    observed = windows(images, uv)
     none = jnp.zeros(uv.shape[:2], uv.dtype)
-    return Recent(seen, jnp.zeros_like(uv), seen, none, none > 0, shape, pose)
+    return Recent(observed, jnp.zeros_like(uv), observed, none, none > 0, shape, pose)
 
 
 def followed(
@@ -79,11 +79,11 @@ def followed(
         pose: Millimetres and radians.
         rig: Cameras.
     """
-    doubtful = found.seen & (found.score < CHANGED_SCORE)
+    doubtful = found.observed & (found.score < CHANGED_SCORE)
 
     def from_last() -> tuple[Alignment, Array]:
         again = align(_patches(recent.found, recent, rig), slopes, images, uv + recent.apart, shape, pose, rig)
-        better = doubtful & again.seen & (again.score > found.score + CLEARLY_BETTER)
+        better = doubtful & again.observed & (again.score > found.score + CLEARLY_BETTER)
         return taken_over(found, again, better), better
 
     return jax.lax.cond(jnp.any(doubtful), from_last, lambda: (found, jnp.zeros_like(doubtful)))
@@ -91,7 +91,7 @@ def followed(
 
 def is_anchored(found: Alignment) -> Bool[Array, "C K"]:
     """Which landmarks look as registered, by the alignment of the registered patches."""
-    return found.seen & (found.score > ANCHORED_SCORE)
+    return found.observed & (found.score > ANCHORED_SCORE)
 
 
 def as_seen(
@@ -116,7 +116,7 @@ def as_seen(
     """
     uv, _ = project_shape(rig, shape, pose)
     uv = jnp.where(jnp.isfinite(uv), uv, 0.0)
-    is_there = found.seen & (found.score > CHANGED_SCORE)
+    is_there = found.observed & (found.score > CHANGED_SCORE)
     apart = jnp.where(is_there[..., None], found.uv - uv, 0.0)
     has_left = jnp.linalg.norm(apart, axis=-1) > FAR_PX
     drift = jnp.zeros_like(found.score) if drift is None else drift

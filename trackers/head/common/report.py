@@ -29,14 +29,14 @@ class HeadTruth(NamedTuple):
 def shares(track: HeadRows) -> dict[str, Any]:
     """Frames by status, how much of the run is tracked, and the longest stretch without loss."""
     counts = np.bincount(track.status, minlength=len(STATUS_WORDS))
-    seen = int(len(track.status) - counts[SKIPPED])
+    observed = int(len(track.status) - counts[SKIPPED])
     longest = longest_stretch(track.status)
     tracked = np.isin(track.status, TRACKED)
     ends = track.times_s[[longest.start, longest.stop - 1]] if longest.stop else np.zeros(2)
     return {
         "frames": len(track.status),
         "status": dict(zip(STATUS_WORDS, counts.tolist(), strict=True)),
-        "share_tracked": round(float(tracked.sum() / seen), 4) if seen else None,
+        "share_tracked": round(float(tracked.sum() / observed), 4) if observed else None,
         "longest_stretch_frames": int(tracked[longest].sum()),
         "longest_stretch_s": round(float(ends[1] - ends[0]), 3),
         "mean_score": _rounded(np.mean(track.score[tracked])) if tracked.any() else None,

@@ -103,13 +103,13 @@ def draw_modes(model: FaceModel | None, labels: Labels = DEFORMATION) -> np.ndar
     """(rows, cols, 3) uint8: for each mode estimated the mean face and those beside it, from the front and the side."""
     sheet = np.full((_MODE_ROWS, _WIDTH, 3), 255, np.uint8)
     deviation = np.zeros(0) if model is None else np.asarray(model.deviation, float)
-    learnt = np.flatnonzero(deviation > 0)[:NUM_MODES]
-    if model is None or not learnt.size:
+    learned = np.flatnonzero(deviation > 0)[:NUM_MODES]
+    if model is None or not learned.size:
         what = "no face was registered" if model is None else "a rigid face: no deformation was estimated"
         write(sheet, what, (_LEFT, 24))
         return sheet
     width = _WIDTH // NUM_MODES
-    for cell, mode in enumerate(learnt):
+    for cell, mode in enumerate(learned):
         offset = DEVIATIONS * deviation[mode] * np.asarray(model.basis, float)[:, mode].reshape(-1, 3)
         picture = _draw_mode((_MODE_ROWS, width), np.asarray(model.mean, float), offset)
         write(picture, f"{labels.mode}{mode + 1}, sd {deviation[mode]:.1f} mm", (26, 52))

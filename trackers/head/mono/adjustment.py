@@ -204,8 +204,8 @@ def _registered_anew(face: MultilinearFace, rig: CameraRig, state: MonoState, bu
     old = state.registered
     pose, expression = bundle.poses[0], bundle.expressions[0]
     shape = posed_shape(face, bundle.person, expression)
-    seen = patches_of(old.wide, shape, pose, rig, old.patches.normals)
-    return state._replace(registered=old._replace(patches=seen))
+    observed = patches_of(old.wide, shape, pose, rig, old.patches.normals)
+    return state._replace(registered=old._replace(patches=observed))
 
 
 def _with(window: Window, frame: Frame, place: Array) -> Window:

@@ -98,7 +98,7 @@ def _tracked(
     }
     focal = _focal(session, place.rig) if options.estimate_focal else None
     report |= {"focal_length_estimate": focal}
-    run.writer.finish(report, **_learnt(session))
+    run.writer.finish(report, **_learned(session))
     if session.remembered is not None:
         write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.remembered), face)
     truth = None if place.truth is None else place.truth.poses
@@ -155,9 +155,9 @@ def _taken_for(run: StreamRun, known: People | None) -> dict[str, int]:
     return {name: int(np.sum(who == i)) for i, name in enumerate(names) if np.any(who == i)}
 
 
-def _learnt(session: MonoSession) -> dict[str, np.ndarray]:
+def _learned(session: MonoSession) -> dict[str, np.ndarray]:
     """What `track.npz` holds beside the track."""
-    learnt = {"status_names": np.asarray(TABLE_STATUS)}
+    learned = {"status_names": np.asarray(TABLE_STATUS)}
     if session.person is not None:
-        learnt |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
-    return learnt
+        learned |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
+    return learned

@@ -44,7 +44,7 @@ class Dense(NamedTuple):
     """Pixels, in iBUG's order."""
     covariance: Float[np.ndarray, "n 68 2 2"]
     """Pixels squared."""
-    seen: Bool[np.ndarray, "n 68"]
+    observed: Bool[np.ndarray, "n 68"]
     """Not what a detector does not give, or not reliably."""
     misplaced_mm: float
     """By how much they lie beside the model's landmarks, the same in all frames: standard deviation of a coordinate."""
@@ -85,7 +85,7 @@ def start_densely(face: MultilinearFace, rig: CameraRig, start: Start, dense: De
         prior: What holds the face; its weight is not 0.
     """
     numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, start.uv.dtype), tree)
-    views = Views(numbers(dense.uv), numbers(dense.covariance), jnp.asarray(dense.seen))
+    views = Views(numbers(dense.uv), numbers(dense.covariance), jnp.asarray(dense.observed))
     return _adjusted(face, rig, start, views, numbers(dense.misplaced_mm), numbers(prior), numbers(REACH))
 
 
@@ -149,9 +149,9 @@ def information_of_ten(
 
         def residuals(y: Array, own: Array) -> Array:
             who, a = split.person(y, misplaced), expression + units[6:] * own[6:]
-            seen = frame_residuals(face, rig, view, Bundle(pose + units[:6] * own[:6], a, who), prior.weight)
+            observed = frame_residuals(face, rig, view, Bundle(pose + units[:6] * own[:6], a, who), prior.weight)
             # Offsets are held once, in proportion to the size that the face has in all frames.
-            return jnp.concatenate([seen, *(part / np.sqrt(len(views.uv)) for part in held(y, a[0]))])
+            return jnp.concatenate([observed, *(part / np.sqrt(len(views.uv)) for part in held(y, a[0]))])
 
         information, _, gradient = reduced(residuals, y, jnp.zeros_like(units))
         return information, gradient

@@ -56,7 +56,7 @@ class Collector:
         self.several = 0
         """Faces in the last frame, if more than one."""
         self._detector = detector or CascadeDetector()
-        self._seen: list[Seen] = []
+        self._observed: list[Seen] = []
         self._images: list[np.ndarray] = []
         self._times: list[float] = []
 
@@ -70,11 +70,11 @@ class Collector:
         self.reason, self.several = "", 0
         if self._times and 0 <= time - self._times[-1] < APART_S:
             return None
-        seen = self._detected(image)
-        if seen is None:
+        observed = self._detected(image)
+        if observed is None:
             return None
-        self._drop_others(seen.points, time)
-        return self._kept(seen, image, time)
+        self._drop_others(observed.points, time)
+        return self._kept(observed, image, time)
 
     def given(self, points: Float[np.ndarray, "K 2"], image: UInt8[np.ndarray, "rows cols"], time: float) -> Detections:
         """Detections that are one frame's landmarks, ten or 68, given by a person."""
@@ -90,10 +90,10 @@ class Collector:
 
     def clear(self) -> None:
         """Begins anew."""
-        self._seen, self._images, self._times = [], [], []
+        self._observed, self._images, self._times = [], [], []
 
     def _detected(self, image: np.ndarray) -> Seen | None:
-        near = self._seen[-1].points.mean(axis=0) if self._seen else None
+        near = self._observed[-1].points.mean(axis=0) if self._observed else None
         found = self._detector.detect(image, near)
         if isinstance(found, str):
             self.reason = found
@@ -110,21 +110,21 @@ class Collector:
             return
         right, left = eye_centers(points[:6])
         most = SAME_PLACE * np.linalg.norm(left - right)
-        is_other = np.linalg.norm(points.mean(axis=0) - self._seen[-1].points.mean(axis=0)) > most
+        is_other = np.linalg.norm(points.mean(axis=0) - self._observed[-1].points.mean(axis=0)) > most
         if is_other or time < self._times[-1]:
             self.clear()
         while self._times and time - self._times[0] > STALE_S:
-            del self._seen[0], self._images[0], self._times[0]
+            del self._observed[0], self._images[0], self._times[0]
 
-    def _kept(self, seen: Seen, image: np.ndarray, time: float) -> Detections | None:
-        self._seen.append(seen)
+    def _kept(self, observed: Seen, image: np.ndarray, time: float) -> Detections | None:
+        self._observed.append(observed)
         self._images.append(image.copy())
         self._times.append(time)
-        if len(self._seen) < NUM_FRAMES:
+        if len(self._observed) < NUM_FRAMES:
             return None
-        points = np.stack([one.points for one in self._seen])
-        many = [one.dense for one in self._seen if one.dense is not None]
-        widths = [one.iris_px for one in self._seen if one.iris_px is not None]
+        points = np.stack([one.points for one in self._observed])
+        many = [one.dense for one in self._observed if one.dense is not None]
+        widths = [one.iris_px for one in self._observed if one.iris_px is not None]
         dense = None if len(many) < NUM_FRAMES else _of_mesh(np.stack(many))
         iris_px = None if len(widths) < NUM_FRAMES else np.stack(widths)
         errors = self._detector.errors
@@ -145,5 +145,5 @@ def noise_px(errors: DetectorErrors, points: Float[np.ndarray, "n K 2"]) -> Floa
 
 
 def _of_mesh(points: Float[np.ndarray, "n 68 2"]) -> Dense:
-    covariance, seen = dense_noise(points)
-    return Dense(np.nan_to_num(points), covariance, seen, MESH_MM)
+    covariance, observed = dense_noise(points)
+    return Dense(np.nan_to_num(points), covariance, observed, MESH_MM)

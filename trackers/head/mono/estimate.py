@@ -93,8 +93,8 @@ def aligned(
     M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
     sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
     drifted = recent.drifted(state.recent, is_followed, drift)
-    seen = recent.as_seen(found, anchored, M, pose, images, rig, drifted)
-    by_shape = jnp.where(found.seen[..., None, None], jacobian(rig, M, pose)[0], 0.0)
+    observed = recent.as_seen(found, anchored, M, pose, images, rig, drifted)
+    by_shape = jnp.where(found.observed[..., None, None], jacobian(rig, M, pose)[0], 0.0)
     by_slope = jnp.einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
     variance = state.model_variance + UNMODELLED_MM**2
     spread = jnp.einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
@@ -102,10 +102,10 @@ def aligned(
     return Estimate(
         fit.belief,
         # What is followed from the last frame is some other point of the skin, and says nothing of the person.
-        Views(found.uv, covariance, found.seen & (found.score > LEAST_SCORE) & ~is_followed),
+        Views(found.uv, covariance, found.observed & (found.score > LEAST_SCORE) & ~is_followed),
         sound & (fit.num_seen >= FEWEST_SEEN),
-        jnp.sum(jnp.any(~seen.has_changed, axis=0)).astype(x.dtype),
-        seen,
+        jnp.sum(jnp.any(~observed.has_changed, axis=0)).astype(x.dtype),
+        observed,
         state.windows,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
         running_variance(state.model_variance, fit.excess, fit.alignment_variance, 1 - MEMORY, MODEL_VARIANCE),
@@ -129,8 +129,8 @@ def recalculated(
     uv, info = recalculate_points(m, m, images[0], previous, templates)
     windows = point_windows(images[0], uv, size=templates.shape[-1])[None]
     # A window beyond the border leaves the point where it was: that is no measurement.
-    seen = rough.view.seen & jnp.isfinite(info.residual)
-    return rough._replace(view=rough.view._replace(uv=uv[None], seen=seen), windows=windows)
+    observed = rough.view.observed & jnp.isfinite(info.residual)
+    return rough._replace(view=rough.view._replace(uv=uv[None], observed=observed), windows=windows)
 
 
 def projected(

@@ -338,7 +338,7 @@ class _MonoTracker:
             return None, [f"the points are no face's: the best one is {error:.1f} px from them"]
         if depth.min() < DEPTH_MM[0] or depth.max() > DEPTH_MM[1]:
             return None, [f"the face would be {depth.mean():.0f} mm away"]
-        return self._told(detections, start, prior), []
+        return self._message(detections, start, prior), []
 
     def _prior(self, detections: Detections) -> Prior:
         """What holds the face, with what the detector misplaces."""
@@ -348,7 +348,7 @@ class _MonoTracker:
         covariance = errors.covariance + UNRENDERED_MM**2 * np.eye(len(errors.covariance))
         return prior_of(options)._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std))
 
-    def _told(self, detections: Detections, start: Start, prior: Prior) -> _Found:
+    def _message(self, detections: Detections, start: Start, prior: Prior) -> _Found:
         """The start with all that the detections tell beside the ten landmarks."""
         points = jnp.asarray(detections.points, float)
         views, past = detected(points, jnp.asarray(detections.std_px, points.dtype)), None
@@ -360,7 +360,7 @@ class _MonoTracker:
             prior = prior._replace(misplaced=None)
             start, past = start_densely(self._whole, self.rig, start, detections.dense, prior)
             # What they tell of the person is in the past already.
-            views = views._replace(seen=jnp.zeros_like(views.seen))
+            views = views._replace(observed=jnp.zeros_like(views.observed))
         if detections.iris_px is not None and options.eyes_apart_mm is None:
             start, past = with_irises(self._face, self.rig, start, views, past, detections.iris_px, prior)
         return _Found(detections, start, views, prior._replace(past=past))

@@ -201,20 +201,20 @@ def _registered(face, rig, bundle, uv, frame, image) -> Registered:
     wide = windows(image, uv[None])
     border = (WIDE_SIZE - SIZE) // 2
     shape = posed_shape(face, bundle.person, bundle.expressions[frame])
-    seen = patches_of(wide, shape, bundle.poses[frame], rig, jnp.asarray(SKIN_NORMALS, uv.dtype))
-    return Registered(wide, wide[..., border:-border, border:-border], seen)
+    observed = patches_of(wide, shape, bundle.poses[frame], rig, jnp.asarray(SKIN_NORMALS, uv.dtype))
+    return Registered(wide, wide[..., border:-border, border:-border], observed)
 
 
 def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike, ""], options: MonoConfig) -> Window:
     """The frames of the start; that of the templates comes first, where they are exact by definition."""
     n = len(views.uv)
     order = jnp.arange(n).at[0].set(frame).at[frame].set(0)
-    points, covariance, seen = (leaf[order] for leaf in views)
+    points, covariance, observed = (leaf[order] for leaf in views)
     if not options.is_published:
         points = points.at[0].set(uv)
         covariance = covariance.at[0].set(ANCHORED_PX**2 * jnp.eye(2))
-        seen = seen.at[0].set(True)
-    views = Views(points, covariance, seen)
+        observed = observed.at[0].set(True)
+    views = Views(points, covariance, observed)
     size = bundle.person.identity.size + bundle.person.offset.size
     return Window(
         views,

@@ -116,12 +116,12 @@ def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoConf
     """What landmarks look like as the head is expected to be turned: as at registration; and, if changed, of late."""
     if options.is_published:
         return state.registered.templates, state.registered.templates
-    x, seen = state.belief.mean, state.registered.patches
+    x, observed = state.belief.mean, state.registered.patches
     pose, M = x[:POSE] + moved, shape(state.model, x[POSE:])
     by_shape, _ = jacobian(rig, M, pose)
-    is_facing = facing(seen, by_shape)[..., None, None]
-    affine = jnp.where(is_facing, stretch(seen, state.slopes, by_shape), jnp.eye(2))
-    templates = jnp.where(is_facing, turned(seen, affine), 0.0)
+    is_facing = facing(observed, by_shape)[..., None, None]
+    affine = jnp.where(is_facing, stretch(observed, state.slopes, by_shape), jnp.eye(2))
+    templates = jnp.where(is_facing, turned(observed, affine), 0.0)
     latest = latest_templates(state.recent, state.slopes, templates, M, pose, rig)
     return templates, jnp.where(state.misses < PATIENCE, latest, templates)
 

@@ -60,7 +60,7 @@ def _tracked(
             for name, value in (("rig", options.rig), ("camera", options.camera), ("points", options.points))
         },
     }
-    run.writer.finish(report, **_learnt(session))
+    run.writer.finish(report, **_learned(session))
     truth = None if stream.place.truth is None else stream.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
     run.conclude(followed)
@@ -77,10 +77,10 @@ def _session(place: Setup, settings: HeadConfig) -> HeadSession:
         raise InputError(f"--detector {settings.detector}: {error}") from error
 
 
-def _learnt(session: HeadSession) -> dict[str, np.ndarray]:
+def _learned(session: HeadSession) -> dict[str, np.ndarray]:
     """What `track.npz` holds beside the track."""
-    learnt = {"status_names": np.asarray(TABLE_STATUS)}
+    learned = {"status_names": np.asarray(TABLE_STATUS)}
     if session.model is not None:
         names = ("mean", "basis", "deviation", "templates")
-        learnt |= {f"model_{name}": np.asarray(getattr(session.model, name)) for name in names}
-    return learnt
+        learned |= {f"model_{name}": np.asarray(getattr(session.model, name)) for name in names}
+    return learned

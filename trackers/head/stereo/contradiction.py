@@ -46,22 +46,22 @@ def why_unmatched(
         window = images[0][max(v - half, 0) : v + half, max(u - half, 0) : u + half]
         _, found[k], _, place = cv2.minMaxLoc(cv2.matchTemplate(images[c], window, cv2.TM_CCOEFF_NORMED))
         at[k] = points[k] + place - np.maximum((u - half, v - half), 0)
-    seen = found >= LEAST_SCORE
-    if seen.sum() < FEWEST:
+    observed = found >= LEAST_SCORE
+    if observed.sum() < FEWEST:
         return (
-            f"only {seen.sum()} of {len(points)} landmarks are found in image {c}, by a correlation of "
+            f"only {observed.sum()} of {len(points)} landmarks are found in image {c}, by a correlation of "
             f"{LEAST_SCORE:g}: it shows another moment or another scene, or the face is hidden."
         )
     inverse = np.linspace(-1 / _CLOSEST, 1 / _CLOSEST, 4001)
     away = np.linalg.norm(epipolar.seen_at(rig, points, inverse, source=0, target=c) - at[:, None], axis=-1)
     away = np.where(np.isnan(away), np.inf, away)
-    error = float(np.median(away.min(axis=1)[seen]))
+    error = float(np.median(away.min(axis=1)[observed]))
     if error > MOST_ASIDE:
         return (
             f"epipolar error: the rig contradicts the images; landmarks are {error:.1f} px from their epipolar lines "
             f"in image {c}, where {MOST_ASIDE:g} px are allowed: calibrate again, or take images of one moment."
         )
-    nearness = float(np.median(inverse[away.argmin(axis=1)][seen]))
+    nearness = float(np.median(inverse[away.argmin(axis=1)][observed]))
     if nearness <= 0:
         return f"the face is behind the cameras: images 0 and {c}, or their cameras, are swapped."
     if not epipolar.NEAREST < 1 / nearness < epipolar.FARTHEST:

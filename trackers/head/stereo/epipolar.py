@@ -69,9 +69,9 @@ def seen_at(
     turn = R[target] @ R[source].T
     shift = t[target] - turn @ t[source]
     rays = np.column_stack([(points - center[source]) / K[source], np.ones(len(points))])
-    seen = (rays @ turn.T)[:, None] + inverse_depths[:, None] * shift
-    depth = np.where(seen[..., 2:] > 1e-3, seen[..., 2:], np.nan)
-    return seen[..., :2] / depth * K[target] + center[target]
+    observed = (rays @ turn.T)[:, None] + inverse_depths[:, None] * shift
+    depth = np.where(observed[..., 2:] > 1e-3, observed[..., 2:], np.nan)
+    return observed[..., :2] / depth * K[target] + center[target]
 
 
 def windows(image: UInt8[np.ndarray, "rows cols"], points: Float[np.ndarray, "K 2"]) -> Float[Array, "K T T"]:

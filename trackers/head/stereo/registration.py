@@ -161,8 +161,8 @@ def _triangulated(images: np.ndarray, points: np.ndarray, rig: CameraRig) -> Flo
         if scores.min() < LEAST_SCORE or returned.max() > MOST_RETURN:
             raise RegistrationError(why_unmatched(images, rig, points, c, scores, returned))
         uv.append(there)
-    world, seen, in_front = _nearest(rig, jnp.asarray(np.stack(uv), float))
-    errors = np.linalg.norm(np.asarray(seen) - np.stack(uv), axis=-1)
+    world, observed, in_front = _nearest(rig, jnp.asarray(np.stack(uv), float))
+    errors = np.linalg.norm(np.asarray(observed) - np.stack(uv), axis=-1)
     if not np.all(in_front) or errors.max() > MOST_REPROJECTION:
         c, k = np.unravel_index(np.nan_to_num(errors, nan=np.inf).argmax(), errors.shape)
         raise RegistrationError(

@@ -70,7 +70,7 @@ def sharpened(
     lacking = jnp.zeros((1, len(shape)), shape.dtype)
     for c in range(1, rig.num_cameras):
         found = align(first, slopes, images[c : c + 1], uv[c : c + 1], shape, pose, _one(rig, c))
-        near = found.seen[0] & (jnp.linalg.norm(found.uv[0] - uv[c], axis=-1) < MOST_CHANGE_PX)
+        near = found.observed[0] & (jnp.linalg.norm(found.uv[0] - uv[c], axis=-1) < MOST_CHANGE_PX)
         inclined = jnp.einsum("kis,kst,kjt->kij", found.by_slope[0], slopes.covariance, found.by_slope[0])
         places.append(jnp.where(near[:, None], found.uv[0], uv[c]))
         mismatch = MISMATCH_PX * jnp.maximum(SAME_SKIN - found.score, 0.0)

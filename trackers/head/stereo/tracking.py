@@ -157,7 +157,7 @@ def _step(
     num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
-    state = _learnt(way, state, model, search, belief, estimate, score, missed, images, rig, options)
+    state = _learned(way, state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
     due &= way.sharpens
     state = jax.lax.cond(due, partial(_sharpened, rig), lambda state: state, state)
@@ -208,7 +208,7 @@ def _held(estimate: Estimate, search: AdaptiveDiffusionState, model: FaceModel, 
     return jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), estimate.belief, particles)
 
 
-def _learnt(
+def _learned(
     way: Variant,
     state: HeadState,
     usable: FaceModel,
@@ -228,7 +228,7 @@ def _learnt(
     if options.learn and rig.num_cameras > 1:
         is_measured = found & learning.measurable(belief.mean[:POSE], score)
         measured, windows = way.measured(state, estimate, images, rig, is_measured)
-        learner, model = learning.learnt(learner, model, measured, windows, is_measured, way.follow, way.still)
+        learner, model = learning.learned(learner, model, measured, windows, is_measured, way.follow, way.still)
     search, belief = _carried(search, belief, usable, model)
     # A face that is not found is not headed anywhere.
     search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
@@ -263,9 +263,9 @@ def _carried(
 
 def _registered(images: Array, shape: Array, pose: Array, slopes: Slopes, rig: CameraRig) -> Registered:
     """The face as it was matched."""
-    seen = patches(images, shape, pose, rig, jnp.asarray(SKIN_NORMALS, shape.dtype))
+    observed = patches(images, shape, pose, rig, jnp.asarray(SKIN_NORMALS, shape.dtype))
     _, covariance, alike = sharpened(images, shape, pose, slopes, rig)
-    return Registered(shape, covariance, alike, seen, pose, images)
+    return Registered(shape, covariance, alike, observed, pose, images)
 
 
 def _sharper(images: Array, shape: Array, pose: Array, slopes: Slopes, rig: CameraRig) -> Registered:
@@ -275,8 +275,8 @@ def _sharper(images: Array, shape: Array, pose: Array, slopes: Slopes, rig: Came
     # The landmarks stay where they are in the first image: what moves the centroid moves the pose back.
     place = pose.at[:3].add(rotation(pose[3:]) @ center)
     shape = shape - center
-    seen = patches(images, shape, place, rig, jnp.asarray(SKIN_NORMALS, shape.dtype))
-    return Registered(shape, covariance, alike, seen, place, images)
+    observed = patches(images, shape, place, rig, jnp.asarray(SKIN_NORMALS, shape.dtype))
+    return Registered(shape, covariance, alike, observed, place, images)
 
 
 def _sharpened(rig: CameraRig, state: HeadState) -> HeadState:

@@ -76,9 +76,9 @@ def _rigid_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[
 
 def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
     """Particles deform where the model does."""
-    learnt = jnp.any(model.deviation > 0)
+    learned = jnp.any(model.deviation > 0)
     return jax.lax.cond(
-        learnt, lambda: run(searches.layered, model.deviation), lambda: _rigid_search(run, searches, model)
+        learned, lambda: run(searches.layered, model.deviation), lambda: _rigid_search(run, searches, model)
     )
 
 

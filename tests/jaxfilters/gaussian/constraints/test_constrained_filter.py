@@ -23,14 +23,14 @@ def unmoved(x, inputs):
     return x
 
 
-def seen(x):
+def observed(x):
     return x
 
 
 def one_variable(noise=1e8):
     """N(0, 1), constant, and observations that say next to nothing."""
     prior = Gaussian(jnp.zeros(1), jnp.eye(1))
-    return extended_kalman(prior, unmoved, jnp.zeros((1, 1)), seen, noise * jnp.eye(1))
+    return extended_kalman(prior, unmoved, jnp.zeros((1, 1)), observed, noise * jnp.eye(1))
 
 
 def run(filter, frames, y=0.0):
@@ -56,7 +56,7 @@ def test_applied_afresh_it_shrinks_the_belief_in_every_frame(x64, method):
 
 def test_what_moves_is_cut_anew(x64):
     prior = Gaussian(jnp.zeros(1), jnp.eye(1))
-    walk = extended_kalman(prior, unmoved, 10.0 * jnp.eye(1), seen, 1e8 * jnp.eye(1))
+    walk = extended_kalman(prior, unmoved, 10.0 * jnp.eye(1), observed, 1e8 * jnp.eye(1))
     _, _, infos = run(constrained(walk, EPConstraints(below_a_half(), jnp.array([False]))), 5)
     # The walk leaves the bound behind in every frame: there is always something to cut.
     assert np.all(np.asarray(infos.truncation.log_mass) < -0.05)

@@ -101,7 +101,7 @@ def test_six_points_are_needed(draw_face):
         complete(image, wrong)
 
 
-def seen(points):
+def observed(points):
     nothing = np.zeros(4)
     return Detection(points, np.array([100.0, 100, 200, 200]), np.zeros((2, 4)), nothing, 1)
 
@@ -116,13 +116,13 @@ def watch(monkeypatch):
     """A detector that is shown points instead of images."""
 
     def reasons(sequence):
-        waiting, told = StableDetector(), []
+        waiting, message = StableDetector(), []
         for shown in sequence:
             monkeypatch.setattr(detect, "_search", lambda image, near, shown=shown: shown)
             done = waiting.update(np.zeros((48, 64), np.uint8))
             assert (done is None) == bool(waiting.reason)
-            told.append(waiting.reason)
-        return told
+            message.append(waiting.reason)
+        return message
 
     return reasons
 
@@ -130,23 +130,23 @@ def watch(monkeypatch):
 def test_five_frames_must_agree(draw_face, watch):
     points = draw_face((330, 220), 70.0)[1][:6]
     frames = [points + 1.3 * i for i in range(5)]  # 1.84 px a frame
-    assert [bool(reason) for reason in watch(map(seen, frames))] == [True] * 4 + [False]
+    assert [bool(reason) for reason in watch(map(observed, frames))] == [True] * 4 + [False]
     frames[3:] = [frame + 2.1 for frame in frames[3:]]
-    assert [bool(reason) for reason in watch(map(seen, [*frames, *frames[-1:] * 3]))] == [True] * 7 + [False]
+    assert [bool(reason) for reason in watch(map(observed, [*frames, *frames[-1:] * 3]))] == [True] * 7 + [False]
     larger = [3 * frame for frame in [points + 1.3 * i for i in range(5)]]  # eyes 210 px apart: 5.5 px a frame
-    assert watch(map(seen, [points + 3.8 * i for i in range(5)]))[-1] != ""
-    assert watch(map(seen, larger))[-1] != ""
-    assert watch(map(seen, [3 * points + 3.8 * i for i in range(5)]))[-1] == ""
+    assert watch(map(observed, [points + 3.8 * i for i in range(5)]))[-1] != ""
+    assert watch(map(observed, larger))[-1] != ""
+    assert watch(map(observed, [3 * points + 3.8 * i for i in range(5)]))[-1] == ""
 
 
 def test_a_face_lost_or_tilted_starts_the_wait_anew(draw_face, watch):
     points = draw_face((330, 220), 70.0)[1][:6]
-    still = [seen(points)] * 5
+    still = [observed(points)] * 5
     assert watch([*still[:4], "no face", *still])[4:] == ["no face", *watch(still)]
     assert watch(still)[-1] == ""
-    assert "tilted" in watch([seen(turned(points, 15.5))] * 6)[-1]
-    assert "tilted" in watch([seen(turned(points, -15.5))] * 6)[-1]
-    assert watch([seen(turned(points, 14.5))] * 5)[-1] == ""
+    assert "tilted" in watch([observed(turned(points, 15.5))] * 6)[-1]
+    assert "tilted" in watch([observed(turned(points, -15.5))] * 6)[-1]
+    assert watch([observed(turned(points, 14.5))] * 5)[-1] == ""
 
 
 def test_the_mesh_says_what_it_needs(monkeypatch):

@@ -28,7 +28,7 @@ from jaxfilters.trackers.head.common.state import NUM_MODES
 
 NEUTRAL = jnp.asarray(MEAN_SHAPE, jnp.float32)
 WINDOWS = jnp.zeros((2, 10, 16, 16))
-learnt = jax.jit(learning.learnt, static_argnames=("follow", "still"))
+learned = jax.jit(learning.learned, static_argnames=("follow", "still"))
 recalculated = jax.jit(learning.recalculated)
 
 
@@ -45,7 +45,7 @@ def follow_all(shapes, follow=1.0, still=as_it_is):
     """Learner and model after shapes that were all measured."""
 
     def one(carry, M):
-        return learning.learnt(*carry, M, WINDOWS, jnp.ones((), bool), follow, still), carry[1].mean
+        return learning.learned(*carry, M, WINDOWS, jnp.ones((), bool), follow, still), carry[1].mean
 
     return jax.jit(lambda shapes: jax.lax.scan(one, begin(), shapes))(jnp.asarray(shapes, jnp.float32))
 
@@ -101,7 +101,7 @@ def test_only_deformations_change_the_modes():
     direction /= np.linalg.norm(direction)
     for norm, count in ((LEAST_CHANGE - 0.1, 0), (LEAST_CHANGE + 0.1, 1)):
         M = jnp.asarray(MEAN_SHAPE + norm * direction, jnp.float32)
-        after, changed = learnt(learner, model, M, WINDOWS, jnp.ones((), bool), 1.0, as_it_is)
+        after, changed = learned(learner, model, M, WINDOWS, jnp.ones((), bool), 1.0, as_it_is)
         assert int(after.subspace.num_samples) == count
         assert bool(jnp.any(changed.deviation > 0)) == bool(count)
         np.testing.assert_allclose(changed.mean, MEAN_SHAPE + 0.5 * norm * direction, atol=1e-4)
@@ -111,7 +111,7 @@ def test_only_deformations_change_the_modes():
 def test_shapes_that_were_not_measured_change_nothing(why):
     learner, model = begin()
     M = NEUTRAL + 3.0 if why == "not measured" else NEUTRAL.at[3, 1].set(jnp.nan)
-    after, same = learnt(learner, model, M, WINDOWS, jnp.asarray(why == "not finite"), 1.0, as_it_is)
+    after, same = learned(learner, model, M, WINDOWS, jnp.asarray(why == "not finite"), 1.0, as_it_is)
     jax.tree.map(np.testing.assert_array_equal, same, model)
     jax.tree.map(np.testing.assert_array_equal, after.subspace, learner.subspace)
     np.testing.assert_array_equal(after.shape, NEUTRAL)
@@ -158,7 +158,7 @@ def test_the_motion_of_the_skull_is_taken_out():
     M = moved + np.array([[0, 8.0 * (k in (4, 5)), 0] for k in range(10)])
     learner, model = begin()
     arguments = jnp.asarray(M, jnp.float32), WINDOWS, jnp.ones((), bool), 0.0
-    _, still = learnt(learner, model, *arguments, without_weighted_motion)
+    _, still = learned(learner, model, *arguments, without_weighted_motion)
     direction = remove_rigid(*(jnp.asarray(a, jnp.float32) for a in (M - MEAN_SHAPE, MEAN_SHAPE, RIGID_WEIGHTS)))
     unit = np.asarray(direction).ravel() / np.linalg.norm(direction)
     np.testing.assert_allclose(np.abs(np.asarray(still.basis)[:, 0] @ unit), 1, atol=1e-5)
@@ -241,7 +241,7 @@ def test_faces_of_the_generator_are_learnt_with_two_modes():
     shapes = jax.vmap(partial(face_shape, identity))(*jnp.asarray(rng.uniform(-0.4, 0.7, (2, 150)), float))
     learner, model = begin(identity.neutral)
     for M in shapes[:40]:
-        learner, model = learnt(learner, model, M, WINDOWS, jnp.ones((), bool), 0.0, without_weighted_motion)
+        learner, model = learned(learner, model, M, WINDOWS, jnp.ones((), bool), 0.0, without_weighted_motion)
     change = np.asarray(shapes - identity.neutral)
     still = np.stack([without_weighted_motion(jnp.asarray(one), identity.neutral) for one in change[40:60]])
     left = still.reshape(20, -1) - still.reshape(20, -1) @ np.asarray(model.basis) @ np.asarray(model.basis).T

@@ -50,9 +50,9 @@ def test_a_changed_landmark_is_followed_and_the_others_stay_registered(scene):
     np.testing.assert_array_equal(again.uv[:, others], found.uv[:, others])
 
     # What the next frame is told: this landmark has changed, and where it was found beside the model's.
-    seen = recent.as_seen(again, jnp.asarray(anchored), shape, pose, after, rig)
-    np.testing.assert_array_equal(np.asarray(seen.has_changed)[0], ~others)
-    np.testing.assert_allclose(seen.apart[:, CHANGED], np.tile(MOVED, (2, 1)), atol=0.1)
+    observed = recent.as_seen(again, jnp.asarray(anchored), shape, pose, after, rig)
+    np.testing.assert_array_equal(np.asarray(observed.has_changed)[0], ~others)
+    np.testing.assert_allclose(observed.apart[:, CHANGED], np.tile(MOVED, (2, 1)), atol=0.1)
 
 
 @pytest.mark.system

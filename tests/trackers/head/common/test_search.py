@@ -141,10 +141,10 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face, x64):
     ten, two = np.arange(10), np.arange(2)
     estimates = []
     for order in ((ten, two), (np.random.default_rng(2).permutation(10), two), (ten, two[::-1])):
-        one, cameras, seen = permuted(model, rig, images, *order)
+        one, cameras, observed = permuted(model, rig, images, *order)
         filter = at(searches(cameras, OPTIONS).layered, one, one.templates, one.deviation)
         state = step(filter, jax.random.key(0), start_search(x, OPTIONS), 1.0)
-        estimates.append(np.asarray(weigh(filter, jax.random.key(1), state, seen)[0].estimate))
+        estimates.append(np.asarray(weigh(filter, jax.random.key(1), state, observed)[0].estimate))
     np.testing.assert_allclose(estimates[1:], [estimates[0]] * 2, atol=1e-6)
     assert np.abs(estimates[0] - np.asarray(x)).max() > 0.01
 

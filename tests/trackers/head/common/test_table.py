@@ -102,25 +102,32 @@ def test_the_longest_stretch_passes_over_skipped_moments(status, expected):
 
 def test_shares_of_a_run(face_track):
     track, _ = face_track
-    told = shares(track)
-    assert told["status"] == {"initialising": 2, "rigid": 13, "deformable": 21, "lost": 3, "doubtful": 0, "skipped": 1}
-    assert told["share_tracked"] == pytest.approx(34 / 39, abs=1e-4)
+    message = shares(track)
+    assert message["status"] == {
+        "initialising": 2,
+        "rigid": 13,
+        "deformable": 21,
+        "lost": 3,
+        "doubtful": 0,
+        "skipped": 1,
+    }
+    assert message["share_tracked"] == pytest.approx(34 / 39, abs=1e-4)
     # Frames 2 to 29, without the skipped one.
-    assert (told["longest_stretch_frames"], told["longest_stretch_s"]) == (27, pytest.approx(27 / 30, abs=1e-3))
-    assert json.dumps(told, allow_nan=False)
+    assert (message["longest_stretch_frames"], message["longest_stretch_s"]) == (27, pytest.approx(27 / 30, abs=1e-3))
+    assert json.dumps(message, allow_nan=False)
 
 
 def test_errors_are_those_of_the_tracked_frames(face_track):
     track, truth = face_track
-    told = errors(track, truth)
+    message = errors(track, truth)
     tracked = np.isfinite(track.pose[:, 0])
     offsets = track.pose[tracked] - truth.poses[tracked]
-    assert told["rmse"]["x_m"] == pytest.approx(np.sqrt(np.mean(offsets[:, 0] ** 2)), abs=1e-6)
-    assert told["rmse"]["yaw_rad"] == pytest.approx(np.sqrt(np.mean(offsets[:, 4] ** 2)), abs=1e-5)
-    assert told["within_2_sigma"]["pitch_rad"] == pytest.approx(np.mean(np.abs(offsets[:, 5]) <= 0.04), abs=1e-4)
-    assert 0.1 < told["landmark_rms_px"] < 10
+    assert message["rmse"]["x_m"] == pytest.approx(np.sqrt(np.mean(offsets[:, 0] ** 2)), abs=1e-6)
+    assert message["rmse"]["yaw_rad"] == pytest.approx(np.sqrt(np.mean(offsets[:, 4] ** 2)), abs=1e-5)
+    assert message["within_2_sigma"]["pitch_rad"] == pytest.approx(np.mean(np.abs(offsets[:, 5]) <= 0.04), abs=1e-4)
+    assert 0.1 < message["landmark_rms_px"] < 10
     turned = track._replace(pose=track.pose + np.float32([0, 0, 0, 2 * np.pi, 0, 0]))
-    assert errors(turned, truth)["rmse"] == pytest.approx(told["rmse"], abs=1e-5)
+    assert errors(turned, truth)["rmse"] == pytest.approx(message["rmse"], abs=1e-5)
     assert errors(track, None) == {}
     lost = TimedHeadTrack(*track[:-1], np.full_like(track.status, 3))
     assert errors(lost, truth) == {}

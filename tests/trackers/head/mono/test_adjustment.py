@@ -44,15 +44,15 @@ def mean_person(face):
 
 
 @pytest.fixture(scope="module")
-def seen(rig, face):
+def observed(rig, face):
     """What five frames of somebody show, exactly, and who it is."""
     true = bundle_of(face)
     return true, detected(projected(face, rig, true), LANDMARK_PX)
 
 
-def window_of(rig, face, seen, options):
+def window_of(rig, face, observed, options):
     """The five frames as a window, the oldest last but for the first."""
-    true, views = seen
+    true, views = observed
     size = face.num_identities + face.mean.size
     ages = jnp.array([9, 1, 2, 4, 3], jnp.int32)
     empty = jnp.zeros((NUM, size, size)), jnp.zeros((NUM, size))
@@ -64,13 +64,13 @@ def window_of(rig, face, seen, options):
 def told_by(window, information):
     """A frame that looks as the window's last one, and tells something else."""
     view = jax.tree.map(lambda leaf: leaf[-1:], window.views)
-    told = type("FrameInformation", (), {"information": information})
-    return Frame(view, window.poses[-1], window.expressions[-1], told)
+    message = type("FrameInformation", (), {"information": information})
+    return Frame(view, window.poses[-1], window.expressions[-1], message)
 
 
-def state_of(rig, face, seen, options):
+def state_of(rig, face, observed, options):
     """At the start, with the truth a little beside; images do not matter."""
-    true, views = seen
+    true, views = observed
     shift = np.random.default_rng(2).normal(0, [1.0, 1, 4, 0.01, 0.02, 0.02], (NUM, 6))
     bundle = true._replace(poses=true.poses + jnp.asarray(shift, jnp.float32))
     start = Start(bundle, Adjustment(*jnp.zeros(3)), views.uv)
@@ -89,9 +89,9 @@ def state_of(rig, face, seen, options):
     )
 
 
-def new_frame(rig, face, state, seen, options):
+def new_frame(rig, face, state, observed, options):
     """The person once more, in the pose of the fourth frame moved, believed to be a little beside."""
-    true, _ = seen
+    true, _ = observed
     apart = jnp.array([12.0, -6, 20, 0.02, -0.15, 0.1])
     now = Bundle(true.poses[3:4] + apart, true.expressions[3:4], true.person)
     view = detected(projected(face, rig, now), LANDMARK_PX)
@@ -101,10 +101,10 @@ def new_frame(rig, face, state, seen, options):
 
 
 @pytest.fixture(scope="module")
-def moved(rig, face, seen):
+def moved(rig, face, observed):
     """The usual tracker before and after an adjustment, with particles and a belief that are not trivial."""
     rng = np.random.default_rng(3)
-    state = state_of(rig, face, seen, USUAL)
+    state = state_of(rig, face, observed, USUAL)
     root = 0.3 * rng.normal(size=(state.belief.mean.size,) * 2)
     covariance = jnp.asarray(root @ root.T, jnp.float32)
     spread = jnp.asarray(rng.normal(size=state.search.particles.shape), jnp.float32)
@@ -113,7 +113,7 @@ def moved(rig, face, seen):
         search=state.search._replace(particles=state.search.particles + spread),
     )
     place = jnp.asarray(3)
-    frame = new_frame(rig, face, state, seen, USUAL)
+    frame = new_frame(rig, face, state, observed, USUAL)
     return state, jax.jit(lambda state, frame: adjusted(face, face, rig, state, frame, place, USUAL))(state, frame), 3
 
 
@@ -133,10 +133,10 @@ def gains(window, new, options, face):
 
 
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
-def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
+def test_the_frame_of_least_information_goes(rig, face, observed, landmarks):
     """Of the first one too if it may: it is made the one that tells least."""
     options = replace(USUAL, landmarks=landmarks)
-    window = window_of(rig, face, seen, options)
+    window = window_of(rig, face, observed, options)
     # The frames tell 0.3, 0.9, 0.5, 1 and 0.8 of what they do.
     window = window._replace(information=window.information * jnp.array([0.3, 0.9, 0.5, 1.0, 0.8])[:, None, None])
     new = window.information[3]
@@ -148,8 +148,8 @@ def test_the_frame_of_least_information_goes(rig, face, seen, landmarks):
     assert bool(does)
 
 
-def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
-    window = window_of(rig, face, seen, USUAL)
+def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, observed):
+    window = window_of(rig, face, observed, USUAL)
     _, does = choose(
         face, window, prior_of(USUAL), mean_person(face), told_by(window, 0.01 * window.information[2]), USUAL
     )
@@ -157,9 +157,9 @@ def test_a_frame_that_tells_less_than_all_others_is_not_taken(rig, face, seen):
 
 
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
-def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landmarks):
+def test_the_frame_goes_without_which_the_face_turns_most(rig, face, observed, landmarks):
     options = replace(USUAL, landmarks=landmarks, selection="angles")
-    window = window_of(rig, face, seen, options)
+    window = window_of(rig, face, observed, options)
     frame = told_by(window, window.information[3])._replace(pose=window.poses[0].at[4:].set(jnp.array([0.6, -0.4])))
     # The first frame faces the middle of all: to let it go gains most.
     poses = window.poses.at[0, 4:].set(jnp.mean(window.poses[1:, 4:], axis=0) + jnp.array([0.1, -0.06]))
@@ -177,9 +177,9 @@ def test_the_frame_goes_without_which_the_face_turns_most(rig, face, seen, landm
 
 
 @pytest.mark.parametrize(("landmarks", "oldest"), [("aligned", 3), ("recalculated", 0)])
-def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
+def test_the_oldest_frame_goes_that_may(rig, face, observed, landmarks, oldest):
     options = replace(USUAL, landmarks=landmarks, selection="latest")
-    window = window_of(rig, face, seen, options)
+    window = window_of(rig, face, observed, options)
     place, does = choose(
         face, window, prior_of(options), mean_person(face), told_by(window, window.information[3]), options
     )
@@ -187,7 +187,7 @@ def test_the_oldest_frame_goes_that_may(rig, face, seen, landmarks, oldest):
     assert bool(does)
 
 
-def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, seen):
+def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, observed):
     """Pose and expression are solved for anew for 4000 persons drawn from the posterior, with a linear camera.
 
     Whitened by the covariance under test, the sample covariance of m = 11 numbers has 66 entries, each nearly normal
@@ -195,11 +195,11 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     away has a probability of 66 times 7e-6, or 5e-4.
     """
     num_persons, m = 4000, 6 + face.num_expressions
-    true, views = seen
-    window = window_of(rig, face, seen, USUAL)
+    true, views = observed
+    window = window_of(rig, face, observed, USUAL)
     alone = jax.tree.map(lambda leaf: leaf[2:3], views)
     x = jnp.concatenate([true.poses[2], jnp.zeros(face.num_expressions)])
-    state = state_of(rig, face, seen, USUAL)
+    state = state_of(rig, face, observed, USUAL)
     x = x.at[6:].set(state.modes.coefficients(face, true.expressions[2]))
     frame = jax.jit(frame_of)(face, rig, alone, true.person, x, state.modes, prior_of(USUAL))
     response = frame.about_person.response
@@ -236,13 +236,13 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, se
     assert np.abs(z).max() < 4.5
 
 
-def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, seen):
+def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, observed):
     rng = np.random.default_rng(5)
-    state = state_of(rig, face, seen, PAPER)
+    state = state_of(rig, face, observed, PAPER)
     scatter = 0.5 * face.identity_std * rng.normal(size=state.identities.shape)
     identities = jnp.asarray(face.identity_mean + scatter, jnp.float32)
     state = state._replace(identities=identities, num_adjusted=jnp.asarray(3))
-    frame = new_frame(rig, face, state, seen, PAPER)
+    frame = new_frame(rig, face, state, observed, PAPER)
     after = jax.jit(lambda state, frame: adjusted(face, face, rig, state, frame, jnp.asarray(1), PAPER))(state, frame)
     assert int(after.num_adjusted) == 4
     np.testing.assert_array_equal(after.identities[1:], identities[:-1])
@@ -270,7 +270,7 @@ def test_the_belief_moves_to_where_the_bundle_has_the_face(rig, face, moved):
     np.testing.assert_array_equal(after.search.estimate, mean)
 
 
-def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, seen, moved):
+def test_an_adjustment_finds_the_landmarks_of_the_new_frame(rig, face, observed, moved):
     """They are exact: what is left is what the prior pulls."""
     before, after, place = moved
     mean = after.belief.mean
@@ -301,14 +301,14 @@ def test_particles_go_with_the_estimate(moved):
     np.testing.assert_array_equal(after.search.velocity, before.search.velocity)
 
 
-def test_what_frames_leave_behind_never_stops_an_adjustment(rig, face, seen):
+def test_what_frames_leave_behind_never_stops_an_adjustment(rig, face, observed):
     """Each tells nothing of some directions, but for rounding: in single precision the sum has no Cholesky root."""
     options = replace(USUAL, past="marginalised")
-    state = state_of(rig, face, seen, options)
+    state = state_of(rig, face, observed, options)
     adjust = jax.jit(lambda state, frame, place: adjusted(face, face, rig, state, frame, place, options))
     held = []
     for i in range(8):
-        state = adjust(state, new_frame(rig, face, state, seen, options), jnp.asarray(1 + i % 4))
+        state = adjust(state, new_frame(rig, face, state, observed, options), jnp.asarray(1 + i % 4))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.person))
         held.append(float(jnp.trace(state.prior.past.information)))
     assert np.all(np.diff(held) > 0)

@@ -18,7 +18,7 @@ FACE = 320 + MEAN_SHAPE[:, :2]
 
 
 @pytest.fixture
-def seen(monkeypatch):
+def observed(monkeypatch):
     """What the detector says; changed by tests."""
     says = SimpleNamespace(points=FACE, completed=True, faces=1)
 
@@ -35,7 +35,7 @@ def gather(collector, times):
     return [collector.update(IMAGE, time) for time in times]
 
 
-def test_enough_detections_apart_in_time_make_a_start(seen):
+def test_enough_detections_apart_in_time_make_a_start(observed):
     collector = Collector()
     found = gather(collector, np.arange(60) / 30)
     first = next(i for i, one in enumerate(found) if one is not None)
@@ -55,34 +55,34 @@ def test_enough_detections_apart_in_time_make_a_start(seen):
         (dict(points=FACE + np.where(np.arange(10) == 7, 25.0, 0)[:, None] * [0, 1]), "left and right"),
     ],
 )
-def test_what_is_wrong_is_said(seen, change, reason):
-    seen.__dict__.update(change)
+def test_what_is_wrong_is_said(observed, change, reason):
+    observed.__dict__.update(change)
     collector = Collector()
     assert collector.update(IMAGE, 0.0) is None
     assert reason in collector.reason
 
 
-def test_several_faces_are_counted_and_the_one_of_before_is_asked_for(seen):
-    seen.faces = 3
+def test_several_faces_are_counted_and_the_one_of_before_is_asked_for(observed):
+    observed.faces = 3
     collector = Collector()
     collector.update(IMAGE, 0.0)
     assert collector.several == 3
     assert collector.reason == ""
     collector.update(IMAGE, 1.0)
-    np.testing.assert_allclose(seen.near, FACE.mean(axis=0))
+    np.testing.assert_allclose(observed.near, FACE.mean(axis=0))
 
 
-def test_another_face_begins_anew(seen):
+def test_another_face_begins_anew(observed):
     collector = Collector()
     gather(collector, np.arange(NUM_FRAMES - 1) * APART_S * 1.01)
-    seen.points = FACE + np.array([250.0, 0.0])
+    observed.points = FACE + np.array([250.0, 0.0])
     assert collector.update(IMAGE, 2.0) is None
     found = gather(collector, 2.0 + np.arange(1, NUM_FRAMES) * APART_S * 1.01)
     assert found[-1] is not None
-    np.testing.assert_allclose(found[-1].points, np.tile(seen.points, (NUM_FRAMES, 1, 1)))
+    np.testing.assert_allclose(found[-1].points, np.tile(observed.points, (NUM_FRAMES, 1, 1)))
 
 
-def test_old_detections_do_not_count(seen):
+def test_old_detections_do_not_count(observed):
     collector = Collector()
     gather(collector, np.arange(NUM_FRAMES - 1) * APART_S * 1.01)
     assert collector.update(IMAGE, STALE_S + 10) is None
@@ -105,7 +105,7 @@ def test_more_landmarks_are_kept_with_what_is_not_seen_of_them():
     dense[list(FROM_68)] = FACE
     dense[:8] = np.nan
     found = gather(Collector(Mesh(dense)), np.arange(NUM_FRAMES) * 1.01 * APART_S)[-1]
-    np.testing.assert_array_equal(found.dense.seen, np.tile(np.arange(68) >= 8, (NUM_FRAMES, 1)))
+    np.testing.assert_array_equal(found.dense.observed, np.tile(np.arange(68) >= 8, (NUM_FRAMES, 1)))
     np.testing.assert_array_equal(found.dense.uv[:, 8:], np.tile(dense[8:], (NUM_FRAMES, 1, 1)))
     apart = np.linalg.norm(FACE[2:4].mean(axis=0) - FACE[:2].mean(axis=0))
     std_px = np.sqrt(found.dense.covariance[:, :, [0, 1], [0, 1]])

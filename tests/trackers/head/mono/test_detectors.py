@@ -28,13 +28,13 @@ def test_vertices_become_landmarks(monkeypatch):
 
     detector = detector_of(monkeypatch, lambda image: [solid(mesh)] if image.any() else [])
     assert detector.detect(IMAGE, None) == "no face"
-    seen = detector.detect(IMAGE + np.uint8(1), None)
-    assert seen.num_faces == 1
-    assert np.flatnonzero(np.isnan(seen.dense[:, 0])).tolist() == [k for k in range(17) if k != CHIN]
-    np.testing.assert_array_equal(seen.dense[30], mesh[4])
-    np.testing.assert_allclose(seen.dense[31], (mesh[97] + mesh[98]) / 2)
-    np.testing.assert_array_equal(seen.points, seen.dense[list(FROM_68)])
-    assert seen.iris_px[1] == np.linalg.norm(mesh[474] - mesh[476])
+    observed = detector.detect(IMAGE + np.uint8(1), None)
+    assert observed.num_faces == 1
+    assert np.flatnonzero(np.isnan(observed.dense[:, 0])).tolist() == [k for k in range(17) if k != CHIN]
+    np.testing.assert_array_equal(observed.dense[30], mesh[4])
+    np.testing.assert_allclose(observed.dense[31], (mesh[97] + mesh[98]) / 2)
+    np.testing.assert_array_equal(observed.points, observed.dense[list(FROM_68)])
+    assert observed.iris_px[1] == np.linalg.norm(mesh[474] - mesh[476])
 
 
 def test_of_two_faces_the_nearest_or_largest_is_taken(monkeypatch):

@@ -92,7 +92,7 @@ def test_no_landmark_counts_for_more_than_a_model_knows_of_faces(followed, talki
     taken = np.asarray(window.ages)[1:] < len(made) - START
     assert taken.sum() >= 2
     unmodelled_px = 800.0 * UNMODELLED_MM / np.asarray(window.poses[:, 2], float)
-    share = (least / unmodelled_px[:, None] ** 2)[1:][taken][np.asarray(window.views.seen)[1:][taken]]
+    share = (least / unmodelled_px[:, None] ** 2)[1:][taken][np.asarray(window.views.observed)[1:][taken]]
     # A landmark is up to 40 mm before or behind the middle of a head at 650 mm. What it is measured to comes on top.
     assert np.all(share > 0.88)
 

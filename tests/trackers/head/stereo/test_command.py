@@ -75,11 +75,11 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
     deformable = [i for i, row in enumerate(rows) if row["is_deformable"] == "1"]
     assert deformable == [i for i in range(6, FRAMES) if i not in (10, 11)]
     # Every image went to the session once, in its place: the stand-in says what it saw.
-    seen = [
+    observed = [
         tuple(1000 * float(row[name]) for name in ("x_m", "y_m", "z_m")) for row in rows if row["status"] == "tracking"
     ]
     expected = [(100 + i, 120 + 2 * i, 1000 * i / 30) for i in range(2, FRAMES) if i not in (10, 11)]
-    np.testing.assert_allclose(seen, expected, rtol=1e-5)
+    np.testing.assert_allclose(observed, expected, rtol=1e-5)
     assert all(np.isnan(float(rows[i]["x_m"])) for i in (0, 1, 10, 11))
     assert float(rows[5]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
     assert fake_head[0].sizes == [8, 8, 4]
@@ -228,11 +228,11 @@ def test_one_camera_is_followed_with_an_assumed_focal_length(stereo, fake_head, 
 
 def test_images_and_points_lose_the_lens_distortion(stereo, fake_head, tmp_path, monkeypatch):
     """A point off the centre: r' = r (1 + k r^2) solved for r, with r' = 24/80 and k = 0.5."""
-    seen = []
+    observed = []
     points = "\n".join(["name,u,v", *(f"{name},{31.5 + 24},{23.5}" for name in NAMES)])
     (tmp_path / "points.csv").write_text(points)
     process = head_command.HeadSession.process
-    remember = lambda self, images, times: seen.append(images) or process(self, images, times)
+    remember = lambda self, images, times: observed.append(images) or process(self, images, times)
     monkeypatch.setattr(head_command.HeadSession, "process", remember)
     rig = rig_file(tmp_path / "bent.json", lens=0.5)
     options = ("--rig", rig, "--points", tmp_path / "points.csv", "--no-video")
@@ -242,8 +242,8 @@ def test_images_and_points_lose_the_lens_distortion(stereo, fake_head, tmp_path,
     r = found[:, 0]
     np.testing.assert_allclose(r * (1 + 0.5 * r**2), 24 / 80, rtol=1e-6)
     # Pincushion distortion taken away: the corners of the straightened image saw nothing.
-    assert seen[0][0, 0, 0, 0] == 0
-    assert seen[0][0, 0, ROWS // 2, COLS // 2] == 100
+    assert observed[0][0, 0, 0, 0] == 0
+    assert observed[0][0, 0, ROWS // 2, COLS // 2] == 100
 
 
 @pytest.mark.system
