@@ -287,7 +287,7 @@ def test_the_order_of_landmarks_and_cameras_does_not_matter(face):
     expected = face.refine(found)
     order = np.random.default_rng(3).permutation(10)
     rows = (3 * order[:, None] + np.arange(3)).ravel()
-    per_camera = {"uv", "covariance", "score", "seen", "by_slope"}
+    per_camera = {"uv", "covariance", "score", "observed", "by_slope"}
     mixed = found._replace(**{name: getattr(found, name)[:, order] for name in per_camera})
     model = replace(face.model, mean=face.model.mean[order], basis=face.model.basis[rows])
     landmarks = refine(face.prior, mixed, face.slopes, model, face.model_variance, face.rig, face.prior.mean)

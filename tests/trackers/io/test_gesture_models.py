@@ -27,7 +27,7 @@ def of_codes():
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("learnt", [of_shape, of_codes])
+@pytest.mark.parametrize("learned", [of_shape, of_codes])
 def test_models_are_read_as_they_were_written(learned, tmp_path):
     symbols = replace(learned(), sharpness=0.07, lapse=0.01, margins=np.array([0.25, -0.5]))
     write_symbols(tmp_path / "new" / "model.npz", SymbolsFile(symbols, "two lines", {"strokes": 2}))

@@ -222,7 +222,7 @@ def test_wrong_arguments_are_named(rig, face):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (dict(landmarks="seen"), "landmarks must be one of"),
+        (dict(landmarks="observed"), "landmarks must be one of"),
         (dict(selection="all"), "selection must be one of"),
         (dict(past="kept"), "past must be one of"),
         (dict(num_particles=0), "num_particles must be at least 1"),
