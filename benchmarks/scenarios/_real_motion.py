@@ -171,15 +171,15 @@ def frame_by_frame(chosen: HandSet, detections: Detections) -> Lifted:
     return Lifted(points, time.perf_counter() - start, 1.0)
 
 
-def filtered(mode: str) -> Callable[[HandSet, Detections], Lifted]:
-    """The tracker in one of its modes, started by itself."""
+def filtered(variant: str) -> Callable[[HandSet, Detections], Lifted]:
+    """The tracker in one of its variants, started by itself."""
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
         times = FRAME_INTERVAL * np.arange(len(detections.pixels))
         detections = detections._replace(noise=persistence(times) * detections.noise)
         hand, limits = hand_of(chosen, detections)
         frames = _frames(detections)
-        tracker = tracker_of(hand, limits, None, ArticulatedConfig(mode=mode, hypotheses=HYPOTHESES))
+        tracker = tracker_of(hand, limits, None, ArticulatedConfig(variant=variant, hypotheses=HYPOTHESES))
         state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
         jax.block_until_ready(tracker.step(state, frames, times))
         start = time.perf_counter()

@@ -1,6 +1,7 @@
 """The simplest thing that follows what each of the six systems follows: no filter, no model of motion."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import cv2
 import jax
@@ -20,7 +21,7 @@ from jaxfilters.models.synthetic.articulated import LAYOUT, ArticulatedSequence,
 
 WINDOW = ((32, 32), 4)
 """Rows and columns about a hand, and how many pixels apart."""
-PATCH = {"winSize": (15, 15), "maxLevel": 3}
+PATCH: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 3}
 """Of the optical flow of landmarks, pixels."""
 POINTS = 32
 """Of a stroke that is compared."""
@@ -102,7 +103,9 @@ def followed_blobs(
     """
     empty = np.median(np.stack(images), axis=0).astype(np.uint8)
     kernel = np.ones((5, 5), np.uint8)
-    rows, last, next_identity = [], {}, 0
+    rows: list[tuple[int, int, np.ndarray]] = []
+    last: dict[int, np.ndarray] = {}
+    next_identity = 0
     for index, image in enumerate(images):
         mask = (cv2.absdiff(image, empty).max(axis=2) > DIFFERENCE).astype(np.uint8)
         mask = cv2.morphologyEx(cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel, iterations=2)
@@ -126,10 +129,12 @@ def flowed_points(
     images: Iterable[UInt8[np.ndarray, "rows cols"]], start: Float[np.ndarray, "K 2"]
 ) -> Float[np.ndarray, "t K 2"]:
     """Landmarks carried from image to image by optical flow, the first ones included."""
-    points, before, found = np.asarray(start, np.float32)[:, None], None, []
+    points: Any = np.asarray(start, np.float32)[:, None]
+    before: np.ndarray | None = None
+    found = []
     for image in images:
         if before is not None:
-            points, _, _ = cv2.calcOpticalFlowPyrLK(before, image, points, None, **PATCH)
+            points, _, _ = cv2.calcOpticalFlowPyrLK(before, image, points, points.copy(), **PATCH)
         found.append(points[:, 0].astype(float))
         before = image
     return np.stack(found)
@@ -139,7 +144,8 @@ def pose_by_pnp(shape: Float[np.ndarray, "K 3"], uv: Float[np.ndarray, "t K 2"],
     """(t, 6) millimetres and radians of a rigid shape before one camera, by `solvePnP` from the frame before."""
     (fx, fy), (cx, cy) = np.asarray(rig.focal[0], float), np.asarray(rig.center[0], float)
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    turn, place = np.zeros((3, 1)), np.array([[0.0], [0.0], [700.0]])
+    turn: Any = np.zeros((3, 1))
+    place: Any = np.array([[0.0], [0.0], [700.0]])
     poses = []
     for points in uv:
         _, turn, place = cv2.solvePnP(shape, points, K, np.zeros(5), turn, place, useExtrinsicGuess=True)
@@ -153,7 +159,7 @@ def pose_by_triangulation(
     """(t, 6) of a rigid shape before two cameras: points from both, then the rotation and translation of `shape`."""
     poses = []
     for left, right in uv:
-        homogeneous = cv2.triangulatePoints(*projections, left.T, right.T)
+        homogeneous = cv2.triangulatePoints(projections[0], projections[1], left.T, right.T)
         points = (homogeneous[:3] / homogeneous[3]).T
         turn, _ = Rotation.align_vectors(points - points.mean(axis=0), shape - shape.mean(axis=0))
         place = points.mean(axis=0) - turn.apply(shape.mean(axis=0))

@@ -63,9 +63,10 @@ def corridor_camera(path: Path, shape: tuple[int, int]) -> FloorCamera:
 def annotated(path: Path, camera: FloorCamera) -> FloorTracks:
     """Places of the people whose feet show, metres, from CAVIAR's boxes (centre and size, pixels)."""
     boxes = [
-        (int(frame.get("number")), int(one.get("id")), *(float(one.find("box").get(k)) for k in ("xc", "yc", "w", "h")))
+        [int(frame.attrib["number"]), int(one.attrib["id"]), *(float(box.attrib[k]) for k in ("xc", "yc", "w", "h"))]
         for frame in read_xml(path, "expected CAVIAR's annotations").iter("frame")
         for one in frame.iter("object")
+        for box in one.iter("box")
     ]
     frame, who, u, v, width, height = np.array(boxes).T
     feet = np.stack([u, v + height / 2], axis=-1)

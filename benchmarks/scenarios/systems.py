@@ -12,6 +12,7 @@ and of the articulated hand print no error.
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -25,7 +26,7 @@ from jaxfilters.benchmarks.scenarios._head_runs import follow, rmse
 from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, START_FRAMES, Contender, follow_all, talking_head
 from jaxfilters.models.fingertip.segmentation import bright_mask
 from jaxfilters.models.gesture.coded import learn_paths, recognise_paths
-from jaxfilters.models.hand.skeleton import hand_geometry
+from jaxfilters.models.hand.skeleton import anatomical_hand
 from jaxfilters.models.synthetic.articulated import LAYOUT, simulate_paper
 from jaxfilters.models.synthetic.face_sequence import sequence
 from jaxfilters.models.synthetic.strokes import drawn, tracked
@@ -67,7 +68,9 @@ def hand_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         count = 20 if quick else 60
         frames, config = [recording[i] for i in range(count)], hand_depth.HandDepthConfig(seed=one, hand="right")
         track = hand_depth.track(frames, recording.times_s[:count], recording.camera, config)
-        alone = simplest.registered_hands(recording.camera, np.stack(frames), track.pose[0], hand_geometry())
+        alone = simplest.registered_hands(
+            recording.camera, np.stack(frames), np.asarray(track.pose[0]), anatomical_hand()
+        )
         for name, joints in (("", track.joints), ("_simple", alone)):
             apart = np.linalg.norm(joints - truth[:count], axis=-1)[SETTLED:]
             errors[name].append(1e3 * float(apart.mean()))
@@ -80,7 +83,7 @@ def articulated_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     lengths: dict[str, list[float]] = {"": [], "_simple": []}
     for one in range(seed, seed + (1 if quick else 6)):
         made = simulate_paper(jax.random.key(one))
-        mean = articulated.track(articulated.synthetic_sequence(one)).mean
+        mean = articulated.track_sequence(articulated.synthetic_sequence(one)).mean
         for name, states in (("", mean), ("_simple", simplest.reprojected_hand(made))):
             off = (np.asarray(states, float) - np.asarray(made.states, float))[-LAST:]
             angles[name].append(_rms((np.rad2deg(off[:, LAYOUT.angles]) + 180) % 360 - 180))
@@ -97,7 +100,8 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     tracks = people.track([[image] for image in images], [i / room.fps for i in range(len(room))], scene)
     ours = [(one.frame, who, one.mean[:2]) for who, track in tracks.items() for one in track]
     present = [(i, who) for i in range(len(room)) for who in np.flatnonzero(room.present(i))]
-    truth = floor_tracks(*zip(*present, strict=True), np.stack([room.routes.xy[i, who] for i, who in present]))
+    frames, whose = zip(*present, strict=True)
+    truth = floor_tracks(frames, whose, np.stack([room.routes.xy[i, who] for i, who in present]))
     found: dict[str, Metric] = {}
     for name, rows in (("", ours), ("_simple", simplest.followed_blobs(images, room.cameras[0]))):
         frame, who, places = zip(*rows, strict=True)
@@ -206,7 +210,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.asarray(values, float) ** 2)))
 
 
-def _mean(values: list[float], unit: str, better: str = "lower") -> Metric:
+def _mean(values: list[float], unit: str, better: Literal["lower", "higher"] = "lower") -> Metric:
     return Metric(float(np.mean(values)), unit, better)
 
 

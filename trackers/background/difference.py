@@ -110,7 +110,7 @@ class Difference:
             return
         cols, rows = found[:, 0].T
         places = every * (rows * np.int32(image.shape[1]) + cols)
-        mask = np.zeros(ratio.shape, np.uint8)
+        mask: np.ndarray = np.zeros(ratio.shape, np.uint8)
         mask[rows, cols] = is_shadow(_colors(image, places), _colors(self.background, places))
         mask = wide(mask, -(-_SHADOW_SIDE // every) | 1)
         if every > 1:

@@ -8,6 +8,7 @@ corners that move on their own, as those on people do.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,8 +51,8 @@ class Registration:
             raise ValueError(f"K must be a finite, regular matrix (3, 3); got {K!r}.")
         self._K = K
         self._reference: np.ndarray | None = None
-        self._corners = np.zeros((0, 2), np.float32)
-        self._rotation = np.eye(3)
+        self._corners: np.ndarray = np.zeros((0, 2), np.float32)
+        self._rotation: np.ndarray = np.eye(3)
         self.most_px = 0.0
         """The largest motion of a corner of the image so far that was undone, pixels."""
         self.failures = 0
@@ -106,7 +107,7 @@ class Registration:
     def refer_to(self, image: np.ndarray) -> None:
         """Take corners from another image in the reference pose, as from a background that follows the light."""
         self._reference = _small_grey(image)
-        found = cv2.goodFeaturesToTrack(self._reference, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX)
+        found: Any = cv2.goodFeaturesToTrack(self._reference, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX)
         self._corners = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
@@ -140,6 +141,7 @@ class Registration:
     def _from_corners(
         self, grey: np.ndarray, guess: np.ndarray, step: int, side_px: int, levels: int
     ) -> np.ndarray | None:
+        assert self._reference is not None
         start = _moved(self._homography(guess, step), self._corners).astype(np.float32)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
             self._reference,

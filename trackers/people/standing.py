@@ -75,7 +75,7 @@ def standing_boxes(camera: FloorCamera, floor: np.ndarray, image: np.ndarray) ->
     detector = cv2.HOGDescriptor()
     if any(size < need for size, need in zip(scaled.shape[:2], detector.winSize[::-1], strict=True)):
         return np.zeros((0, 4))
-    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
     found, _ = detector.detectMultiScale(
         scaled, hitThreshold=_LEAST_SCORE, winStride=(8, 8), padding=(16, 16), scale=1.1, groupThreshold=0
     )
