@@ -16,6 +16,7 @@ from jaxfilters.trackers.io.errors import OutputError
 SIGMAS = 2.0
 """Half the height of the bands of charts, standard deviations."""
 _WIDTH, _PLAN_ROWS, _CHART_ROWS, _LEGEND_ROWS = 1200, 560, 200, 30
+_MARGIN, _LINE_ROWS = 16, 22
 _PAPER, _FRAME = 255, (200, 200, 200)
 _DRAWN, _HANDLED = (205, 240, 205), (225, 225, 250)
 """Paper of a chart while a symbol is drawn, and while something is handled."""
@@ -101,10 +102,10 @@ def _plan(
         for i in np.flatnonzero(np.diff(frames) == 1):
             ends = (tuple(map(int, points[i])), tuple(map(int, points[i + 1])))
             cv2.line(sheet, *ends, _color(hand, finger), 3 if drawing[i] else 1, cv2.LINE_AA)
-    for event in symbols:
-        left, top, *_ = event.quantities["box_px"]
-        at = pixel(np.array([left, top])) - [0, 6]
-        write(sheet, str(event.quantities["label"] or "unknown"), (int(at[0]), int(max(at[1], 12))))
+    # In the margin and not where they were drawn, which is one place for all of them.
+    for line, event in enumerate(symbols):
+        label = event.quantities["label"] or "unknown"
+        write(sheet, f"{event.time_s:.1f} s  {label}", (int(high[0]) + _MARGIN, 36 + _LINE_ROWS * line))
     return sheet
 
 

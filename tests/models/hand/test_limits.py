@@ -13,7 +13,7 @@ LOW, HIGH = SOFT_LIMITS.T
 @pytest.mark.system
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_inside_and_on_the_limits_nothing_is_lost(share):
-    assert limit_log_likelihood(jnp.asarray(LOW + share * (HIGH - LOW))) == 0
+    assert limit_log_likelihood(jnp.asarray((1 - share) * LOW + share * HIGH)) == 0
 
 
 @pytest.mark.parametrize("angle", range(15))
