@@ -14,7 +14,7 @@ MODES = (slice(800, 1044), slice(0, 745))
 
 
 def main(results: Path, picture: Path) -> None:
-    """Three frames of the first camera above the modes that were learnt."""
+    """Three frames of the first camera above the estimated modes."""
     video = cv2.VideoCapture(str(results / "overlay.mp4"))
     frames = []
     while len(frames) <= max(FRAMES):

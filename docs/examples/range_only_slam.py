@@ -5,7 +5,7 @@
 # ---
 
 # %% [markdown]
-# # Range-only SLAM with a learnt bias
+# # Range-only SLAM with an estimated bias
 #
 # A robot drives loops among six radio beacons. It measures its own motion and the distance to each beacon; every radio
 # adds a constant delay of its own, some two metres, and the beacons were placed to half a metre. The state holds the
