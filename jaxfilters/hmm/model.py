@@ -20,6 +20,18 @@ class HiddenMarkovModel:
     """A Markov chain of Q hidden states with an emission distribution for each of them.
 
     Probabilities are logarithms; `from_probabilities` makes a model from probabilities.
+
+    Examples:
+        A coin that is fair, or always shows heads (code 0).
+
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> emission = jf.hmm.Codes(jnp.log(jnp.array([[0.5, 0.5], [1.0, 0.0]])))
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.1, 0.9]], emission)
+        >>> print(np.exp(model.log_likelihoods(jnp.array([0, 1]))).round(2))
+        [[0.5 1. ]
+         [0.5 0. ]]
     """
 
     log_initial: Float[Array, "..."]
@@ -44,6 +56,15 @@ class HiddenMarkovModel:
         Raises:
             ValueError: If `log_transition` is no function; if the leaves of `inputs` do not share one length; if the
                 function returns another shape than (Q, Q), or rows that do not sum to 1 where they are known.
+
+        Examples:
+            >>> import jax.numpy as jnp
+            >>> import numpy as np
+            >>> import jaxfilters as jf
+            >>> stay = lambda u: jnp.array([[u, 1 - u], [1 - u, u]])
+            >>> model = jf.hmm.from_probabilities([0.5, 0.5], stay).with_inputs(jnp.array([0.9, 0.8, 0.7]))
+            >>> print(np.exp(model.log_transition[:, 0, 0]).round(2))
+            [0.8 0.7]
         """
         if not callable(self.log_transition):
             raise ValueError("model must have a function of the inputs for its transitions; it has an array.")
@@ -214,6 +235,14 @@ def from_topology(
 
     Raises:
         ValueError: If shapes do not match, a state has no transition, or there is no initial state.
+
+    Examples:
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_topology(jf.hmm.left_right(2), initial=jf.hmm.left_right_initial(2))
+        >>> print(np.exp(model.log_transition).round(2))
+        [[0.5 0.5]
+         [0.  1. ]]
     """
     allowed = np.asarray(allowed, bool)
     starts = np.ones(len(allowed), bool) if initial is None else np.asarray(initial, bool)
@@ -234,6 +263,13 @@ def left_right(num_states: int, *, max_jump: int = 2) -> Bool[np.ndarray, "q q"]
 
     Raises:
         ValueError: If `num_states` or `max_jump` is less than 1.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> print(jf.hmm.left_right(3, max_jump=1).astype(int))
+        [[1 1 0]
+         [0 1 1]
+         [0 0 1]]
     """
     if num_states < 1 or max_jump < 1:
         raise ValueError(f"num_states and max_jump must be at least 1; got {num_states} and {max_jump}.")
@@ -249,6 +285,11 @@ def ergodic(num_states: int) -> Bool[np.ndarray, "q q"]:
 
     Raises:
         ValueError: If `num_states` is less than 1.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> bool(jf.hmm.ergodic(3).all())
+        True
     """
     if num_states < 1:
         raise ValueError(f"num_states must be at least 1; got {num_states}.")
@@ -256,7 +297,13 @@ def ergodic(num_states: int) -> Bool[np.ndarray, "q q"]:
 
 
 def left_right_initial(num_states: int) -> Bool[np.ndarray, " q"]:
-    """The initial states of a left-right model, (Q,) for `from_topology`: state 0 only."""
+    """The initial states of a left-right model, (Q,) for `from_topology`: state 0 only.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> print(jf.hmm.left_right_initial(3))
+        [ True False False]
+    """
     return np.arange(num_states) == 0
 
 
@@ -271,6 +318,16 @@ def sample(key: AnyKey, model: HiddenMarkovModel, num_frames: int) -> tuple[Int3
 
     Returns:
         States (T,) and observations, leaves with time first; `None` without an emission.
+
+    Examples:
+        A chain that starts in state 0 and always changes its state.
+
+        >>> import jax
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]])
+        >>> states, _ = jf.hmm.sample(jax.random.key(0), model, 4)
+        >>> print(states)
+        [0 1 0 1]
     """
     check_model(model, num_frames)
     state_key, emission_key = jax.random.split(key)

@@ -52,6 +52,14 @@ def parallel_composition(
     Raises:
         ValueError: If there is no model, `final` does not match, a model has no final state, `exit_probability` is out
             of range, or the emissions differ in class, options or size.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> short = jf.hmm.from_probabilities([1.0], [[1.0]])
+        >>> long = jf.hmm.from_topology(jf.hmm.left_right(2), initial=jf.hmm.left_right_initial(2))
+        >>> network = jf.hmm.parallel_composition([short, long])
+        >>> print(network.part, network.final)
+        [0 1 1] [ True False  True]
     """
     if not 0 < exit_probability < 1:
         raise ValueError(f"exit_probability must be between 0 and 1; got {exit_probability!r}.")
@@ -87,6 +95,15 @@ def threshold_model(network: Network) -> HiddenMarkovModel:
     (H.-K. Lee and J. Kim, "An HMM-based threshold model approach for gesture recognition", IEEE PAMI 21(10), 1999,
     section 4.1). Patterns that occur only between symbols need a model of their own in the network, for example of one
     state.
+
+    Examples:
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> symbol = jf.hmm.from_probabilities([1.0], [[1.0]])
+        >>> network = jf.hmm.parallel_composition([symbol, symbol], exit_probability=0.2)
+        >>> print(np.exp(jf.hmm.threshold_model(network).log_transition).round(2))
+        [[0.8 0.2]
+         [0.2 0.8]]
     """
     num_states = network.part.shape[0]
     stays = jnp.diagonal(network.model.log_transition)
@@ -110,6 +127,17 @@ def loop(network: Network, *, part_transition: Float[np.ndarray, "k k"] | None =
 
     Raises:
         ValueError: If `part_transition` has another shape, or its rows do not sum to 1.
+
+    Examples:
+        Each symbol is left with the probability 0.2, for itself or the other one.
+
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> symbol = jf.hmm.from_probabilities([1.0], [[1.0]])
+        >>> network = jf.hmm.parallel_composition([symbol, symbol], exit_probability=0.2)
+        >>> print(np.exp(jf.hmm.loop(network).log_transition).round(2))
+        [[0.9 0.1]
+         [0.1 0.9]]
     """
     num_models = int(np.asarray(network.part).max()) + 1
     uniform = np.full((num_models, num_models), 1 / num_models)
@@ -140,6 +168,15 @@ def segments(states: Int[np.ndarray, " t"], network: Network) -> list[Segment]:
 
     Raises:
         ValueError: If a state is out of range.
+
+    Examples:
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> symbol = jf.hmm.from_probabilities([1.0], [[1.0]])
+        >>> network = jf.hmm.parallel_composition([symbol, symbol])
+        >>> states = np.array([0, 0, 1, -1])
+        >>> [(found.label, found.start, found.end) for found in jf.hmm.segments(states, network)]
+        [(0, 0, 1), (1, 2, 2)]
     """
     part, final = np.asarray(network.part), np.asarray(network.final)
     if np.any(np.asarray(states) < -1) or np.any(np.asarray(states) >= len(part)):

@@ -66,6 +66,18 @@ def parallel_posterior(model: HiddenMarkovModel, log_likelihoods: Float[Array, "
     """The forward-backward algorithm in logarithmic depth: posteriors of states, and expected transitions.
 
     Arguments and errors are those of `parallel_forward`; the result is that of `posterior` for one sequence.
+
+    Examples:
+        The second frame says nothing; the first one says 0.8, of which the chain keeps 0.8 * 0.9 + 0.2 * 0.1.
+
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.1, 0.9]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.8, 0.2], [0.5, 0.5]]))
+        >>> print(np.asarray(jf.hmm.parallel_posterior(model, log_likelihoods).states).round(2))
+        [[0.8  0.2 ]
+         [0.74 0.26]]
     """
     _check(model, log_likelihoods)
     A = jnp.exp(model.log_transition)
@@ -93,6 +105,14 @@ def parallel_viterbi(model: HiddenMarkovModel, log_likelihoods: Float[Array, "t 
 
     Arguments and errors are those of `parallel_forward`. The scores of all frames come from a scan of maxima of sums,
     and the path from a scan that composes the tables of best predecessors.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.9, 0.1], [0.6, 0.4], [0.01, 0.99]]))
+        >>> print(jf.hmm.parallel_viterbi(model, log_likelihoods).states)
+        [0 0 1]
     """
     _check(model, log_likelihoods)
     frames = usable(log_likelihoods)

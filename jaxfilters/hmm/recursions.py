@@ -77,6 +77,16 @@ def log_evidence(
 
     Raises:
         ValueError: If the shapes do not match.
+
+    Examples:
+        0.9 in the first frame, and 0.9 * 0.9 + 0.1 * 0.1 in the second one.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([1.0, 0.0], [[0.9, 0.1], [0.2, 0.8]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.9, 0.1], [0.9, 0.1]]))
+        >>> round(float(jnp.exp(jf.hmm.log_evidence(model, log_likelihoods))), 3)
+        0.738
     """
     check_shapes(model, log_likelihoods, lengths)
     return _log_evidence(model.log_initial, model.log_transition, log_likelihoods, lengths)
@@ -122,6 +132,18 @@ def backward(
 
     Raises:
         ValueError: If the shapes do not match.
+
+    Examples:
+        From state 0, the second frame has the likelihood 0.9 * 0.9 + 0.1 * 0.1.
+
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.9, 0.1], [0.9, 0.1]]))
+        >>> print(np.exp(jf.hmm.backward(model, log_likelihoods)).round(2))
+        [[0.82 0.26]
+         [1.   1.  ]]
     """
     check_shapes(model, log_likelihoods, lengths)
     if len(log_likelihoods) < 2:
@@ -151,6 +173,18 @@ def posterior(
 
     Raises:
         ValueError: If the shapes do not match.
+
+    Examples:
+        The second frame says nothing; the first one says 0.8, of which the chain keeps 0.8 * 0.9 + 0.2 * 0.1.
+
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.1, 0.9]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.8, 0.2], [0.5, 0.5]]))
+        >>> print(np.asarray(jf.hmm.posterior(model, log_likelihoods).states).round(2))
+        [[0.8  0.2 ]
+         [0.74 0.26]]
     """
     check_shapes(model, log_likelihoods, lengths)
     A = jnp.exp(model.log_transition)

@@ -30,7 +30,17 @@ from jaxfilters.hmm.model import HiddenMarkovModel, from_probabilities
 
 @pytree_dataclass
 class SemiMarkovModel:
-    """A chain of Q states with explicit durations of up to D frames; probabilities are logarithms."""
+    """A chain of Q states with explicit durations of up to D frames; probabilities are logarithms.
+
+    Examples:
+        A segment of one frame in a half of all cases, else of two or three frames with equal probability.
+
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.semi_markov([1.0], [[1.0]], [[0.5, 0.25, 0.25]])
+        >>> print(np.exp(model.log_end).round(2))
+        [[0.5 0.5 1. ]]
+    """
 
     log_initial: Float[Array, "..."]
     """(Q,): log p(s_1), for the state of the first segment."""
@@ -129,6 +139,16 @@ def semi_markov_log_evidence(model: SemiMarkovModel, log_likelihoods: Float[Arra
 
     Raises:
         ValueError: If the shapes do not match.
+
+    Examples:
+        Where all states explain a frame equally well, segments do not matter: 0.5 ** 4.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.semi_markov([1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]])
+        >>> total = jf.hmm.semi_markov_log_evidence(model, jnp.log(jnp.full((4, 2), 0.5)))
+        >>> round(float(jnp.exp(total)), 4)
+        0.0625
     """
     check_frames(model, log_likelihoods)
 
@@ -145,6 +165,19 @@ def semi_markov_posterior(model: SemiMarkovModel, log_likelihoods: Float[Array, 
     """The smoothing distributions p(s_t | y_1:T) of all frames; zero for an impossible sequence.
 
     Arguments and errors are those of `semi_markov_log_evidence`, whose derivative this is (the identity of L. Baum).
+
+    Examples:
+        State 0 lasts two frames; state 1 one frame or two, with equal probability.
+
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.semi_markov([1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]])
+        >>> print(np.asarray(jf.hmm.semi_markov_posterior(model, jnp.zeros((4, 2)))).round(2))
+        [[1.  0. ]
+         [1.  0. ]
+         [0.  1. ]
+         [0.5 0.5]]
     """
     found: Array = jax.grad(semi_markov_log_evidence, argnums=1)(model, log_likelihoods)
     return found
@@ -155,6 +188,16 @@ def semi_markov_viterbi(model: SemiMarkovModel, log_likelihoods: Float[Array, "t
     """The most probable sequence of segments, or any of several equally probable ones.
 
     Arguments and errors are those of `semi_markov_log_evidence`.
+
+    Examples:
+        State 0 lasts two frames; state 1 one frame or two.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> model = jf.hmm.semi_markov([1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]])
+        >>> log_likelihoods = jnp.log(jnp.array([[0.9, 0.1], [0.9, 0.1], [0.1, 0.9], [0.8, 0.2]]))
+        >>> print(jf.hmm.semi_markov_viterbi(model, log_likelihoods).starts)
+        [ True False  True  True]
     """
     check_frames(model, log_likelihoods)
     last_age = model.log_end.shape[1] - 1

@@ -111,6 +111,16 @@ def semi_markov_spotter(model: SemiMarkovModel, background: int, *, patience: in
     Raises:
         ValueError: If the shapes of the model do not match, `background` is none of its states, or `patience` is less
             than 1.
+
+    Examples:
+        State 0 is background, of any length; segments of state 1 last two frames.
+
+        >>> import jaxfilters as jf
+        >>> durations = [[0.5, 0.5], [0.0, 1.0]]
+        >>> model = jf.hmm.semi_markov([1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]], durations, tail=[0.5, 0.0])
+        >>> filter = jf.hmm.semi_markov_spotter(model, background=0, patience=2)
+        >>> int(filter.params.background), int(filter.params.patience)
+        (0, 2)
     """
     check_frames(model, model.log_initial, one=True)
     num_states = model.log_initial.shape[0]

@@ -99,6 +99,17 @@ def spotter(
     Raises:
         ValueError: If `null` has other states, `log_prior` does not have one number for each symbol, or `patience` or
             `min_frames` is less than 1.
+
+    Examples:
+        Two symbols of one state each; the threshold model starts in either of the two.
+
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> symbol = jf.hmm.from_probabilities([1.0], [[1.0]])
+        >>> network = jf.hmm.parallel_composition([symbol, symbol])
+        >>> filter = jf.hmm.spotter(network, margin=2.0, patience=3)
+        >>> print(np.exp(filter.params.null.log_initial).round(2))
+        [0.5 0.5]
     """
     null = threshold_model(network) if null is None else null
     check_model(null)

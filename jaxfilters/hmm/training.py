@@ -46,6 +46,17 @@ def pad(sequences: Sequence[PyTree], length: int | None = None) -> tuple[PyTree,
 
     Raises:
         ValueError: If there is no sequence, or one is longer than `length`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> padded, lengths = jf.hmm.pad([jnp.array([1, 2, 3]), jnp.array([4])])
+        >>> print(padded)
+        [[1 4]
+         [2 0]
+         [3 0]]
+        >>> print(lengths)
+        [3 1]
     """
     lengths = np.array([len(jax.tree.leaves(sequence)[0]) for sequence in sequences], np.int32)
     if not len(lengths) or (length is not None and length < lengths.max()):
@@ -192,6 +203,16 @@ def with_responsibilities(
 
     Raises:
         ValueError: If the model has no emission, or shapes do not match.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> emission = jf.hmm.DiagonalGaussian(jnp.zeros((2, 1)), jnp.ones((2, 1)))
+        >>> model = jf.hmm.from_topology(jf.hmm.left_right(2), emission)
+        >>> observations, lengths = jf.hmm.pad([jnp.array([[1.0], [1.0], [5.0], [5.0]])])
+        >>> weights = jf.hmm.uniform_segmentation(lengths, 4, 2)
+        >>> print(jf.hmm.with_responsibilities(model, observations, weights).emission.mean.ravel())
+        [1. 5.]
     """
     num_frames, num_sequences = _extent(observations)
     expected = (num_frames, model.log_initial.shape[0], num_sequences)
@@ -204,6 +225,16 @@ def uniform_segmentation(lengths: Int[Array, " n"], num_frames: int, num_states:
     """Responsibilities (T, Q, n) that divide every sequence evenly among the states, in their order.
 
     This is the usual initialisation of left-right models.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> weights = jf.hmm.uniform_segmentation(jnp.array([4]), 4, 2)
+        >>> print(weights[..., 0])
+        [[1. 0.]
+         [1. 0.]
+         [0. 1.]
+         [0. 1.]]
     """
     frames = jnp.arange(num_frames)[:, None]
     state = jnp.minimum(frames * num_states // jnp.maximum(lengths, 1), num_states - 1)
@@ -217,6 +248,16 @@ def random_responsibilities(
     """Responsibilities (T, Q, n) that give every state a random frame and an equal part of all frames, half each.
 
     This is an initialisation of ergodic models.
+
+    Examples:
+        Each of three states has the weight 1 on one frame, and 1 more divided among all six frames.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> weights = jf.hmm.random_responsibilities(jax.random.key(0), jnp.array([4, 2]), 4, 3)
+        >>> print(np.asarray(weights).sum((0, 2)).round(2))
+        [2. 2. 2.]
     """
     inside = (jnp.arange(num_frames)[:, None] < lengths).astype(float)
     flat = inside.ravel()
