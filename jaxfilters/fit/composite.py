@@ -108,6 +108,16 @@ def score_covariance(scores: Float[Array, "*grid d"], lags: int | Sequence[int])
     Raises:
         ValueError: If `scores` has fewer than two axes, `lags` is negative or has another length than the grid, or a
             window holds more than a quarter of the grid.
+
+    Examples:
+        The sum of 100 independent scores of variance one has a variance near 100; 0.99 is the correction I - L.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> scores = jnp.array([1.0, -1.0] * 50)[:, None]
+        >>> K = jax.jit(lambda scores: jf.fit.score_covariance(scores, lags=0))(scores)
+        >>> round(float(0.99 * K[0, 0]), 2)
+        100.0
     """
     checks.floating("scores", scores)
     if scores.ndim < 2:

@@ -222,6 +222,13 @@ def interval(lower: float | int, upper: float | int) -> Any:
 
     Raises:
         ValueError: If the bounds are not finite, or `lower` is not less than `upper`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> interval = jf.fit.interval(2, 4)
+        >>> float(interval.constrain(jnp.array(0.0), jnp.array(3.0)))  # the coordinate 0 is the middle
+        3.0
     """
     if not -np.inf < lower < upper < np.inf:
         raise ValueError(f"interval must have finite bounds, the lower one first; got {lower!r}, {upper!r}.")

@@ -74,6 +74,13 @@ def common_random_numbers(key: AnyKey, log_density: RandomLogDensity) -> CommonR
     Args:
         key: Random key.
         log_density: `(key, theta) -> log p`.
+
+    Examples:
+        >>> import jax
+        >>> import jaxfilters as jf
+        >>> log_density = jf.fit.common_random_numbers(jax.random.key(0), lambda key, x: x + jax.random.normal(key))
+        >>> round(float(log_density(3.0) - log_density(1.0)), 3)
+        2.0
     """
     return CommonRandomNumbers(key, as_pytree(log_density))
 
@@ -87,6 +94,13 @@ def fresh_keys(key: AnyKey, log_density: RandomLogDensity) -> FreshKeys:
     Args:
         key: Random key.
         log_density: `(key, theta) -> log p`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> log_density = jf.fit.fresh_keys(jax.random.key(0), lambda key, x: x + jax.random.normal(key))
+        >>> bool(log_density.at(jnp.array(0), 1.0) == log_density.at(jnp.array(1), 1.0))
+        False
     """
     return FreshKeys(key, as_pytree(log_density))
 
@@ -97,6 +111,13 @@ def with_prior(log_density: Callable, log_prior: LogDensity) -> WithPrior:
     Args:
         log_density: A log density, or what `common_random_numbers` or `fresh_keys` return.
         log_prior: `theta -> log p(theta)`, a density with respect to `theta` itself, not to its coordinates.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> log_posterior = jf.fit.with_prior(lambda x: -0.5 * (x - 4.0) ** 2, lambda x: -0.5 * x**2)
+        >>> float(log_posterior(jnp.array(2.0)))
+        -4.0
     """
     return WithPrior(as_pytree(log_density), as_pytree(log_prior))
 
@@ -204,6 +225,18 @@ def over_sequences(
 
     Raises:
         ValueError: If `observations` has no array, or lengths or numbers of sequences differ.
+
+    Examples:
+        Two sequences of one frame, whose observation 0 has the mean 0 and the variance 1 + 1 + 1.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> def filter_of(noise):
+        ...     prior = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        ...     return jf.extended_kalman(prior, lambda x: x, jnp.eye(1), lambda x: x, noise**2 * jnp.eye(1))
+        >>> log_density = jf.fit.over_sequences(jax.random.key(0), filter_of, jnp.zeros((1, 1, 2)))
+        >>> round(float(jax.jit(lambda noise: log_density(noise))(1.0)), 3)  # -log(2 pi 3)
+        -2.936
     """
     _check_lengths(observations, inputs, mask)
     counts = {

@@ -191,6 +191,13 @@ def residuals(function: Callable[[PyTree], PyTree]) -> Residuals:
     Args:
         function: `theta -> residuals`, a pytree of arrays in units of their standard deviations; the residuals of a
             Gaussian prior are further leaves.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> log_density = jf.fit.residuals(lambda x: x - jnp.array([1.0, 5.0]))
+        >>> float(log_density(3.0))
+        -4.0
     """
     return Residuals(as_pytree(function))
 
@@ -234,6 +241,13 @@ def adam(
 
     Raises:
         ValueError: If an option is out of range.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> method = jf.fit.adam(0.1)
+        >>> fit = jf.fit.maximize(lambda x: -0.5 * (x - 3.0) ** 2, 0.0, method=method, errors=jf.fit.no_errors)
+        >>> round(float(fit.theta), 1)
+        3.0
     """
     if not learning_rate > 0:
         raise ValueError(f"learning_rate must be positive; got {learning_rate}.")
@@ -254,6 +268,14 @@ def first_order(
 
     Raises:
         ValueError: If an option is out of range.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> import optax
+        >>> method = jf.fit.first_order(optax.sgd(0.5), tolerance=1e-6)
+        >>> fit = jf.fit.maximize(lambda x: -0.5 * (x - 3.0) ** 2, 0.0, method=method, errors=jf.fit.no_errors)
+        >>> round(float(fit.theta), 2)
+        3.0
     """
     _check_options(max_steps, tolerance, patience)
     return FirstOrder(transformation, max_steps, tolerance, patience)
@@ -268,6 +290,13 @@ def bfgs(*, max_steps: int = 200, tolerance: float = 1e-5) -> Bfgs:
 
     Raises:
         ValueError: If an option is out of range.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> method = jf.fit.bfgs(max_steps=50)
+        >>> fit = jf.fit.maximize(lambda x: -0.5 * (x - 3.0) ** 2, 0.0, method=method, errors=jf.fit.no_errors)
+        >>> round(float(fit.theta), 2), bool(fit.converged)
+        (3.0, True)
     """
     _check_options(max_steps, tolerance)
     return Bfgs(max_steps, tolerance)
@@ -282,6 +311,15 @@ def lbfgsb(*, max_steps: int = 100, tolerance: float = 1e-3) -> Lbfgsb:
 
     Raises:
         ValueError: If an option is out of range.
+
+    Examples:
+        The maximum over all numbers is 3, and the interval ends at 2.
+
+        >>> import jaxfilters as jf
+        >>> log_density, interval = lambda x: -0.5 * (x - 3.0) ** 2, jf.fit.interval(0.0, 2.0)
+        >>> fit = jf.fit.maximize(log_density, 1.0, interval, method=jf.fit.lbfgsb(), errors=jf.fit.no_errors)
+        >>> round(float(fit.theta), 2)
+        2.0
     """
     _check_options(max_steps, tolerance)
     return Lbfgsb(max_steps, tolerance)
@@ -296,6 +334,14 @@ def least_squares(*, max_steps: int = 50, tolerance: float = 1e-6) -> LeastSquar
 
     Raises:
         ValueError: If an option is out of range.
+
+    Examples:
+        It is an argument of `maximize`, as in `maximize(residuals(...), start, method=least_squares(max_steps=20))`.
+
+        >>> import jaxfilters as jf
+        >>> method = jf.fit.least_squares(max_steps=20)
+        >>> method.max_steps, method.supports_bounds
+        (20, True)
     """
     _check_options(max_steps, tolerance)
     return LeastSquares(max_steps, tolerance)

@@ -89,6 +89,12 @@ def report(fit: Fit, check: GradientCheck | None = None) -> str:
     Args:
         fit: The fit.
         check: A check of the gradient, whose error is then reported.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> fit = jf.fit.maximize(lambda theta: -0.5 * (theta - 3.0) ** 2, 0.0)
+        >>> jf.fit.report(fit).splitlines()[1].split()[:3]  # the estimate and its standard error
+        ['theta', '3', '1']
     """
     lines = [f"{'parameter':24}{'estimate':>14}{'std. error':>14}    95 % interval"]
     rows = _rows(fit)

@@ -70,6 +70,15 @@ def observed_information(loss: Callable[[Array], Array], z: Float[Array, " d"]) 
     Args:
         loss: Minus the log density as a function of the coordinates.
         z: (d,), coordinates of the maximum.
+
+    Examples:
+        The loss is quadratic in the first coordinate, and does not depend on the second one.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> found = jax.jit(lambda z: jf.fit.observed_information(lambda z: 2 * z[0] ** 2, z))(jnp.zeros(2))
+        >>> round(float(found.covariance[0, 0]), 3), [jf.fit.ErrorStatus(code).name for code in found.status.tolist()]
+        (0.25, ['DETERMINED', 'FLAT'])
     """
     information = jax.hessian(loss)(z)
     finite = jnp.all(jnp.isfinite(information), axis=1)
@@ -115,7 +124,15 @@ def _inverse(S: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, 
 
 
 def no_errors(loss: Callable[[Array], Array], z: Float[Array, " d"]) -> Uncertainty:
-    """No standard errors: NaN, without the cost of the Hessian."""
+    """No standard errors: NaN, without the cost of the Hessian.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> found = jf.fit.no_errors(lambda z: jnp.sum(z**2), jnp.zeros(2))
+        >>> found.covariance.shape, jf.fit.ErrorStatus(int(found.status[0])).reason
+        ((2, 2), 'not computed')
+    """
     del loss
     status = jnp.full(z.size, ErrorStatus.NOT_COMPUTED, jnp.int32)
     return Uncertainty(jnp.full((z.size, z.size), jnp.nan, z.dtype), status)
@@ -204,6 +221,13 @@ def check_gradient(
 
     Raises:
         ValueError: If `constraints` do not fit `theta`, or `theta` violates them.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> check = jf.fit.check_gradient(lambda x: -jnp.sum(x**2), jnp.array([1.0, 2.0]))
+        >>> check.gradient.tolist(), check.error < 1e-6
+        ([-2.0, -4.0], True)
     """
     with jax.enable_x64(True):
         log_density, theta = jax.tree.map(_as_float64, (as_pytree(log_density), theta))

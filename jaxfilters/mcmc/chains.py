@@ -54,13 +54,29 @@ class Draw(NamedTuple):
 
 
 def keep_theta(state: PyTree, info: PyTree) -> PyTree:
-    """Collect the parameters of every step."""
+    """Collect the parameters of every step.
+
+    Examples:
+        `sample(key, sampler, state, 100, collect=keep_theta)` calls it with each state of a chain.
+
+        >>> import jaxfilters as jf
+        >>> jf.mcmc.keep_theta(jf.mcmc.GibbsState(theta=2.0, path=0.0), None)
+        2.0
+    """
     del info
     return state.theta
 
 
 def keep_draw(state: PyTree, info: PyTree) -> Draw:
-    """Collect the parameters and the diagnostics of every step."""
+    """Collect the parameters and the diagnostics of every step.
+
+    Examples:
+        `sample(key, sampler, state, 100)` calls it with each state of a chain.
+
+        >>> import jaxfilters as jf
+        >>> jf.mcmc.keep_draw(jf.mcmc.GibbsState(theta=2.0, path=0.0), None)
+        Draw(theta=2.0, info=None)
+    """
     return Draw(state.theta, info)
 
 
@@ -79,6 +95,13 @@ def init(key: AnyKey, sampler: Sampler, theta: PyTree) -> PyTree:
         ValueError: If the leaves of `theta` do not share their last axis; or, where its values are known, if a chain
             violates the constraints of the proposal or starts where the posterior has no density. Under `jit` and
             `vmap` such a chain has NaN or `-inf` as its log density and accepts whatever has any.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> sampler = jf.mcmc.pmmh(lambda key, theta: -0.5 * (theta - 1.0) ** 2, lambda theta: -0.5 * theta**2)
+        >>> state = jf.mcmc.init(jax.random.key(0), sampler, jnp.array([2.0, 3.0]))
+        >>> state.theta.tolist(), state.point.log_likelihood.tolist()
+        ([2.0, 3.0], [-0.5, -2.0])
     """
     count = checks.num_chains(theta)
     state, fault = _init(key, sampler, theta)
@@ -104,6 +127,14 @@ def warm_up(key: AnyKey, sampler: Sampler, state: PyTree, num_steps: int) -> tup
 
     Raises:
         ValueError: If `num_steps` is not an integer of at least 1.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> sampler = jf.mcmc.pmmh(lambda key, theta: -0.5 * (theta - 1.0) ** 2, lambda theta: -0.5 * theta**2)
+        >>> state = jf.mcmc.init(jax.random.key(0), sampler, jnp.zeros(2))
+        >>> state, info = jf.mcmc.warm_up(jax.random.key(1), sampler, state, 50)
+        >>> state.theta.shape, info.accepted.shape
+        ((2,), (50, 2))
     """
     checks.check_count("num_steps", num_steps)
     return _run(key, sampler, state, num_steps, 1, sampler.warm_up, _keep_info)

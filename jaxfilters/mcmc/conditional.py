@@ -128,6 +128,11 @@ def ancestral() -> Ancestral:
 
     The paths of all particles soon coincide backwards in time, so that early states change in few sweeps only, unless
     there are about as many particles as frames (Andrieu, Doucet and Holenstein 2010).
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.mcmc.ancestral()
+        Ancestral()
     """
     return Ancestral()
 
@@ -148,6 +153,11 @@ def ancestor_sampling(log_transition: Callable[..., Array]) -> AncestorSampling:
 
     Raises:
         TypeError: If `log_transition` is not callable.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.mcmc.ancestor_sampling(lambda x_next, x: -0.5 * (x_next - x) ** 2).log_transition(3.0, 1.0, None)
+        -2.0
     """
     particle_checks.check_callables(log_transition=log_transition)
     return AncestorSampling(taking_inputs("log_transition", log_transition, "x_next", "x"))
@@ -159,14 +169,18 @@ def backward_sampling(log_transition: Callable[..., Array]) -> BackwardSampling:
     The proposal is N. Whiteley's, in the discussion of Andrieu, Doucet and Holenstein (2010).
 
     Args:
-        log_transition: `(x_next, x) -> log p(x_next | x)`, a scalar, up to a constant that depends on neither; it may
-            take the inputs of the step as one more argument.
+        log_transition: As for `ancestor_sampling`.
 
     Returns:
         An argument of `conditional_smc`.
 
     Raises:
         TypeError: If `log_transition` is not callable.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.mcmc.backward_sampling(lambda x_next, x: -0.5 * (x_next - x) ** 2).log_transition(3.0, 1.0, None)
+        -2.0
     """
     particle_checks.check_callables(log_transition=log_transition)
     return BackwardSampling(taking_inputs("log_transition", log_transition, "x_next", "x"))
@@ -193,18 +207,14 @@ def conditional_smc(
 
     Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
-        >>> pf = jf.bootstrap(
-        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
-        ...     num_particles=20, noise=jf.StandardNormal(1),
-        ... )
-        >>> kernel = jf.mcmc.conditional_smc(
-        ...     pf, jf.mcmc.ancestor_sampling(lambda x_next, x: -0.5 * jnp.sum((x_next - x) ** 2))
-        ... )
-        >>> ys = jnp.ones((5, 1))
+        >>> pf = jf.bootstrap(lambda key: 0.0, lambda e, x: x + e, lambda x, y: -((x - y) ** 2),
+        ...     num_particles=20, noise=jf.StandardNormal(()))
+        >>> redraw = jf.mcmc.ancestor_sampling(lambda x_next, x: -0.5 * (x_next - x) ** 2)
+        >>> kernel, ys = jf.mcmc.conditional_smc(pf, redraw), jnp.ones(5)
         >>> path, info = jf.mcmc.initial_path(jax.random.key(0), kernel, ys)
         >>> path, info = jf.mcmc.update_path(jax.random.key(1), kernel, path, ys)
         >>> path.shape, int(info.num_invalid)
-        ((6, 1), 0)
+        ((6,), 0)
     """
     checks.check_bootstrap(filter)
     if not (callable(getattr(redraw, "parent", None)) and callable(getattr(redraw, "trace", None))):

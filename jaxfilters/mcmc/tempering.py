@@ -114,6 +114,14 @@ def adaptive_temperatures(ess_fraction: ArrayLike = 0.5, *, max_stages: int = 20
 
     Raises:
         ValueError: If `ess_fraction` is not in (0, 1), or `max_stages` not an integer of at least 1.
+
+    Examples:
+        Where all particles are equally likely, the first temperature is the last one.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> schedule = jf.mcmc.adaptive_temperatures(0.5)
+        >>> float(jax.jit(schedule.next)(jnp.array(0), jnp.array(0.0), jnp.zeros(10)))
+        1.0
     """
     check_scalar("ess_fraction", ess_fraction, "in (0, 1)", lambda share: 0 < share < 1)
     checks.check_count("max_stages", max_stages)
@@ -131,6 +139,11 @@ def fixed_temperatures(values: ArrayLike) -> FixedTemperatures:
 
     Raises:
         ValueError: If `values` is no such vector.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> jf.mcmc.fixed_temperatures(jnp.array([0.1, 0.5, 1.0])).max_stages
+        3
     """
     values = jnp.asarray(values, float)
     if values.ndim != 1 or not values.size:

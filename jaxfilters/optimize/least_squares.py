@@ -193,6 +193,13 @@ def bounds_of(options: dict[str, Any], y: PyTree) -> tuple[Float[Array, " n"], F
     Raises:
         ValueError: If a bound does not have the structure and shapes of `y`, or, unless it is traced, a lower bound
             exceeds the upper one or is NaN.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> lower, upper = jf.optimize.bounds_of({"lower": 0.0}, jnp.ones(2))
+        >>> lower.tolist(), upper.tolist()
+        ([0.0, 0.0], [inf, inf])
     """
     numbers = options.get("lower"), options.get("upper")
     lowest, highest = (
@@ -239,6 +246,16 @@ def covariance(
 
     Returns:
         (n, n), in the order of `jax.flatten_util.ravel_pytree`.
+
+    Examples:
+        The mean of four numbers.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> residuals = lambda y, args: y - jnp.array([1.0, 2.0, 3.0, 6.0])
+        >>> covariance = jax.jit(lambda mean: jf.optimize.covariance(residuals, mean))(jnp.array(3.0))
+        >>> round(float(covariance[0, 0]), 3)
+        0.25
     """
     flat, unravel = ravel_pytree(y)
     residuals = lambda x: ravel_pytree(fn(unravel(x), args))[0]
@@ -259,6 +276,13 @@ def huber(residual: Float[Array, "*shape"], scale: float) -> Float[Array, "*shap
 
     Raises:
         ValueError: If `scale` is not positive.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> small, large = jf.optimize.huber(jnp.array([0.5, 5.0]), scale=1.0)
+        >>> round(float(small), 3), round(float(large), 3)  # sqrt(2 * 5 - 1) = 3
+        (0.5, 3.0)
     """
     _check_scale(scale)
     size = jnp.abs(residual)
@@ -275,6 +299,12 @@ def cauchy(residual: Float[Array, "*shape"], scale: float) -> Float[Array, "*sha
 
     Raises:
         ValueError: If `scale` is not positive.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> round(float(jf.optimize.cauchy(jnp.array(1.0), scale=1.0) ** 2), 3)  # log(2)
+        0.693
     """
     _check_scale(scale)
     ratio2 = jnp.square(residual / scale)

@@ -29,7 +29,15 @@ from jaxfilters.optimize.least_squares import bounds_of
 
 
 class Split(NamedTuple):
-    """Shared variables and those of the frames, or bounds of both."""
+    """Shared variables and those of the frames, or bounds of both.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> start = jf.optimize.Split(shared=jnp.zeros(3), frames=jnp.zeros((10, 6)))  # 6 for each of 10 frames
+        >>> start.frames.shape
+        (10, 6)
+    """
 
     shared: PyTree
     """Variables of all frames."""
@@ -276,6 +284,16 @@ def schur(
 
     Returns:
         x (s,) and y (n, f); NaN if a matrix is not positive definite.
+
+    Examples:
+        Two frames with one variable each, 2 and 3, and a shared one, 1.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> U, W, V = jnp.full((1, 1), 4.0), jnp.ones((2, 1, 1)), jnp.full((2, 1, 1), 2.0)
+        >>> x, y = jax.jit(jf.optimize.schur)(U, W, V, jnp.array([9.0]), jnp.array([[5.0], [7.0]]))
+        >>> round(float(x[0]), 3), [round(v, 3) for v in y[:, 0].tolist()]
+        (1.0, [2.0, 3.0])
     """
     solve = lambda V, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(V), True), b)
     # One frame after the other: batches of matrix factorisations can deadlock on two cores.
