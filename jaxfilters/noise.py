@@ -12,7 +12,13 @@ from jaxfilters.typing import AnyKey
 
 
 def random_keys(key: AnyKey, num_particles: int) -> PyTree:
-    """Draw one random key for each particle, stacked along the last axis."""
+    """Draw one random key for each particle, stacked along the last axis.
+
+    Examples:
+        >>> import jax, jaxfilters as jf
+        >>> jf.noise.random_keys(jax.random.key(0), 1000).shape
+        (1000,)
+    """
     keys = jax.random.split(key, num_particles)
     return jnp.moveaxis(keys, 0, -1)
 

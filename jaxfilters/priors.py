@@ -23,7 +23,20 @@ from jaxfilters.typing import AnyKey, DrawNoise, SamplePrior, as_pytree
 
 @runtime_checkable
 class EnsemblePrior(Protocol):
-    """A `SamplePrior` that also draws a whole ensemble; a user's own frozen pytree dataclass may be one."""
+    """A `SamplePrior` that also draws a whole ensemble; a user's own frozen pytree dataclass may be one.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> @jax.tree_util.register_dataclass
+        ... @dataclass(frozen=True)
+        ... class Flat:
+        ...     width: jax.Array
+        ...     def __call__(self, key): return self.ensemble(key, 1)[:, 0]
+        ...     def ensemble(self, key, num_particles): return self.width * jax.random.uniform(key, (1, num_particles))
+        >>> jf.priors.sample_ensemble(jax.random.key(0), Flat(jnp.array(2.0)), 100).shape
+        (1, 100)
+    """
 
     def __call__(self, key: AnyKey, /) -> PyTree: ...
 
@@ -118,6 +131,12 @@ def sample_ensemble(key: AnyKey, sample: SamplePrior, num_particles: int) -> PyT
 
     Raises:
         ValueError: If the ensemble that a prior draws has another number of particles.
+
+    Examples:
+        >>> import jax, jaxfilters as jf
+        >>> one = lambda key: jax.random.normal(key, (3,))
+        >>> jf.priors.sample_ensemble(jax.random.key(0), one, 100).shape
+        (3, 100)
     """
     if not isinstance(sample, EnsemblePrior):
         return jax.vmap(sample, out_axes=-1)(jax.random.split(key, num_particles))

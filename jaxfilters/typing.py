@@ -82,7 +82,7 @@ class DrawNoise(Protocol):
 
 @runtime_checkable
 class ResamplingScheme(Protocol):
-    """Draw sorted ancestor indices, so that index `i` appears `N w_i` times on average."""
+    """Draw n ancestor indices, so that index `i` appears `n w_i` times on average, with normalised weights `w`."""
 
     def __call__(self, key: AnyKey, log_weights: Float[Array, " n"], /) -> Array: ...
 
@@ -115,6 +115,11 @@ def as_pytree(callback: Callable) -> Callable:
 
     Returns:
         A callable pytree.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.typing.as_pytree(lambda x: 2 * x)(3)
+        6
     """
     if isinstance(callback, MethodType) and not jax.tree_util.all_leaves([callback.__self__]):
         return jax.tree_util.Partial(callback.__func__, callback.__self__)
@@ -144,6 +149,12 @@ def asks_for_inputs(name: str, callback: Callable, *arguments: str) -> bool:
     Raises:
         TypeError: If the callback is no function of these arguments, with or without inputs; or if its signature
             leaves that open.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> asks = jf.typing.asks_for_inputs
+        >>> asks("observe", lambda x, u: x + u, "x"), asks("observe", lambda x: x, "x")
+        (True, False)
     """
     return not isinstance(callback, WithoutInputs) and _longer_form(name, callback, arguments, (*arguments, "inputs"))
 
@@ -157,6 +168,12 @@ def depends_on_state(name: str, callback: Callable) -> bool:
 
     Raises:
         TypeError: If the function has another form, or if its signature leaves that open.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> depends = jf.typing.depends_on_state
+        >>> depends("process_noise", lambda x, dt: x * dt), depends("process_noise", lambda dt: dt)
+        (True, False)
     """
     return _longer_form(name, callback, ("inputs",), ("x", "inputs"))
 
@@ -174,6 +191,11 @@ def taking_inputs(name: str, callback: Callable, *arguments: str) -> Callable:
 
     Raises:
         TypeError: If the callback is no such function.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.typing.taking_inputs("observe", lambda x: 2 * x, "x")(3, None)
+        6
     """
     if isinstance(callback, WithoutInputs) or asks_for_inputs(name, callback, *arguments):
         return as_pytree(callback)
@@ -189,6 +211,11 @@ def only_inputs(name: str, callback: Callable) -> Callable:
 
     Raises:
         TypeError: If the function has another form.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.typing.only_inputs("process_noise", lambda dt: 2 * dt)(3)
+        6
     """
     _longer_form(name, callback, ("inputs",))
     return as_pytree(callback)

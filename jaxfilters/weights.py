@@ -27,7 +27,13 @@ _TEMPER_LOWEST_LOG2 = -40.0
 
 
 def uniform(num: int, dtype: DTypeLike = float) -> Float[Array, " n"]:
-    """Return equal log weights `(num,)` that sum to one."""
+    """Return equal log weights `(num,)` that sum to one.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> [round(w, 3) for w in jnp.exp(jf.weights.uniform(4)).tolist()]
+        [0.25, 0.25, 0.25, 0.25]
+    """
     return jnp.full(num, -math.log(num), dtype=dtype)
 
 
@@ -36,6 +42,12 @@ def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Floa
 
     Where all are `-inf` the weights become equal and the log sum is `-inf`. Where one is NaN it gets no weight and the
     log sum is NaN.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> log_weights, log_sum = jf.weights.normalize(jnp.log(jnp.array([1.0, 3.0])))
+        >>> [round(w, 3) for w in jnp.exp(log_weights).tolist()], round(float(jnp.exp(log_sum)), 3)
+        ([0.25, 0.75], 4.0)
     """
     shifted, peak = _below_peak(log_weights)
     log_sum = jnp.log(jnp.sum(jnp.exp(shifted)))
@@ -43,12 +55,24 @@ def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Floa
 
 
 def relative(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return weights `(n,)` scaled so that the largest is one."""
+    """Return weights `(n,)` scaled so that the largest is one.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> [round(w, 3) for w in jf.weights.relative(jnp.log(jnp.array([1.0, 2.0, 4.0]))).tolist()]
+        [0.25, 0.5, 1.0]
+    """
     return jnp.exp(_below_peak(log_weights)[0])
 
 
 def linear(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return weights `(n,)` that sum to one."""
+    """Return weights `(n,)` that sum to one.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> [round(w, 3) for w in jf.weights.linear(jnp.log(jnp.array([1.0, 3.0]))).tolist()]
+        [0.25, 0.75]
+    """
     weights = relative(log_weights)
     return weights / jnp.sum(weights)
 
@@ -70,12 +94,26 @@ def _check(log_weights):
 
 
 def effective_sample_size(log_weights: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return `1 / sum(w**2)` of the normalised weights: 1 if one particle has all weight, n if all are equal."""
+    """Return `1 / sum(w**2)` of the normalised weights: 1 if one particle has all weight, n if all are equal.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> round(float(jf.weights.effective_sample_size(jnp.log(jnp.array([2.0, 2.0, 2.0, 0.0])))), 3)
+        3.0
+    """
     return 1 / jnp.sum(jnp.square(linear(log_weights)))
 
 
 def mean(particles: PyTree[Shaped[Array, "..."]], log_weights: Float[Array, " n"]) -> PyTree[Float[Array, "..."]]:
-    """Return the weighted mean of every leaf `(..., n)` over its last axis; of a boolean leaf, the probability."""
+    """Return the weighted mean of every leaf `(..., n)` over its last axis; of a boolean leaf, the probability.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> particles = {"x": jnp.array([0.0, 10.0]), "moves": jnp.array([True, False])}
+        >>> mean = jf.weights.mean(particles, jnp.log(jnp.array([1.0, 3.0])))
+        >>> round(float(mean["x"]), 3), round(float(mean["moves"]), 3)
+        (7.5, 0.25)
+    """
     w = linear(log_weights)
     return jax.tree.map(lambda leaf: jnp.sum(jnp.where(w > 0, leaf, 0) * w, axis=-1), particles)
 
@@ -95,6 +133,14 @@ def mean_around_mode(
     H. Koike, "Head pose estimation system based on particle filtering with adaptive diffusion control", IAPR Conference
     on Machine Vision Applications, 2005). Of equal weights the first is taken; which particles are near is a constant
     to differentiation.
+
+    Examples:
+        Of two clusters, the one about 8 has the heaviest particle.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> x, log_weights = jnp.array([[0.0, 1.0, 8.0, 9.0]]), jnp.log(jnp.array([2.0, 2.0, 3.0, 1.0]))
+        >>> [round(v, 3) for v in jf.weights.mean_around_mode(x, log_weights, jnp.ones(1)).tolist()]
+        [8.25]
     """
     heaviest = jnp.argmax(linear(log_weights))
     apart = jax.lax.stop_gradient((x - x[:, heaviest, None]) / scale[:, None])
@@ -104,7 +150,14 @@ def mean_around_mode(
 
 
 def covariance(x: Float[Array, "d n"], log_weights: Float[Array, " n"]) -> Float[Array, "d d"]:
-    """Return the weighted covariance `sum_i w_i (x_i - mean)(x_i - mean)^T`, without a small-sample correction."""
+    """Return the weighted covariance `sum_i w_i (x_i - mean)(x_i - mean)^T`, without a small-sample correction.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> P = jf.weights.covariance(jnp.array([[-1.0, 1.0], [-2.0, 2.0]]), jf.weights.uniform(2))
+        >>> [[round(v, 3) for v in row] for row in P.tolist()]
+        [[1.0, 2.0], [2.0, 4.0]]
+    """
     w = linear(log_weights)
     centred = jnp.where(w > 0, x - mean(x, log_weights)[:, None], 0.0)
     return jnp.matmul(centred * w, centred.T, precision="highest")
@@ -113,7 +166,14 @@ def covariance(x: Float[Array, "d n"], log_weights: Float[Array, " n"]) -> Float
 def quantile(
     x: Num[Array, "*batch n"], log_weights: Float[Array, " n"], probability: float | Num[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """Return the smallest value with at least `probability` of the weight at or below it, along the last axis."""
+    """Return the smallest value with at least `probability` of the weight at or below it, along the last axis.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> x, log_weights = jnp.array([30.0, 10.0, 20.0]), jnp.log(jnp.array([1.0, 1.0, 2.0]))
+        >>> float(jf.weights.quantile(x, log_weights, 0.5))
+        20.0
+    """
     w = linear(log_weights)
     values = jnp.where(w > 0, x, jnp.inf)
     order = jnp.argsort(values, axis=-1)
@@ -131,6 +191,14 @@ def temper_exponent(
     fulfils this. It is found by bisection of its logarithm, to a relative error of 2e-6; from equal weights the
     effective sample size decreases monotonically in it. Where `log_weights` alone do not reach the target, the result
     is 2**-40. The exponent is a constant to differentiation.
+
+    Examples:
+        The square root of a ratio of 1 : 9 is 1 : 3, which has an effective sample size of 1.6.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> log_likelihood = jnp.log(jnp.array([1.0, 9.0]))
+        >>> round(float(jf.weights.temper_exponent(log_likelihood, jf.weights.uniform(2), 1.6)), 3)
+        0.5
     """
     log_likelihood, log_weights = jax.lax.stop_gradient((log_likelihood, log_weights))
 

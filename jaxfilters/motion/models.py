@@ -172,6 +172,11 @@ def constant_acceleration(spectral_density: ArrayLike, *, dims: int = 1) -> Moti
 
     Raises:
         ValueError: As for `integrated_wiener`.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.motion.constant_acceleration(1.0).discretize(2.0).F.tolist()
+        [[1.0, 2.0, 2.0], [0.0, 1.0, 2.0], [0.0, 0.0, 1.0]]
     """
     return integrated_wiener(2, spectral_density, dims=dims)
 
@@ -189,6 +194,12 @@ def ornstein_uhlenbeck(time_constant: ArrayLike, std: ArrayLike, *, dims: int = 
 
     Raises:
         ValueError: If `dims < 1`, or a concrete parameter has the wrong sign or is not finite.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> motion = jf.motion.ornstein_uhlenbeck(2.0, 3.0)
+        >>> round(float(motion.transition(jnp.ones(1), 2.0)[0]), 3), motion.stationary_covariance().tolist()
+        (0.368, [[9.0]])
     """
     _check_dims(dims)
     rate = 1 / _positive("time_constant", time_constant)
@@ -209,6 +220,14 @@ def integrated_ornstein_uhlenbeck(time_constant: ArrayLike, std: ArrayLike, *, d
 
     Raises:
         ValueError: As for `ornstein_uhlenbeck`.
+
+    Examples:
+        In one time constant, a velocity of 1 covers 1 - 1/e and decays to 1/e.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> motion = jf.motion.integrated_ornstein_uhlenbeck(1.0, 3.0)
+        >>> [round(v, 3) for v in motion.transition(jnp.array([0.0, 1.0]), 1.0).tolist()]
+        [0.632, 0.368]
     """
     return _driven_by_decay(1, time_constant, std, dims)
 
@@ -230,6 +249,14 @@ def singer(time_constant: ArrayLike, std: ArrayLike, *, dims: int = 1) -> Motion
 
     Raises:
         ValueError: As for `ornstein_uhlenbeck`.
+
+    Examples:
+        In one time constant, an acceleration of 1 adds 1 - 1/e to the velocity and decays to 1/e.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> motion = jf.motion.singer(1.0, 3.0)
+        >>> [round(v, 3) for v in motion.transition(jnp.array([0.0, 0.0, 1.0]), 1.0).tolist()]
+        [0.368, 0.632, 0.368]
     """
     return _driven_by_decay(2, time_constant, std, dims)
 

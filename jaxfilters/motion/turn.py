@@ -24,7 +24,16 @@ _QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 @pytree_dataclass
 class CoordinatedTurn:
-    """Turn at a known rate, with white noise acceleration in the plane; made by `coordinated_turn`."""
+    """Turn at a known rate, with white noise acceleration in the plane; made by `coordinated_turn`.
+
+    Examples:
+        Half a turn reverses the velocity.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> F, Q = jf.motion.coordinated_turn(jnp.pi, 0.1).discretize(1.0)
+        >>> [round(v, 3) for v in jnp.diagonal(F).tolist()], Q.shape
+        ([1.0, 1.0, -1.0, -1.0], (4, 4))
+    """
 
     rate: Float[Array, ""]
     """Radians per unit of time."""
@@ -62,7 +71,15 @@ class CoordinatedTurn:
 
 @pytree_dataclass
 class UnknownTurn:
-    """Turn at a rate that is part of the state and walks at random; made by `unknown_turn`."""
+    """Turn at a rate that is part of the state and walks at random; made by `unknown_turn`.
+
+    Examples:
+        Without a turn, a step of 2 leads straight on.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> jf.motion.unknown_turn(0.1, 0.01).transition(jnp.array([0.0, 0.0, 1.0, 3.0, 0.0]), 2.0).tolist()
+        [2.0, 6.0, 1.0, 3.0, 0.0]
+    """
 
     spectral_density: Float[Array, ""]
     """Variance that each component of the velocity gains per unit of time."""

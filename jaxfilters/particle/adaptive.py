@@ -5,14 +5,6 @@ Y. Sato et al. 2006, equations 15 and 18-24; in English: K. Oka, Y. Sato, Y. Nak
 estimation system based on particle filtering with adaptive diffusion control", IAPR Conference on Machine Vision
 Applications, 2005; Y. Sugano, "User-independent techniques for real-time estimation of non-rigid 3D head motion",
 2007, section 3.3).
-
-Examples:
-    >>> import jax, jax.numpy as jnp, jaxfilters as jf
-    >>> fit = jf.math.diffusion.start(jnp.ones(2))
-    >>> log_likelihood = lambda particles, y: -jnp.sum((particles - y[:, None]) ** 2, axis=0)
-    >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2), jnp.eye(2)))
-    >>> pf = jf.adaptive_diffusion(prior, log_likelihood, fit, num_particles=100, mode_scale=jnp.ones(2))
-    >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 2)))
 """
 
 import math
@@ -127,6 +119,16 @@ def adaptive_diffusion(
         TypeError: If a callback is not callable.
         ValueError: If `num_particles < 1`, a scale, a distance or a limit is out of range, or sizes do not agree; and
             when the filter is traced, if a callback returns an array of the wrong shape or type.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> fit = jf.math.diffusion.start(jnp.ones(2))
+        >>> log_likelihood = lambda particles, y: -jnp.sum((particles - y[:, None]) ** 2, axis=0)
+        >>> prior = jf.priors.gaussian_prior(jf.Gaussian(jnp.zeros(2), jnp.eye(2)))
+        >>> pf = jf.adaptive_diffusion(prior, log_likelihood, fit, num_particles=100, mode_scale=jnp.ones(2))
+        >>> state, _ = jf.run(pf, jax.random.key(0), jnp.ones((5, 2)))
+        >>> state.estimate.shape, int(state.num_estimates)
+        ((2,), 5)
     """
     checks.check_callables(sample_prior=sample_prior, log_likelihood=log_likelihood, update_fit=update_fit)
     checks.check_ensemble(num_particles, 1.0, scheme, None)

@@ -100,6 +100,15 @@ def soft(share: float, *, scheme: ResamplingScheme = systematic) -> Soft:
 
     Raises:
         ValueError: If `share` is out of range.
+
+    Examples:
+        The weights 3/4 and 1/4 are drawn from as 5/8 and 3/8, and corrected by 6/5 and 2/3.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> scheme, w = jf.differentiable_resampling.soft(0.5), jnp.array([0.75, 0.25])
+        >>> _, log_weights, ancestors = scheme.resample(jax.random.key(0), jnp.array([0.0, 4.0]), jnp.log(w))
+        >>> bool(jnp.allclose(2 * jnp.exp(log_weights), jnp.array([6 / 5, 2 / 3])[ancestors], rtol=1e-4))
+        True
     """
     if not 0 < share < 1:
         raise ValueError(f"share must be between 0 and 1; got {share!r}.")
@@ -125,6 +134,15 @@ def transport(regularization: float = 0.5) -> Transport:
 
     Raises:
         ValueError: If `regularization` is not positive.
+
+    Examples:
+        The mean of the particles is that of the weighted particles before.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> scheme, w = jf.differentiable_resampling.transport(), jnp.array([0.75, 0.25])
+        >>> particles, _, _ = jax.jit(scheme.resample)(jax.random.key(0), jnp.array([0.0, 4.0]), jnp.log(w))
+        >>> round(float(jnp.mean(particles)), 2)
+        1.0
     """
     if not regularization > 0:
         raise ValueError(f"regularization must be positive; got {regularization!r}.")
@@ -139,6 +157,15 @@ def transport_plan(
     It is computed by Sinkhorn iterations on the logarithms of the scalings, with a regularisation that decreases from
     the largest cost, and two Newton steps. The last Newton step is differentiated. Corenflos et al. differentiate one
     more Sinkhorn iteration instead, which can be wrong by orders of magnitude where the regularisation is small.
+
+    Examples:
+        The columns sum to n times the weights.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> x, log_weights = jnp.array([[0.0, 4.0]]), jnp.log(jnp.array([0.75, 0.25]))
+        >>> plan = jax.jit(lambda x, log_w: jf.differentiable_resampling.transport_plan(x, log_w, 0.5))
+        >>> [round(v, 2) for v in jnp.sum(plan(x, log_weights), axis=0).tolist()]
+        [1.5, 0.5]
     """
     centred = x - jnp.mean(x, axis=1, keepdims=True)
     variance = jnp.max(jnp.mean(centred**2, axis=1)) * x.shape[0]

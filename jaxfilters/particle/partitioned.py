@@ -67,7 +67,14 @@ class StageWeights(Protocol):
 
 
 def uncorrected(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Weight by `L(child)`, as published: the observation counts in both stages, and the posterior is too narrow."""
+    """Weight by `L(child)`, as published: the observation counts in both stages, and the posterior is too narrow.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.particle.partitioned import uncorrected
+        >>> uncorrected(jnp.array([-1.0, -2.0]), jnp.array([-3.0, -3.0])).tolist()
+        [-1.0, -2.0]
+    """
     del parent
     return child
 
@@ -77,13 +84,26 @@ def corrected(child: Float[Array, " n"], parent: Float[Array, " n"]) -> Float[Ar
 
     The particles then approximate the posterior for the prior that the two moves make up. That prior is narrower than
     the transition of the model, because each particle makes the large move in one group only.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.particle.partitioned import corrected
+        >>> corrected(jnp.array([-1.0, -2.0]), jnp.array([-3.0, -3.0])).tolist()
+        [2.0, 1.0]
     """
     return child - jnp.where(jnp.isfinite(parent), parent, 0.0)
 
 
 @pytree_dataclass
 class Partitions:
-    """How partitioned sampling splits the move of a prediction into two stages."""
+    """How partitioned sampling splits the move of a prediction into two stages.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> from jaxfilters.particle.partitioned import consecutive, corrected
+        >>> jf.Partitions(consecutive(6, 5), stage_weights=corrected).groups.shape
+        (2, 11)
+    """
 
     groups: Bool[Array, "g d"]
     """Coordinates that move together in the first stage, one group a row; `consecutive(6, 5)` makes two groups of the
@@ -99,6 +119,11 @@ def consecutive(*sizes: int) -> Bool[Array, "g d"]:
 
     Raises:
         ValueError: If there is no size, or one that is not an integer of at least 1.
+
+    Examples:
+        >>> from jaxfilters.particle.partitioned import consecutive
+        >>> consecutive(2, 1).astype(int).tolist()
+        [[1, 1, 0], [0, 0, 1]]
     """
     if not sizes:
         raise ValueError("sizes of consecutive must be one or more; got none.")
@@ -113,6 +138,12 @@ def move_one_group(displacement: Float[Array, "d n"], groups: Bool[Array, "g d"]
 
     The groups alternate along the ensemble. Resampled particles with the same parent are neighbours, so that the
     children of every parent move in different groups.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.particle.partitioned import consecutive, move_one_group
+        >>> move_one_group(jnp.ones((2, 4)), consecutive(1, 1)).tolist()
+        [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]]
     """
     turn = jnp.arange(displacement.shape[1]) % groups.shape[0]
     return jnp.where(groups[turn].T, displacement, 0.0)

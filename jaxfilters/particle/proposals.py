@@ -33,7 +33,14 @@ class IncrementProposal(Protocol):
 def exact(
     noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Draw from N(0, N), the transition with the linear state integrated out, which needs no correction."""
+    """Draw from N(0, N), the transition with the linear state integrated out, which needs no correction.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> delta, log_correction = jf.proposals.exact(jnp.ones(1), jnp.array([[4.0]]), jnp.array([[1.0]]))
+        >>> round(float(delta[0]), 3), round(float(log_correction), 3)
+        (2.0, 0.0)
+    """
     del Q_n
     return cholesky(N) @ noise, jnp.zeros((), noise.dtype)
 
@@ -46,6 +53,12 @@ def plug_in(
     The proposal is that of Kajihara and Tanaka, "A method for 3D hand pose tracking using a Rao-Blackwellized particle
     filter", equations 49-54. The result is the filter of a model in which one noise drives both states; for the given
     model its posterior is too narrow.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> delta, log_correction = jf.proposals.plug_in(jnp.ones(1), jnp.array([[4.0]]), jnp.array([[1.0]]))
+        >>> round(float(delta[0]), 3), round(float(log_correction), 3)
+        (1.0, 0.0)
     """
     del N
     return cholesky(Q_n) @ noise, jnp.zeros((), noise.dtype)
@@ -54,7 +67,16 @@ def plug_in(
 def plug_in_corrected(
     noise: Float[Array, " n"], N: Float[Array, "n n"], Q_n: Float[Array, "n n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """Draw from N(0, Q_n) and correct the weight to N(0, N): consistent, with weights of larger variance."""
+    """Draw from N(0, Q_n) and correct the weight to N(0, N): consistent, with weights of larger variance.
+
+    Examples:
+        At zero, the density of N(0, 4) is half of that of N(0, 1).
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> delta, log_correction = jf.proposals.plug_in_corrected(jnp.zeros(1), jnp.array([[4.0]]), jnp.array([[1.0]]))
+        >>> round(float(jnp.exp(log_correction)), 3)
+        0.5
+    """
     root_Q, root_N = cholesky(Q_n), cholesky(N)
     delta = root_Q @ noise
     whitened = solve_triangular(root_N, delta)

@@ -41,7 +41,13 @@ Key = PRNGKeyArray | Array
 
 
 def systematic(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
-    """Draw ancestors by a grid of n points with a common offset: particle i is copied floor or ceil of n w_i times."""
+    """Draw ancestors by a grid of n points with a common offset: particle i is copied floor or ceil of n w_i times.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jf.resampling.systematic(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5, 0.0]))).tolist()
+        [0, 0, 2, 2]
+    """
     m = _count(log_weights, num_samples)
     whole, fraction = prefix.positions(_relative(log_weights), m)
     offset = jax.random.uniform(key, (), log_weights.dtype)
@@ -49,7 +55,13 @@ def systematic(key: Key, log_weights: Float[Array, " n"], num_samples: int | Non
 
 
 def stratified(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
-    """Draw ancestors by one point in each of n equal intervals: the number of copies is within 2 of n w_i."""
+    """Draw ancestors by one point in each of n equal intervals: the number of copies is within 2 of n w_i.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jf.resampling.stratified(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5, 0.0]))).tolist()
+        [0, 0, 2, 2]
+    """
     m = _count(log_weights, num_samples)
     whole, fraction = prefix.positions(_relative(log_weights), m)
     offsets = jax.random.uniform(key, (m,), log_weights.dtype)
@@ -57,13 +69,25 @@ def stratified(key: Key, log_weights: Float[Array, " n"], num_samples: int | Non
 
 
 def multinomial(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
-    """Draw n ancestors independently."""
+    """Draw n ancestors independently.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jax.jit(jf.resampling.multinomial)(jax.random.key(0), jnp.log(jnp.array([0.0, 1.0, 0.0]))).tolist()
+        [1, 1, 1]
+    """
     m = _count(log_weights, num_samples)
     return _ancestors(_draws_below(key, _relative(log_weights), jnp.int32(m), m), m)
 
 
 def residual(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
-    """Copy each particle floor(n w_i) times and draw the other ancestors independently from the remaining weights."""
+    """Copy each particle floor(n w_i) times and draw the other ancestors independently from the remaining weights.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jax.jit(jf.resampling.residual)(jax.random.key(0), jnp.log(jnp.array([2.0, 0.0, 1.0, 1.0]))).tolist()
+        [0, 0, 2, 3]
+    """
     m = _count(log_weights, num_samples)
     relative = _relative(log_weights)
     expected = relative * (m / jnp.sum(relative))
@@ -83,6 +107,11 @@ def ssp(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = Non
     The fractional parts of n w_i meet in pairs: one of the two becomes 0 or 1, and the other meets the next. The pairs
     are those of a knockout tournament, as in A. Srinivasan, "Distributions on level-sets with applications to
     approximation algorithms", FOCS 2001, which takes log2 n rounds instead of n steps.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jax.jit(jf.resampling.ssp)(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5, 0.0]))).tolist()
+        [0, 0, 2, 2]
     """
     m = _count(log_weights, num_samples)
     whole, fraction = (axis.reshape(-1) for axis in prefix.positions(_relative(log_weights), m))
@@ -104,6 +133,11 @@ def killing(key: Key, log_weights: Float[Array, " n"]) -> Int32[Array, " n"]:
     Most particles stay where they are if their weights are nearly equal, which suits models with many short time steps
     (N. Chopin, S. Singh, T. Soto and M. Vihola, "On resampling schemes for particle filters with weakly informative
     observations", Annals of Statistics 50, 2022, section 3). The indices are not sorted.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> jax.jit(jf.resampling.killing)(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5]))).tolist()[::2]
+        [0, 2]
     """
     n = log_weights.size
     survive_key, draw_key = jax.random.split(key)
@@ -174,6 +208,13 @@ def metropolis_steps(largest: float, bias: float) -> int:
 
     Raises:
         ValueError: If an argument is out of range.
+
+    Examples:
+        With weights of at most 2 / n, every step halves the bound.
+
+        >>> import jaxfilters as jf
+        >>> jf.resampling.metropolis_steps(2.0, 1e-3)
+        10
     """
     checks.check_scalar("largest", largest, "at least 1", lambda value: value >= 1)
     checks.check_scalar("bias", bias, "in (0, 1)", lambda value: 0 < value < 1)

@@ -99,6 +99,14 @@ def sharded(filter: Filter, mesh: Mesh, *, axis: str = AXIS, island_threshold: f
         TypeError: If `filter` is not a `Filter` or `mesh` is not a `jax.sharding.Mesh`.
         ValueError: If the mesh has no such axis, its length does not divide the number of particles, the filter is
             tempered or no particle filter, or `island_threshold < 0`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, move = lambda key: jnp.zeros(1), lambda key, x: x + jax.random.normal(key, (1,))
+        >>> pf = jf.bootstrap(prior, move, lambda x, y: -jnp.sum((x - y) ** 2), num_particles=100)
+        >>> islands = jf.sharding.sharded(pf, jax.sharding.Mesh(jax.devices()[:1], ("particles",)))
+        >>> jf.init(islands, jax.random.key(0)).particles.shape
+        (1, 100)
     """
     condition = "a fraction of the number of devices, at least 0"
     checks.check_scalar("island_threshold", island_threshold, condition, lambda value: value >= 0)
@@ -127,6 +135,12 @@ def spread_sequences(sequences: PyTree, mesh: Mesh, *, axis: str) -> PyTree:
     Raises:
         TypeError: If `mesh` is not a `jax.sharding.Mesh`.
         ValueError: If the mesh has no such axis, or its length does not divide the number of sequences.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> mesh = jax.sharding.Mesh(jax.devices()[:1], ("sequences",))
+        >>> jf.sharding.spread_sequences(jnp.zeros((8, 50, 2)), mesh, axis="sequences").sharding.spec[0]
+        'sequences'
     """
     num_devices = _length(mesh, axis)
     for path, leaf in jax.tree_util.tree_leaves_with_path(sequences):
