@@ -123,7 +123,7 @@ def ssp(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = Non
     up, last = _tournament(key, jnp.where(share < 0, share + 1, share))
     copies = (certain + up).at[last].set(0)
     # What the last one keeps is an integer but for rounding.
-    copies = copies.at[last].set(jnp.maximum(m - jnp.sum(copies), 0))
+    copies = copies.at[last].set(jnp.maximum(m - jnp.sum(copies, dtype=copies.dtype), 0))
     return _ancestors(prefix.running_count(prefix.in_rows(copies)), m)
 
 
