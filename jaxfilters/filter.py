@@ -36,12 +36,28 @@ class Filter:
 
 
 def keep_all(state: PyTree, info: PyTree) -> tuple[PyTree, PyTree]:
-    """Collect the state and the info of every step."""
+    """Collect the state and the info of every step.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> filter = jf.kalman(jf.Gaussian(jnp.zeros(1), jnp.eye(1)), *[jnp.eye(1)] * 4)
+        >>> last, (beliefs, infos) = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)), collect=jf.keep_all)
+        >>> beliefs.mean.shape, infos.log_evidence.shape
+        ((5, 1), (5,))
+    """
     return state, info
 
 
 def keep_info(state: PyTree, info: PyTree) -> PyTree:
-    """Collect the info of every step."""
+    """Collect the info of every step.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> filter = jf.kalman(jf.Gaussian(jnp.zeros(1), jnp.eye(1)), *[jnp.eye(1)] * 4)
+        >>> last, infos = jf.run(filter, jax.random.key(0), jnp.ones((5, 1)), collect=jf.keep_info)
+        >>> infos.log_evidence.shape
+        (5,)
+    """
     del state
     return info
 
@@ -56,6 +72,13 @@ def init(filter: Filter, key: AnyKey) -> PyTree:
 
     Returns:
         The state.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> filter = jf.kalman(jf.Gaussian(jnp.array([2.0]), one), one, one, one, one)
+        >>> jf.init(filter, jax.random.key(0)).mean.tolist()
+        [2.0]
     """
     # Weakly typed leaves (from Python numbers) would change type in the first step and compile it twice.
     return jax.tree.map(_strongly_typed, filter.init(filter.params, key))
@@ -74,6 +97,16 @@ def predict(filter: Filter, key: AnyKey, state: PyTree, inputs: PyTree = None) -
 
     Returns:
         The predicted state.
+
+    Examples:
+        Process noise of variance 3 adds to the variance 1 of the prior.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, one = jf.Gaussian(jnp.array([2.0]), jnp.eye(1)), jnp.eye(1)
+        >>> filter = jf.kalman(prior, one, 3.0 * one, one, one)
+        >>> ahead = jf.predict(filter, jax.random.key(0), prior)
+        >>> ahead.mean.tolist(), ahead.covariance.tolist()
+        ([2.0], [[4.0]])
     """
     return filter.predict(filter.params, key, state, inputs)
 
@@ -93,6 +126,16 @@ def update(
 
     Returns:
         The state, and the info of the filter, whose `log_evidence` is log p(y_t | y_1:t-1).
+
+    Examples:
+        An observation that is as uncertain as the belief moves its mean halfway, and halves its variance.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, one = jf.Gaussian(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+        >>> filter = jf.kalman(prior, one, one, one, one)
+        >>> belief, info = jf.update(filter, jax.random.key(0), prior, jnp.array([4.0]))
+        >>> round(float(belief.mean[0]), 3), round(float(belief.covariance[0, 0]), 3)
+        (2.0, 0.5)
     """
     return filter.update(filter.params, key, state, observation, inputs)
 
@@ -113,6 +156,17 @@ def step(
 
     Returns:
         The state, and the info of the filter.
+
+    Examples:
+        The prediction has the variance 1 + 1, and the observation noise the same: the mean moves halfway.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> filter = jf.kalman(jf.Gaussian(jnp.zeros(1), one), one, one, one, 2.0 * one)
+        >>> state = jf.init(filter, jax.random.key(0))
+        >>> state, info = jf.step(filter, jax.random.key(1), state, jnp.array([4.0]))
+        >>> round(float(state.mean[0]), 3), round(float(state.covariance[0, 0]), 3)
+        (2.0, 1.0)
     """
     predict_key, update_key = jax.random.split(key)
     state = filter.predict(filter.params, predict_key, state, inputs)
@@ -196,6 +250,17 @@ def log_evidence(
     Raises:
         ValueError: As for `run`.
         TypeError: As for `run`.
+
+    Examples:
+        One observation at its predicted value, whose variance is 1 + 1 + 2.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> filter = jf.kalman(jf.Gaussian(jnp.zeros(1), one), one, one, one, 2.0 * one)
+        >>> round(float(jf.log_evidence(filter, jax.random.key(0), jnp.zeros((1, 1)))), 3)
+        -1.612
+        >>> round(float(-0.5 * jnp.log(2 * jnp.pi * 4.0)), 3)
+        -1.612
     """
     _, log_evidence = run(filter, key, observations, inputs, mask=mask, collect=_keep_log_evidence)
     return log_evidence.sum()

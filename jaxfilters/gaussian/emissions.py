@@ -59,7 +59,15 @@ class Family(Protocol):
 
 @pytree_dataclass
 class Emission:
-    """A distribution of observations given the state; made by `poisson`, `binomial`, `bernoulli`, `categorical`."""
+    """A distribution of observations given the state; made by `poisson`, `binomial`, `bernoulli`, `categorical`.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> emission = jf.emissions.poisson(lambda x: 2.0 * x)
+        >>> log_rate = emission.of_step(None)
+        >>> log_rate(jnp.array([1.5])).tolist()
+        [3.0]
+    """
 
     natural: Callable
     """`(x, inputs) -> eta`."""

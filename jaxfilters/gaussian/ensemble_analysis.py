@@ -57,6 +57,19 @@ def perturbed_observations(key: AnyKey, forecast: Forecast) -> Float[Array, "n k
 
     G. Burgers, P. J. van Leeuwen and G. Evensen, "Analysis scheme in the ensemble Kalman filter", Monthly Weather
     Review 126, 1998.
+
+    Examples:
+        The samples -1 and 1 have the variance 2, as the noise: their mean moves halfway to the observation.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> samples, R = jnp.array([[-1.0, 1.0]]), jnp.array([[2.0]])
+        >>> forecast = jf.ensemble.Forecast(
+        ...     mean=jnp.zeros(1), deviations=samples, predicted=samples, observation=jnp.array([2.0]),
+        ...     observed=jnp.array([True]), R=R, noise_root=jnp.sqrt(R), root=jnp.sqrt(R + 2.0), localization=None,
+        ... )
+        >>> after = jf.ensemble.perturbed_observations(jax.random.key(0), forecast)
+        >>> round(float(after.mean()), 3)
+        1.0
     """
     predicted, observed = forecast.predicted, forecast.observed[:, None]
     noise = matmul(forecast.noise_root, standard_normal(key, predicted.shape, predicted.dtype))
@@ -100,6 +113,19 @@ def transform(key: AnyKey, forecast: Forecast) -> Float[Array, "n k"]:
     of the state has a transform of its own, in which the precision of an observation is multiplied by its factor.
     B. R. Hunt, E. J. Kostelich and I. Szunyogh, "Efficient data assimilation for spatiotemporal chaos: a local ensemble
     transform Kalman filter", Physica D 230, 2007.
+
+    Examples:
+        The samples -1 and 1 have the variance 2, as the noise: the mean moves halfway, and the variance halves.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> samples, R = jnp.array([[-1.0, 1.0]]), jnp.array([[2.0]])
+        >>> forecast = jf.ensemble.Forecast(
+        ...     mean=jnp.zeros(1), deviations=samples, predicted=samples, observation=jnp.array([2.0]),
+        ...     observed=jnp.array([True]), R=R, noise_root=jnp.sqrt(R), root=jnp.sqrt(R + 2.0), localization=None,
+        ... )
+        >>> after = jf.ensemble.transform(jax.random.key(0), forecast)
+        >>> round(float(after.mean()), 3), round(float(after.var(ddof=1)), 3)
+        (1.0, 1.0)
     """
     del key
     scale = jnp.sqrt(jnp.asarray(forecast.predicted.shape[1] - 1, forecast.R.dtype))
@@ -130,6 +156,19 @@ def serial(key: AnyKey, forecast: Forecast) -> Float[Array, "n k"]:
     observations must be uncorrelated. Without localisation the result for linear observations is exact, as that of
     `transform`. J. S. Whitaker and T. M. Hamill, "Ensemble data assimilation without perturbed observations", Monthly
     Weather Review 130, 2002.
+
+    Examples:
+        The samples -1 and 1 have the variance 2, as the noise: the mean moves halfway, and the variance halves.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> samples, R = jnp.array([[-1.0, 1.0]]), jnp.array([[2.0]])
+        >>> forecast = jf.ensemble.Forecast(
+        ...     mean=jnp.zeros(1), deviations=samples, predicted=samples, observation=jnp.array([2.0]),
+        ...     observed=jnp.array([True]), R=R, noise_root=jnp.sqrt(R), root=jnp.sqrt(R + 2.0), localization=None,
+        ... )
+        >>> after = jf.ensemble.serial(jax.random.key(0), forecast)
+        >>> round(float(after.mean()), 3), round(float(after.var(ddof=1)), 3)
+        (1.0, 1.0)
     """
     del key
     m, count = forecast.predicted.shape

@@ -200,6 +200,13 @@ def map_component(state: GaussianSumState) -> PyTree:
 
     Returns:
         The state, e.g. a `Gaussian`.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> places = jf.Gaussian(jnp.array([[-5.0], [5.0]]), jnp.ones((2, 1, 1)))
+        >>> state = jf.GaussianSumState(places, jnp.log(jnp.array([0.2, 0.8])))
+        >>> jf.map_component(state).mean.tolist()
+        [5.0]
     """
     best = jnp.argmax(state.log_weights)
     return jax.tree.map(lambda leaf: leaf[best], state.components)

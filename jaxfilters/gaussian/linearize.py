@@ -49,6 +49,15 @@ def taylor(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
 
     Returns:
         Value and Jacobian, with a `residual_root` of width 0.
+
+    Examples:
+        The square of x, whose derivative at 3 is 6.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([3.0]), jnp.eye(1))
+        >>> found = jf.linearize.taylor(lambda x: x**2, belief)
+        >>> found.value.tolist(), found.F.tolist(), found.residual_root.shape
+        ([9.0], [[6.0]], (1, 0))
     """
     value, F = _value_and_jacobian(f, belief.mean)
     return Linearization(value, F, jnp.zeros((value.size, 0), value.dtype))
@@ -67,6 +76,16 @@ def second_order_covariance_only(f: Function, belief: Gaussian | GaussianRoot) -
 
     Returns:
         Value, Jacobian, and a `residual_root` of width n^2 (n the columns of the belief's root).
+
+    Examples:
+        With x = 3 + e, x^2 = 9 + 6 e + e^2, and e^2 has the variance 2.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([3.0]), jnp.eye(1))
+        >>> found = jf.linearize.second_order_covariance_only(lambda x: x**2, belief)
+        >>> parts = found.value[0], found.F[0, 0], found.residual_root[0, 0] ** 2
+        >>> tuple(round(float(x), 3) for x in parts)
+        (9.0, 6.0, 2.0)
     """
     return _second_order(f, belief)[0]
 
@@ -84,6 +103,16 @@ def second_order(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
 
     Returns:
         Mean, Jacobian, and a `residual_root` of width n^2 (n the columns of the belief's root).
+
+    Examples:
+        With x = 3 + e, x^2 = 9 + 6 e + e^2, and e^2 has the mean 1 and the variance 2.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([3.0]), jnp.eye(1))
+        >>> found = jf.linearize.second_order(lambda x: x**2, belief)
+        >>> parts = found.value[0], found.F[0, 0], found.residual_root[0, 0] ** 2
+        >>> tuple(round(float(x), 3) for x in parts)
+        (10.0, 6.0, 2.0)
     """
     linearization, curvature = _second_order(f, belief)
     return linearization._replace(value=linearization.value + 0.5 * jnp.trace(curvature, axis1=1, axis2=2))
@@ -101,6 +130,15 @@ def cubature(f: Function, belief: Gaussian | GaussianRoot) -> Linearization:
 
     Returns:
         Mean, matrix of the regression, and a `residual_root` of width n.
+
+    Examples:
+        The points of N(3, 1) are 2 and 4; their squares have the mean 10 and the slope 6.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([3.0]), jnp.eye(1))
+        >>> found = jf.linearize.cubature(lambda x: x**2, belief)
+        >>> round(float(found.value[0]), 3), round(float(found.F[0, 0]), 3)
+        (10.0, 6.0)
     """
     return _sigma_points(f, belief, belief.mean.size, -1.0)
 
@@ -123,6 +161,16 @@ def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Line
 
     Raises:
         ValueError: If `alpha` is not positive, or `beta` or `kappa` is negative: the covariance could be indefinite.
+
+    Examples:
+        With x = 3 + e, x^2 = 9 + 6 e + e^2, and e^2 has the mean 1 and the variance 2.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([3.0]), jnp.eye(1))
+        >>> found = jf.linearize.unscented()(lambda x: x**2, belief)
+        >>> parts = found.value[0], found.F[0, 0], found.residual_root[0, 0] ** 2
+        >>> tuple(round(float(x), 3) for x in parts)
+        (10.0, 6.0, 2.0)
     """
     if not alpha > 0:
         raise ValueError(f"alpha must be positive; got {alpha!r}.")

@@ -17,7 +17,16 @@ from jaxfilters.math.linalg import safe_norm
 
 
 class Localization(NamedTuple):
-    """Factors of sample covariances, from 0 to 1."""
+    """Factors of sample covariances, from 0 to 1.
+
+    Examples:
+        Each of two observations changes only the number of the state that it measures, and no observation the third.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> factors = jf.ensemble.Localization(state=jnp.eye(3)[:, :2], observation=jnp.eye(2))
+        >>> factors.state.tolist()
+        [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]
+    """
 
     state: Float[Array, "n m"]
     """Between each number of the state and each observation."""

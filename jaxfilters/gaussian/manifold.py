@@ -35,12 +35,24 @@ class Manifold:
 
 
 def add(x: Float[Array, " n"], delta: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The point of a vector space that an increment leads to."""
+    """The point of a vector space that an increment leads to.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> jf.manifold.add(jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])).tolist()
+        [1.5, 2.0]
+    """
     return x + delta
 
 
 def displacement(x: Float[Array, " n"], other: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The increment from one point of a vector space to another."""
+    """The increment from one point of a vector space to another.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> jf.manifold.displacement(jnp.array([1.0, 2.0]), jnp.array([1.5, 2.0])).tolist()
+        [0.5, 0.0]
+    """
     return other - x
 
 
@@ -63,7 +75,14 @@ rotation = Block(Manifold(lie.so3_retract, lie.so3_local), 4, 3)
 
 
 def vector(size: int) -> Block:
-    """A part that is a vector of `size` components."""
+    """A part that is a vector of `size` components.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> position = jf.manifold.vector(3)
+        >>> position.size, position.dimension
+        (3, 3)
+    """
     return Block(euclidean, size, size)
 
 
@@ -123,24 +142,54 @@ def hashable(manifold: Manifold) -> Manifold:
 
 
 def increments(belief: Belief) -> Belief:
-    """Belief about the increment from the mean: the same covariance about zero."""
+    """Belief about the increment from the mean: the same covariance about zero.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.manifold.increments(jf.Gaussian(jnp.array([5.0]), 2.0 * jnp.eye(1)))
+        >>> belief.mean.tolist(), belief.covariance.tolist()
+        ([0.0], [[2.0]])
+    """
     return with_mean(belief, jnp.zeros(dimension(belief), belief.mean.dtype))
 
 
 def dimension(belief: Belief) -> int:
-    """Dimension of the tangent space."""
+    """Dimension of the tangent space.
+
+    Examples:
+        An orientation, as a quaternion of four numbers, has three degrees of freedom.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> jf.manifold.dimension(jf.Gaussian(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(3)))
+        3
+    """
     return (belief.covariance if isinstance(belief, Gaussian) else belief.root).shape[0]
 
 
 def with_mean(belief: Belief, mean: Float[Array, " size"], J: Float[Array, "m n"] | None = None) -> Belief:
-    """Belief with another mean; its covariance becomes `J P J^T` if J is given."""
+    """Belief with another mean; its covariance becomes `J P J^T` if J is given.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([1.0]), jnp.eye(1))
+        >>> moved = jf.manifold.with_mean(belief, jnp.array([5.0]), J=jnp.array([[2.0]]))
+        >>> moved.mean.tolist(), moved.covariance.tolist()
+        ([5.0], [[4.0]])
+    """
     if isinstance(belief, Gaussian):
         return Gaussian(mean, belief.covariance if J is None else factor.turned(J, belief.covariance))
     return GaussianRoot(mean, belief.root if J is None else linalg.matmul(J, belief.root))
 
 
 def retract_belief(manifold: Manifold, x: Array, belief: Belief) -> Belief:
-    """Belief about `x ⊞ delta`, given that about delta: its covariance is in the tangent space at the new mean."""
+    """Belief about `x ⊞ delta`, given that about delta: its covariance is in the tangent space at the new mean.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> delta = jf.Gaussian(jnp.array([1.0]), jnp.eye(1))
+        >>> jf.manifold.retract_belief(jf.manifold.euclidean, jnp.array([5.0]), delta).mean.tolist()
+        [6.0]
+    """
     mean = manifold.retract(x, belief.mean)
     if manifold.flat:
         return with_mean(belief, mean)
@@ -150,7 +199,14 @@ def retract_belief(manifold: Manifold, x: Array, belief: Belief) -> Belief:
 
 
 def to_tangent(manifold: Manifold, x: Array, belief: Belief) -> Belief:
-    """Belief about the increment delta from x, given that about `x ⊞ delta`; the inverse of `retract_belief`."""
+    """Belief about the increment delta from x, given that about `x ⊞ delta`; the inverse of `retract_belief`.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> belief = jf.Gaussian(jnp.array([6.0]), jnp.eye(1))
+        >>> jf.manifold.to_tangent(jf.manifold.euclidean, jnp.array([5.0]), belief).mean.tolist()
+        [1.0]
+    """
     mean = manifold.local(x, belief.mean)
     if manifold.flat:
         return with_mean(belief, mean)

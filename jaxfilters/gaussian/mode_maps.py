@@ -34,7 +34,17 @@ class ModeMaps(Protocol):
 
 @pytree_dataclass
 class CommonSpace:
-    """Maps through one common state; made by `common_space` and `components`."""
+    """Maps through one common state; made by `common_space` and `components`.
+
+    Examples:
+        Metres are common; the second mode measures in kilometres.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> scaled = lambda s: lambda belief: jf.Gaussian(s * belief.mean, s * s * belief.covariance)
+        >>> maps = jf.mode_maps.common_space([scaled(1.0), scaled(1e3)], [scaled(1.0), scaled(1e-3)])
+        >>> maps.to_common(1, jf.Gaussian(jnp.array([2.0]), jnp.eye(1))).mean.tolist()
+        [2000.0]
+    """
 
     to: tuple[Callable[[Belief], Belief], ...]
     back: tuple[Callable[[Belief], Belief], ...]
@@ -50,7 +60,15 @@ class CommonSpace:
 
 @pytree_dataclass
 class Pairwise:
-    """Maps from each mode to each other; made by `pairwise`."""
+    """Maps from each mode to each other; made by `pairwise`.
+
+    Examples:
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> shifted = lambda source, target, belief: jf.Gaussian(belief.mean + target - source, belief.covariance)
+        >>> maps = jf.mode_maps.pairwise(shifted)
+        >>> maps.convert(0, 1, jf.Gaussian(jnp.array([5.0]), jnp.eye(1))).mean.tolist()
+        [6.0]
+    """
 
     function: Callable[[int, int, Belief], Belief]
     common: int = field(metadata={"static": True})

@@ -142,6 +142,17 @@ def parallel_rts(beliefs: GaussianRoot, model: LinearModel) -> GaussianRoot:
     Raises:
         ValueError: If shapes do not fit one another, or a field of `model` has another length than `beliefs`.
         TypeError: If an argument is of another kind.
+
+    Examples:
+        A constant with the prior N(0, 1), observed as 9 eight times with noise of variance 1: its mean is 72 / 9.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> prior, one = jf.GaussianRoot(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+        >>> model = jf.smoothing.LinearModel(F=one, root_Q=0.0 * one, H=one, root_R=one)
+        >>> beliefs, log_evidences = jf.smoothing.parallel_kalman(prior, model, 9.0 * jnp.ones((8, 1)))
+        >>> smoothed = jf.smoothing.parallel_rts(beliefs, model)
+        >>> round(float(smoothed.mean[0, 0]), 3)
+        8.0
     """
     if not isinstance(beliefs, GaussianRoot):
         raise TypeError(f"beliefs must be a GaussianRoot with time first; got a {type(beliefs).__name__}.")

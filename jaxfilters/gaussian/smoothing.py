@@ -43,6 +43,16 @@ def filter_and_smooth(
     Raises:
         ValueError: If `filter` is another kind of filter, or lengths differ.
         TypeError: If `filter` is no filter.
+
+    Examples:
+        A constant with the prior N(0, 1), observed as 4 three times with noise of variance 1: its mean is 12 / 4.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> prior, one = jf.Gaussian(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+        >>> filter = jf.kalman(prior, one, 0.0 * one, one, one)
+        >>> smoothed, infos = jf.smoothing.filter_and_smooth(filter, jax.random.key(0), jnp.full((3, 1), 4.0))
+        >>> [round(float(mean), 3) for mean in smoothed.mean[:, 0]]
+        [3.0, 3.0, 3.0]
     """
     checks.is_filter("filter", filter)
     model_of(filter, "filter")

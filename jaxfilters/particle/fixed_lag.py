@@ -76,6 +76,16 @@ def fixed_lag(inner: Filter, lag: int) -> Filter:
         ValueError: If `lag < 1`; if `inner` resamples by transport, whose particles are averages and have no ancestors;
             or, when it is traced, if the state of `inner` is another one.
         TypeError: If `inner` is no filter.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> pf = jf.bootstrap(
+        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     num_particles=100, noise=jf.StandardNormal(1),
+        ... )
+        >>> last, _ = jf.run(jf.smoothing.fixed_lag(pf, lag=3), jax.random.key(0), jnp.ones((5, 1)))
+        >>> last.window.shape, last.delayed.shape
+        ((4, 1, 100), (1, 100))
     """
     checks.is_filter("inner", inner)
     _check(lag)

@@ -37,7 +37,18 @@ class LogTransition(Protocol):
 
 
 def keep_history(state: PyTree, info: PyTree) -> History:
-    """Collect the ensemble of every step; for `run(..., collect=keep_history)`."""
+    """Collect the ensemble of every step; for `run(..., collect=keep_history)`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> pf = jf.bootstrap(
+        ...     lambda key: jnp.zeros(1), lambda e, x: x + e, lambda x, y: -jnp.sum((x - y) ** 2),
+        ...     num_particles=100, noise=jf.StandardNormal(1),
+        ... )
+        >>> _, history = jf.run(pf, jax.random.key(0), jnp.ones((5, 1)), collect=jf.smoothing.keep_history)
+        >>> history.particles.shape, history.ancestors.shape
+        ((5, 1, 100), (5, 100))
+    """
     del info
     return History(state.particles, state.log_weights, state.ancestors)
 
@@ -122,6 +133,17 @@ def backward_sampling(
         TypeError: If `history` is not a `History` or `log_transition` is not callable.
         ValueError: If `num_paths < 1` or `max_candidates < 1`, `log_bound` is not finite, `inputs` has another
             length than `history`, or `log_transition` does not return a scalar.
+
+    Examples:
+        Two frames of two particles of a state that hardly moves: no trajectory changes sides.
+
+        >>> import jax, jax.numpy as jnp, jaxfilters as jf
+        >>> particles, ancestors = jnp.array([[-1.0, 1.0], [-1.0, 1.0]]), jnp.array([[0, 1], [0, 1]])
+        >>> history = jf.smoothing.History(particles, jnp.log(jnp.full((2, 2), 0.5)), ancestors)
+        >>> log_transition = lambda x_next, x: -1000.0 * (x_next - x) ** 2
+        >>> paths = jf.smoothing.backward_sampling(jax.random.key(0), history, log_transition, num_paths=10)
+        >>> paths.shape, bool((paths[0] == paths[1]).all())
+        ((2, 10), True)
     """
     checks.check_history(history)
     checks.check_callables(log_transition=log_transition)

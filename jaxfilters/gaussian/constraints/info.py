@@ -53,6 +53,14 @@ def constraint_distances(belief: Gaussian | GaussianRoot, constraints: LinearCon
     Raises:
         TypeError: `belief` is not Gaussian.
         ValueError: The normals do not have one column for each component of the belief.
+
+    Examples:
+        A mean of 3 with a standard deviation of 2, which must not be negative.
+
+        >>> import jax.numpy as jnp, jaxfilters as jf
+        >>> rows = jf.constraints.linear_constraints([[1.0]], lower=0.0, upper=jnp.inf)
+        >>> jf.constraints.constraint_distances(jf.Gaussian(jnp.array([3.0]), 4.0 * jnp.eye(1)), rows).tolist()
+        [[1.5, inf]]
     """
     check_width(belief, constraints)
     directions = jax.vmap(along, (None, 0))(belief, constraints.normals)

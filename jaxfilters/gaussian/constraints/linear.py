@@ -21,7 +21,14 @@ Numbers = ArrayLike | Sequence[Any]
 
 @pytree_dataclass
 class LinearConstraints:
-    """Intervals `lower <= normals x <= upper`, one a row. `linear_constraints` makes validated ones."""
+    """Intervals `lower <= normals x <= upper`, one a row. `linear_constraints` makes validated ones.
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> rows = jf.constraints.linear_constraints([[1.0, 0.0], [0.0, 1.0]], lower=0.0, upper=[1.0, 2.0])
+        >>> rows.lower.tolist(), rows.upper.tolist()
+        ([0.0, 0.0], [1.0, 2.0])
+    """
 
     normals: Float[Array, "..."]
     """(k, n), one normal a row. The result does not depend on their lengths."""
@@ -98,6 +105,15 @@ def feasible(constraints: LinearConstraints) -> bool:
 
     Args:
         constraints: The rows. Their values must be known: this function cannot be traced.
+
+    Examples:
+        No number is at most 0 and at least 1.
+
+        >>> import jaxfilters as jf
+        >>> inf = float("inf")
+        >>> rows = jf.constraints.linear_constraints([[1.0], [1.0]], lower=[-inf, 1.0], upper=[0.0, inf])
+        >>> jf.constraints.feasible(rows)
+        False
     """
     return _some_point_satisfies(*_on_host(constraints))
 
@@ -114,6 +130,17 @@ def check_feasible(constraints: LinearConstraints) -> None:
 
     Raises:
         ValueError: No x satisfies all rows.
+
+    Examples:
+        No number is at most 0 and at least 1.
+
+        >>> import jaxfilters as jf
+        >>> inf = float("inf")
+        >>> rows = jf.constraints.linear_constraints([[1.0], [1.0]], [-inf, 1.0], [0.0, inf], ["low", "high"])
+        >>> jf.constraints.check_feasible(rows)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+            ...
+        ValueError: constraints: ... these contradict each other: low in [-inf, 0]; high in [1, inf].
     """
     host = _on_host(constraints)
     if _some_point_satisfies(*host):

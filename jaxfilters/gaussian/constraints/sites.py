@@ -44,6 +44,12 @@ def initial_sites(constraints: LinearConstraints) -> Sites:
 
     Returns:
         Sites whose fields are all zeros, (k,).
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> rows = jf.constraints.linear_constraints([[1.0, 0.0], [0.0, 1.0]], lower=0.0, upper=1.0)
+        >>> jf.constraints.initial_sites(rows).precision.tolist()
+        [0.0, 0.0]
     """
     zeros = jnp.zeros_like(constraints.lower)
     return Sites(zeros, zeros, zeros, zeros)
