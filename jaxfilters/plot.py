@@ -43,6 +43,14 @@ def track(
     Raises:
         ValueError: If a shape does not fit, or `sigmas` or `every` is not positive.
         ModuleNotFoundError: If matplotlib is not installed.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> means = jnp.stack([jnp.arange(5.0), jnp.arange(5.0) ** 2], axis=1)
+        >>> axes = jf.plot.track(means, 0.1 * jnp.broadcast_to(jnp.eye(2), (5, 2, 2)), every=2)
+        >>> len(axes.collections) + len(axes.patches) > 0
+        True
     """
     means = _shaped("means", means, (None, 2))
     if not sigmas > 0 or every < 1:
@@ -94,6 +102,14 @@ def innovations(
     Raises:
         ValueError: If a shape does not fit, or `sigmas` is not positive.
         ModuleNotFoundError: If matplotlib is not installed.
+
+    Examples:
+        >>> import jax
+        >>> import jaxfilters as jf
+        >>> errors = jax.random.normal(jax.random.key(0), (200,))
+        >>> axes = jf.plot.innovations(errors, 0.0 * errors + 1.0)
+        >>> axes.get_title()
+        '95 % inside, 95 % expected'
     """
     e = _shaped("innovations", innovations, (None,))
     s = _shaped("std", std, e.shape)
@@ -128,6 +144,14 @@ def ancestry(values: ArrayLike, ancestors: ArrayLike, log_weights: ArrayLike, *,
     Raises:
         ValueError: If the shapes differ, or an ancestor is no index.
         ModuleNotFoundError: If matplotlib is not installed.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> values, ancestors = jnp.array([[0.0, 1.0], [0.1, 0.9]]), jnp.array([[0, 1], [1, 1]])
+        >>> axes = jf.plot.ancestry(values, ancestors, jnp.zeros((2, 2)))
+        >>> axes.get_xlabel()
+        'step'
     """
     x = _shaped("values", values, (None, None))
     length, count = x.shape
@@ -173,6 +197,13 @@ def calibration(transforms: ArrayLike, *, probability: float = 0.95, ax: Axes | 
     Raises:
         ValueError: If `transforms` is no vector of numbers in [0, 1], or `probability` is outside (0, 1).
         ModuleNotFoundError: If matplotlib is not installed.
+
+    Examples:
+        >>> import jax
+        >>> import jaxfilters as jf
+        >>> axes = jf.plot.calibration(jax.random.uniform(jax.random.key(0), (200,)))
+        >>> axes.get_title()
+        '200 predictions, p = 0.77'
     """
     u = np.sort(_shaped("transforms", transforms, (None,)))
     if u.size == 0 or u[0] < 0 or u[-1] > 1:

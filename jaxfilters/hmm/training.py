@@ -176,6 +176,19 @@ def best_of_restarts(
 
     Raises:
         ValueError: If `num_restarts` is less than 1, or as for `baum_welch`.
+
+    Examples:
+        Two states that are far apart, from 60 frames of a switching sequence.
+
+        >>> import jax, jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> y = jnp.where(jnp.arange(60) // 10 % 2 == 0, 1.0, 5.0) + 0.1 * jax.random.normal(jax.random.key(0), (60,))
+        >>> observations, lengths = jf.hmm.pad([y[:, None]])
+        >>> emission = jf.hmm.DiagonalGaussian(jnp.zeros((2, 1)), jnp.ones((2, 1)))
+        >>> model = jf.hmm.from_topology(jf.hmm.ergodic(2), emission)
+        >>> trained = jf.hmm.best_of_restarts(jax.random.key(1), model, observations, lengths, num_restarts=4)
+        >>> sorted(round(float(mean)) for mean in trained.model.emission.mean.ravel())
+        [1, 5]
     """
     if num_restarts < 1:
         raise ValueError(f"num_restarts must be at least 1; got {num_restarts}.")

@@ -55,6 +55,15 @@ def match_noncrossing(
 
     Raises:
         ValueError: If `cost` is not a matrix, holds NaN, or a mask does not match it.
+
+    Examples:
+        The cheapest pairs cross, so that without crossing both rows keep their order.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> cost = jnp.array([[4.0, 1.0], [1.0, 5.0]])
+        >>> print(jf.math.assignment.match_noncrossing(cost).column, jf.math.assignment.match(cost).column)
+        [0 1] [1 0]
     """
     return _in_order(_all_of_the_fewer(cost, rows, columns))
 
@@ -77,6 +86,13 @@ def match_noncrossing_gated(
 
     Raises:
         ValueError: As for `match_noncrossing`, or if `gate` is negative.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> matching = jf.math.assignment.match_noncrossing_gated(jnp.array([[1.0, 9.0], [9.0, 8.0]]), 4.0)
+        >>> print(matching.column, matching.cost)
+        [ 0 -1] 5.0
     """
     return _in_order(_gated(cost, gate, rows, columns))
 
@@ -109,12 +125,28 @@ def match_gated(
 
     Raises:
         ValueError: As for `match_noncrossing_gated`, or if there are more than `MAX_COLUMNS` columns.
+
+    Examples:
+        The second row costs too much to be paired, so it stays without a column, at half the gate.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> matching = jf.math.assignment.match_gated(jnp.array([[9.0, 1.0], [8.0, 9.0]]), 4.0)
+        >>> print(matching.column, matching.row, matching.cost)
+        [ 1 -1] [-1  0] 5.0
     """
     return _in_any_order(_gated(cost, gate, rows, columns))
 
 
 def enumerate_noncrossing(cost: Float[np.ndarray, "n m"]) -> tuple[list[tuple[int, int]], float]:
-    """The pairs and the cost of `match_noncrossing` by enumeration of all ordered combinations, for small problems."""
+    """The pairs and the cost of `match_noncrossing` by enumeration of all ordered combinations, for small problems.
+
+    Examples:
+        >>> import numpy as np
+        >>> import jaxfilters as jf
+        >>> jf.math.assignment.enumerate_noncrossing(np.array([[4.0, 1.0, 3.0], [2.0, 0.0, 5.0]]))
+        ([(0, 0), (1, 1)], 4.0)
+    """
     cost = np.asarray(cost, float)
     if cost.shape[0] > cost.shape[1]:
         pairs, total = enumerate_noncrossing(cost.T)
@@ -126,7 +158,13 @@ def enumerate_noncrossing(cost: Float[np.ndarray, "n m"]) -> tuple[list[tuple[in
 
 
 def count_noncrossing(n: int, m: int) -> int:
-    """The number of ordered combinations of n rows and m columns, the binomial coefficient (max, min)."""
+    """The number of ordered combinations of n rows and m columns, the binomial coefficient (max, min).
+
+    Examples:
+        >>> import jaxfilters as jf
+        >>> jf.math.assignment.count_noncrossing(5, 3)
+        10
+    """
     return math.comb(max(n, m), min(n, m))
 
 

@@ -103,6 +103,18 @@ def update(
 
     Raises:
         ValueError: If a vector is not (d,).
+
+    Examples:
+        Ten steps at rest with small changes make the constant smaller.
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import diffusion
+        >>> fit = diffusion.start(jnp.array([1.0]), strength=1.0)
+        >>> for _ in range(10):
+        ...     fit = diffusion.update(fit, jnp.array([0.0]), jnp.array([0.1]))
+        ...
+        >>> round(float(fit.offset[0]), 2)
+        0.2
     """
     for name, vector in (("velocity", velocity), ("velocity_change", velocity_change)):
         if jnp.shape(vector) != fit.scale.shape:
@@ -126,7 +138,15 @@ def update(
 
 
 def fixed(fit: DiffusionFit, velocity: Float[Array, " d"], velocity_change: Float[Array, " d"]) -> DiffusionFit:
-    """The unchanged fit, in place of `update`, for coefficients that are not estimated."""
+    """The unchanged fit, in place of `update`, for coefficients that are not estimated.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import diffusion
+        >>> fit = diffusion.start(jnp.array([1.0]), slope=0.0)
+        >>> print(diffusion.fixed(fit, jnp.array([3.0]), jnp.array([0.5])).offset)
+        [1.]
+    """
     del velocity, velocity_change
     return fit
 
@@ -151,6 +171,15 @@ def velocity_change_std(
 
     Raises:
         ValueError: If `velocity` is not (d,).
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import diffusion
+        >>> fit = diffusion.start(jnp.array([2.0]), slope=0.5)
+        >>> print(diffusion.velocity_change_std(fit, jnp.array([-4.0])))
+        [4.]
+        >>> print(diffusion.velocity_change_std(fit, jnp.array([-4.0]), high=3.0))
+        [3.]
     """
     if jnp.shape(velocity) != fit.scale.shape:
         raise ValueError(f"velocity must be {fit.scale.shape}, the shape of scale; got {jnp.shape(velocity)}.")

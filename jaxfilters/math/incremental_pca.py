@@ -43,6 +43,12 @@ def start(size: int, num_components: int) -> IncrementalPCA:
 
     Raises:
         ValueError: Unless `1 <= num_components <= size`.
+
+    Examples:
+        >>> from jaxfilters.math import incremental_pca
+        >>> pca = incremental_pca.start(size=3, num_components=2)
+        >>> print(pca.vectors.shape, pca.num_samples)
+        (2, 3) 0
     """
     _check_sizes(size, num_components)
     return IncrementalPCA(
@@ -112,6 +118,17 @@ def principal_components(pca: IncrementalPCA) -> PrincipalComponents:
     """The orthonormal basis and the variances. Each column keeps the sign of its vector, so that no coordinate flips.
 
     A vector whose sine to the span of those with larger variances is at most 0.001 is not a component.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> pca = incremental_pca.start(size=2, num_components=2)
+        >>> for deviation in jnp.array([[0.0, 2.0], [1.0, 0.0], [0.0, -2.0], [-1.0, 0.0]]):
+        ...     pca = incremental_pca.update(pca, deviation)
+        ...
+        >>> print(abs(incremental_pca.principal_components(pca).basis).round(1))
+        [[0. 1.]
+         [1. 0.]]
     """
     variances = safe_norm(pca.vectors)
     order = jnp.argsort(-variances)
@@ -126,7 +143,16 @@ def principal_components(pca: IncrementalPCA) -> PrincipalComponents:
 
 
 def explained_variance_ratio(pca: IncrementalPCA) -> Float[Array, ""]:
-    """The fraction of the mean squared deviation that the components explain, from 0 to 1; 0 without a sample."""
+    """The fraction of the mean squared deviation that the components explain, from 0 to 1; 0 without a sample.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> pca = incremental_pca.start(size=3, num_components=1)
+        >>> pca = incremental_pca.update(pca, jnp.array([0.0, 2.0, 0.0]))
+        >>> print(incremental_pca.explained_variance_ratio(pca))
+        1.0
+    """
     explained = jnp.sum(safe_norm(pca.vectors))
     total = explained + pca.residual_energy
     return explained / jnp.where(total > 0, total, 1.0)
@@ -142,6 +168,12 @@ def running_mean(mean: Float[Array, " d"], x: Float[Array, " d"], count: Int32[A
 
     Raises:
         ValueError: If `x` does not have the shape of `mean`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> print(incremental_pca.running_mean(jnp.array([1.0, 2.0]), jnp.array([4.0, 2.0]), 3))
+        [2. 2.]
     """
     if jnp.shape(x) != jnp.shape(mean):
         raise ValueError(f"x must have the shape of mean, {jnp.shape(mean)}; got {jnp.shape(x)}.")
@@ -169,6 +201,15 @@ def change_basis(
 
     Raises:
         ValueError: If shapes do not match.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> axes = jnp.eye(2)
+        >>> coordinates = jnp.array([[3.0], [1.0]])
+        >>> print(incremental_pca.change_basis(coordinates, jnp.zeros(2), axes, jnp.array([1.0, 0.0]), axes[:, ::-1]))
+        [[1.]
+         [2.]]
     """
     sizes = {jnp.shape(mean)[:1], jnp.shape(basis)[:1], jnp.shape(new_mean)[:1], jnp.shape(new_basis)[:1]}
     if len(sizes) != 1 or jnp.shape(coordinates)[:1] != jnp.shape(basis)[1:]:
@@ -196,6 +237,12 @@ def start_moments(size: int) -> Moments:
 
     Raises:
         ValueError: If `size` is less than 1.
+
+    Examples:
+        >>> from jaxfilters.math import incremental_pca
+        >>> print(incremental_pca.start_moments(2).scatter)
+        [[0. 0.]
+         [0. 0.]]
     """
     if size < 1:
         raise ValueError(f"size must be at least 1; got {size}.")
@@ -210,6 +257,16 @@ def update_moments(moments: Moments, x: Float[Array, " d"]) -> Moments:
 
     Raises:
         ValueError: If `x` is not (d,).
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> moments = incremental_pca.start_moments(1)
+        >>> for x in jnp.array([[1.0], [2.0], [6.0]]):
+        ...     moments = incremental_pca.update_moments(moments, x)
+        ...
+        >>> print(moments.mean, moments.scatter)
+        [3.] [[14.]]
     """
     if jnp.shape(x) != moments.mean.shape:
         raise ValueError(f"x must be {moments.mean.shape}, as in start_moments; got {jnp.shape(x)}.")
@@ -227,6 +284,16 @@ def exact_principal_components(moments: Moments, num_components: int) -> Princip
 
     Raises:
         ValueError: Unless `1 <= num_components <= d`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import incremental_pca
+        >>> moments = incremental_pca.start_moments(2)
+        >>> for x in jnp.array([[0.0, 2.0], [1.0, 0.0], [0.0, -2.0], [-1.0, 0.0]]):
+        ...     moments = incremental_pca.update_moments(moments, x)
+        ...
+        >>> print(incremental_pca.exact_principal_components(moments, 1).variances.round(3))
+        [2.667]
     """
     _check_sizes(moments.mean.shape[0], num_components)
     values, vectors = jnp.linalg.eigh(moments.scatter / jnp.maximum(moments.num_samples - 1, 1))

@@ -37,7 +37,17 @@ def _vector(name: str, v: Array) -> Array:
 
 
 def quaternion_multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Hamilton product `p q`: the rotation `q` followed by the rotation `p`."""
+    """Hamilton product `p q`: the rotation `q` followed by the rotation `p`.
+
+    Examples:
+        Two quarter turns about z are a half turn.
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> quarter = lie.so3_exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+        >>> print(abs(lie.quaternion_multiply(quarter, quarter)).round(3))
+        [0. 0. 0. 1.]
+    """
     pw, px, py, pz = _quaternion("p", p)
     qw, qx, qy, qz = _quaternion("q", q)
     return jnp.stack(
@@ -51,13 +61,28 @@ def quaternion_multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arr
 
 
 def quaternion_conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Inverse of a unit quaternion."""
+    """Inverse of a unit quaternion.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> q = lie.so3_exp(jnp.array([0.3, -0.2, 0.5]))
+        >>> print(lie.so3_log(lie.quaternion_conjugate(q)).round(3))
+        [-0.3  0.2 -0.5]
+    """
     w, x, y, z = _quaternion("q", q)
     return jnp.stack([w, -x, -y, -z])
 
 
 def quaternion_normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The quaternion `q` divided by its norm; NaN for the zero quaternion."""
+    """The quaternion `q` divided by its norm; NaN for the zero quaternion.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> print(lie.quaternion_normalize(jnp.array([0.0, 3.0, 4.0, 0.0])))
+        [0.  0.6 0.8 0. ]
+    """
     w, x, y, z = _quaternion("q", q)
     # Scaled first, because in float32 the sum of squares underflows for norms below 1e-19.
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(abs(w), abs(x)), jnp.maximum(abs(y), abs(z))))
@@ -67,7 +92,16 @@ def quaternion_normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 
 def quaternion_to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation matrix of a unit quaternion."""
+    """The rotation matrix of a unit quaternion.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> print(lie.quaternion_to_matrix(jnp.array([0.0, 1.0, 0.0, 0.0])))
+        [[ 1.  0.  0.]
+         [ 0. -1.  0.]
+         [ 0.  0. -1.]]
+    """
     w, x, y, z = _quaternion("q", q)
     return jnp.stack(
         [
@@ -83,6 +117,12 @@ def quaternion_from_matrix(R: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
     Of the four vectors `4 q_k q` that a rotation matrix determines, the longest is used, so that no angle leads to
     cancellation (S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> print(lie.quaternion_from_matrix(jnp.diag(jnp.array([1.0, -1.0, -1.0]))))
+        [0. 1. 0. 0.]
     """
     if jnp.shape(R)[:2] != (3, 3):
         raise ValueError(f"R must be a rotation matrix (3, 3); got {jnp.shape(R)}.")
@@ -99,7 +139,14 @@ def quaternion_from_matrix(R: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def so3_exp(rotvec: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The unit quaternion of a rotation by `|rotvec|` radians about `rotvec`."""
+    """The unit quaternion of a rotation by `|rotvec|` radians about `rotvec`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> [round(float(number), 3) for number in lie.so3_exp(jnp.array([2 * jnp.pi / 3, 0.0, 0.0]))]
+        [0.5, 0.866, 0.0, 0.0]
+    """
     x, y, z = _vector("rotvec", rotvec)
     angle2 = x * x + y * y + z * z
     small = angle2 < _SMALL
@@ -116,6 +163,12 @@ def so3_log(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
     `q` and `-q` are the same rotation and give the same vector, except for a rotation by pi, for which both signs are
     valid. The norm of `q` has no influence.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> round(float(lie.so3_log(jnp.array([1.0, 1.0, 0.0, 0.0]))[0]), 3)
+        1.571
     """
     w, x, y, z = _quaternion("q", q)
     sign = jnp.where(w < 0, -1.0, 1.0).astype(q.dtype)
@@ -132,12 +185,28 @@ def so3_log(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def so3_retract(q: Float[Array, "4"], rotvec: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The rotation `q` followed by `rotvec` in its own frame, `q exp(rotvec)`, as a unit quaternion."""
+    """The rotation `q` followed by `rotvec` in its own frame, `q exp(rotvec)`, as a unit quaternion.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> q = lie.so3_exp(jnp.array([0.2, 0.0, 0.0]))
+        >>> print(lie.so3_log(lie.so3_retract(q, jnp.array([0.3, 0.0, 0.0]))).round(3))
+        [0.5 0.  0. ]
+    """
     return quaternion_normalize(quaternion_multiply(q, so3_exp(rotvec)))
 
 
 def so3_local(q: Float[Array, "4"], p: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The rotation vector from `q` to `p`, `log(q^-1 p)` in radians: the inverse of `so3_retract`."""
+    """The rotation vector from `q` to `p`, `log(q^-1 p)` in radians: the inverse of `so3_retract`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> q, p = (lie.so3_exp(jnp.array([angle, 0.0, 0.0])) for angle in (0.2, 0.5))
+        >>> print(lie.so3_local(q, p).round(3))
+        [0.3 0.  0. ]
+    """
     return so3_log(quaternion_multiply(quaternion_conjugate(q), p))
 
 
@@ -154,6 +223,14 @@ def quaternion_mean(q: Float[Array, "4 n"], log_weights: Float[Array, " n"]) -> 
 
     Raises:
         ValueError: If `q` is not (4, n) with the n of `log_weights`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> angles = jnp.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+        >>> q = jax.vmap(lie.so3_exp, out_axes=1)(angles)
+        >>> round(float(lie.so3_log(lie.quaternion_mean(q, jnp.zeros(2)))[2]), 3)
+        0.2
     """
     if jnp.shape(q) != (4, *jnp.shape(log_weights)):
         raise ValueError(f"q and log_weights must be (4, n) and (n,); got {jnp.shape(q)} and {jnp.shape(log_weights)}.")
@@ -214,5 +291,14 @@ class RigidTransform:
 
 
 def compose(a: RigidTransform, b: RigidTransform) -> RigidTransform:
-    """The composition `T_x_z` of a = `T_x_y` and b = `T_y_z`, which applies `b` first."""
+    """The composition `T_x_z` of a = `T_x_y` and b = `T_y_z`, which applies `b` first.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import lie
+        >>> turned = lie.RigidTransform(lie.so3_exp(jnp.array([0.0, 0.0, jnp.pi / 2])), jnp.zeros(3))
+        >>> moved = lie.RigidTransform(lie.so3_exp(jnp.zeros(3)), jnp.array([1.0, 0.0, 0.0]))
+        >>> print(lie.compose(turned, moved).apply(jnp.zeros(3)).round(3) + 0.0)
+        [0. 1. 0.]
+    """
     return RigidTransform(quaternion_multiply(a.rotation, b.rotation), a.apply(b.translation))

@@ -19,13 +19,27 @@ _UNROLLED = 8
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The square root, with derivative 0 instead of infinity at 0; it is 0 for negative numbers."""
+    """The square root, with derivative 0 instead of infinity at 0; it is 0 for negative numbers.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.safe_sqrt(jnp.array([4.0, 0.0, -1.0])), jax.grad(linalg.safe_sqrt)(0.0))
+        [2. 0. 0.] 0.0
+    """
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def safe_norm(x: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
-    """The Euclidean norm along the last axis, with derivative 0 at 0."""
+    """The Euclidean norm along the last axis, with derivative 0 at 0.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.safe_norm(jnp.array([3.0, 4.0])), jax.grad(linalg.safe_norm)(jnp.zeros(2)))
+        5.0 [0. 0.]
+    """
     return safe_sqrt(jnp.sum(x * x, axis=-1))
 
 
@@ -34,6 +48,12 @@ def matmul(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"
 
     Raises:
         ValueError: If the inner sizes differ.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.matmul(jnp.array([[1.0, 2.0]]), jnp.array([[3.0], [4.0]])))
+        [[11.]]
     """
     if a.shape[1] != b.shape[0]:
         raise ValueError(f"a and b must be (n, k) and (k, m); got {a.shape} and {b.shape}.")
@@ -50,6 +70,14 @@ def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     Raises:
         ValueError: If S is not square.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.cholesky(jnp.array([[4.0, 0.0, 2.0], [0.0, 0.0, 0.0], [2.0, 0.0, 2.0]])))
+        [[2. 0. 0.]
+         [0. 0. 0.]
+         [1. 0. 1.]]
     """
     if S.shape != S.shape[:1] * 2:
         raise ValueError(f"S must be square; got {S.shape}.")
@@ -78,6 +106,15 @@ def solve_triangular(
 
     Raises:
         ValueError: If L is not square, or b does not have as many rows.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> L = jnp.array([[2.0, 0.0], [1.0, 4.0]])
+        >>> print(linalg.solve_triangular(L, jnp.array([2.0, 9.0])))
+        [1. 2.]
+        >>> print(linalg.solve_triangular(L, jnp.array([4.0, 8.0]), transpose=True))
+        [1. 2.]
     """
     n = L.shape[0]
     if L.shape != (n, n) or b.shape[:1] != (n,):
@@ -105,6 +142,13 @@ def tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     that is zero, or a linear combination of earlier rows up to rounding, has a zero on the diagonal, at which L is not
     differentiable, as |x| at 0: the derivative there is finite, correct for changes that keep the row in the span, and
     ignores the part of other changes to the right of the diagonal.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.tria(jnp.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])))
+        [[5. 0.]
+         [0. 2.]]
     """
     return _with_rows_of_zeros(_wide_tria, A)
 
@@ -123,7 +167,15 @@ def _wide_tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
 
 
 def tria_of_many_with_zeros(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """As `tria_of_many`, and a row of zeros leads to a column of zeros, too, as in `tria`."""
+    """As `tria_of_many`, and a row of zeros leads to a column of zeros, too, as in `tria`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.tria_of_many_with_zeros(jnp.array([[0.0, 0.0], [3.0, 4.0]])))
+        [[0. 0.]
+         [0. 5.]]
+    """
     return _with_rows_of_zeros(tria_of_many, A)
 
 
@@ -131,6 +183,13 @@ def tria_of_many(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """As `tria`, for many matrices at once under `vmap`: up to 8 rows by Householder reflections written as algebra.
 
     A row of zeros leads to a row of zeros; its column need not be zero. Derivatives are those of `tria`.
+
+    Examples:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> many = jnp.array([[[3.0, 4.0]], [[6.0, 8.0]]])
+        >>> print(jax.vmap(linalg.tria_of_many)(many).ravel())
+        [ 5. 10.]
     """
     n, m = A.shape
     A = jnp.pad(A, ((0, 0), (0, max(0, n - m))))

@@ -50,6 +50,13 @@ def unfold(X: Float[Array, "..."], mode: int) -> Float[Array, "rows columns"]:
 
     Raises:
         ValueError: If the tensor has no such mode.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> print(multilinear.unfold(jnp.arange(8).reshape(2, 2, 2), mode=1))
+        [[0 1 4 5]
+         [2 3 6 7]]
     """
     _check_mode(X.ndim, mode)
     return jnp.moveaxis(X, mode, 0).reshape(X.shape[mode], -1)
@@ -60,6 +67,13 @@ def fold(Y: Float[Array, "rows columns"], mode: int, shape: tuple[int, ...]) -> 
 
     Raises:
         ValueError: If the tensor has no such mode, or `Y` does not match the shape.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> X = jnp.arange(24).reshape(2, 3, 4)
+        >>> print(bool((multilinear.fold(multilinear.unfold(X, 1), 1, X.shape) == X).all()))
+        True
     """
     _check_mode(len(shape), mode)
     rest = tuple(size for n, size in enumerate(shape) if n != mode)
@@ -73,6 +87,14 @@ def mode_product(X: Float[Array, "..."], C: Float[Array, "rows columns"], mode: 
 
     Raises:
         ValueError: If the tensor has no such mode, or its size is not the number of columns.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> X = jnp.arange(6.0).reshape(2, 3)
+        >>> print(multilinear.mode_product(X, jnp.ones((1, 3)), mode=1))
+        [[ 3.]
+         [12.]]
     """
     _check_mode(X.ndim, mode)
     if C.shape[1] != X.shape[mode]:
@@ -81,14 +103,31 @@ def mode_product(X: Float[Array, "..."], C: Float[Array, "rows columns"], mode: 
 
 
 def compose(core: Float[Array, "..."], factors: Factors) -> Float[Array, "..."]:
-    """The tensor `core x_n U_n` over all factors."""
+    """The tensor `core x_n U_n` over all factors.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> core = jnp.array([[2.0]])
+        >>> print(multilinear.compose(core, {0: jnp.array([[0.6], [0.8]]), 1: jnp.array([[1.0], [0.0]])}))
+        [[1.2 0. ]
+         [1.6 0. ]]
+    """
     for mode, U in factors.items():
         core = mode_product(core, U, mode)
     return core
 
 
 def project(X: Float[Array, "..."], factors: Factors) -> Float[Array, "..."]:
-    """The core `X x_n U_n^T` over all factors, which is the optimal one for them."""
+    """The core `X x_n U_n^T` over all factors, which is the optimal one for them.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> X = jnp.array([[1.2, 0.0], [1.6, 0.0]])
+        >>> print(multilinear.project(X, {0: jnp.array([[0.6], [0.8]])}))
+        [[2. 0.]]
+    """
     return compose(X, {mode: U.T for mode, U in factors.items()})
 
 
@@ -103,6 +142,16 @@ def hosvd(X: Float[Array, "..."], ranks: Mapping[int, int] | None = None) -> Tuc
     Raises:
         ValueError: If a number is not finite, or a rank is outside of `1..min(I_n, product of the other sizes)`, where
             the size of a reduced mode is its rank.
+
+    Examples:
+        A tensor of rank one needs one vector for each mode.
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> X = jnp.einsum("i,j,k->ijk", jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0]))
+        >>> core, factors = multilinear.hosvd(X, {0: 1, 1: 1, 2: 1})
+        >>> print(core.round(3), bool(jnp.allclose(multilinear.compose(core, factors), X, atol=1e-5)))
+        [[[10.]]] True
     """
     if ranks is None:
         ranks = {n: min(size, X.size // size) for n, size in enumerate(X.shape)}
@@ -126,6 +175,16 @@ def hooi(X: Float[Array, "..."], ranks: Mapping[int, int], *, max_sweeps: int = 
 
     Raises:
         ValueError: As `hosvd`, or if `max_sweeps` is not positive.
+
+    Examples:
+        The energy of the approximation increases from one sweep to the next.
+
+        >>> import jax
+        >>> from jaxfilters.math import multilinear
+        >>> X = jax.random.normal(jax.random.key(0), (4, 4, 4))
+        >>> history = multilinear.hooi(X, {0: 1, 1: 1, 2: 1}).history
+        >>> print(bool(history[-1] > history[0]))
+        True
     """
     check_ranks(X.shape, ranks)
     check_finite("X", X)
@@ -145,6 +204,12 @@ def numerical_ranks(X: Float[Array, "..."], tolerance: float | None = None) -> I
 
     Raises:
         ValueError: If a number is not finite, or the tolerance is not in [0, 1).
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> print(multilinear.numerical_ranks(jnp.einsum("i,jk->ijk", jnp.array([3.0, 4.0]), jnp.eye(2))))
+        [1 2 2]
     """
     check_finite("X", X)
     if tolerance is not None and not 0 <= tolerance < 1:
@@ -159,13 +224,32 @@ def numerical_ranks(X: Float[Array, "..."], tolerance: float | None = None) -> I
 
 
 def leading_singular_vectors(X: Float[Array, "..."], mode: int, rank: int) -> Float[Array, "rows rank"]:
-    """The leading left singular vectors of an unfolding, with signs that make their sums nonnegative."""
+    """The leading left singular vectors of an unfolding, with signs that make their sums nonnegative.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear
+        >>> print(multilinear.leading_singular_vectors(jnp.diag(jnp.array([1.0, 3.0, 2.0])), mode=0, rank=2).round(3))
+        [[0. 0.]
+         [1. 0.]
+         [0. 1.]]
+    """
     U = jnp.linalg.svd(unfold(X, mode), full_matrices=False)[0][:, :rank]
     return U * jnp.where(jnp.sum(U, axis=0) < 0, -1.0, 1.0).astype(U.dtype)
 
 
 def sweep(X: Float[Array, "..."], factors: Factors) -> Factors:
-    """The factors after one sweep of alternating least squares over their modes."""
+    """The factors after one sweep of alternating least squares over their modes.
+
+    Examples:
+        >>> import jax
+        >>> from jaxfilters.math import multilinear
+        >>> X = jax.random.normal(jax.random.key(0), (4, 4, 4))
+        >>> before = multilinear.hosvd(X, {0: 1, 1: 1, 2: 1}).factors
+        >>> after = multilinear.sweep(X, before)
+        >>> print(bool(abs(multilinear.project(X, after)) > abs(multilinear.project(X, before))))
+        True
+    """
     factors = dict(factors)
     for mode, U in factors.items():
         others = {n: V for n, V in factors.items() if n != mode}

@@ -55,6 +55,16 @@ def complete(
     Raises:
         ValueError: If an observed number is not finite, `observed` does not broadcast to the tensor, an index of a
             reduced mode has no observed entry, or the ranks are not those of a tensor (`check_ranks`).
+
+    Examples:
+        The missing entry of a matrix of rank one follows from the others.
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import multilinear, tensor_completion
+        >>> X = jnp.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [3.0, 6.0, jnp.nan]])
+        >>> completed = tensor_completion.complete(X, jnp.isfinite(X), {0: 1})
+        >>> print(multilinear.compose(completed.core, completed.factors)[2].round(2))
+        [3. 6. 9.]
     """
     check_ranks(X.shape, ranks)
     try:

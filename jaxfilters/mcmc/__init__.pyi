@@ -10,15 +10,11 @@ from .chains import sample as sample
 from .chains import warm_up as warm_up
 from .conditional import ConditionalSMC as ConditionalSMC
 from .conditional import PathInfo as PathInfo
-from .conditional import ancestor_sampling as ancestor_sampling
-from .conditional import ancestral as ancestral
-from .conditional import backward_sampling as backward_sampling
 from .conditional import conditional_smc as conditional_smc
 from .conditional import initial_path as initial_path
 from .conditional import update_path as update_path
 from .conditional_resampling import conditional_multinomial as conditional_multinomial
 from .conditional_resampling import conditional_systematic as conditional_systematic
-from .correlated import correlated as correlated
 from .ensembles import SMCPosterior as SMCPosterior
 from .ensembles import SMCStatus as SMCStatus
 from .gibbs import GibbsState as GibbsState
@@ -31,6 +27,10 @@ from .nested import SMC2Info as SMC2Info
 from .nested import smc2 as smc2
 from .proposals import proposal as proposal
 from .proposals import random_walk as random_walk
+from .pseudo_marginal import correlated as correlated
+from .redraw import ancestor_sampling as ancestor_sampling
+from .redraw import ancestral as ancestral
+from .redraw import backward_sampling as backward_sampling
 from .tempering import TemperingInfo as TemperingInfo
 from .tempering import adaptive_temperatures as adaptive_temperatures
 from .tempering import fixed_temperatures as fixed_temperatures

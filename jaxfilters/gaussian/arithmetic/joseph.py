@@ -26,6 +26,16 @@ def update(
     rows of `H`, `R` and `added_root` hold, NaN included. Neither have those that the diagnostics count as invalid or
     deficient. The
     covariance is `(I - K H) P (I - K H)^T + K R K^T` (R. Bucy, P. Joseph, "Filtering for stochastic processes", 1968).
+
+    Examples:
+        A reading of 2 whose noise is as uncertain as the prior N(0, 1).
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior, one = jf.Gaussian(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+        >>> posterior, info = jf.arithmetic.joseph.update(prior, jnp.array([2.0]), one, one)
+        >>> print(posterior.mean.round(3), posterior.covariance.round(3))
+        [1.] [[0.5]]
     """
     return covariance.update(_form, belief, y, H, R, y_hat, mask, added_root)
 
@@ -36,6 +46,14 @@ def condition(
     """The update with every component observed, of which the covariance depends on no reading: shared by an ensemble.
 
     NaN in the innovation becomes NaN in the shift and in the log density.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> update = jf.arithmetic.joseph.condition(one, one, one, jnp.array([2.0]))
+        >>> print(update.shift.round(3))
+        [1.]
     """
     return covariance.condition(_form, P, H, R, innovation)
 
@@ -53,6 +71,17 @@ def rts(
     The next step is `x' = F x + b + q`, q ~ N(0, Q). Once x' is known, x has the covariance of an update that measured
     x'; what is not known of x' comes on top: no covariance is subtracted (H. Rauch, F. Tung, C. Striebel, "Maximum
     likelihood estimates of linear dynamic systems", AIAA J. 3(8), 1965).
+
+    Examples:
+        A constant: what is known later holds earlier, too.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> earlier, later = jf.Gaussian(jnp.zeros(1), one), jf.Gaussian(jnp.ones(1), 0.5 * one)
+        >>> smoothed = jf.arithmetic.joseph.rts(earlier, later, one, 0.0 * one)
+        >>> print(smoothed.mean, smoothed.covariance)
+        [1.] [[0.5]]
     """
     return covariance.rts(_form, belief, following, F, Q, b, added_root)
 
@@ -67,6 +96,14 @@ def backward(
     """State given the next one, x': the gain G and the belief N(g, C), so that x is N(g + G x', C).
 
     The next step is `x' = F x + b + q`, q ~ N(0, Q), as for `rts`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> gain, rest = jf.arithmetic.joseph.backward(jf.Gaussian(jnp.zeros(1), one), one, one)
+        >>> print(gain.round(3), rest.covariance.round(3))
+        [[0.5]] [[0.5]]
     """
     return covariance.backward(_form, belief, F, Q, b, added_root)
 

@@ -22,7 +22,16 @@ def predict(
     b: Float[Array, " k"] | float = 0.0,
     added_root: Float[Array, "k _"] | None = None,
 ) -> GaussianRoot:
-    """Belief in `x' = F x + b + root_Q q`, q ~ N(0, I); `added_root` is a root of more noise."""
+    """Belief in `x' = F x + b + root_Q q`, q ~ N(0, I); `added_root` is a root of more noise.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> belief, one = jf.GaussianRoot(jnp.ones(1), 3.0 * jnp.eye(1)), jnp.eye(1)
+        >>> ahead = jf.arithmetic.square_root.predict(belief, one, 4.0 * one)
+        >>> print(ahead.mean, abs(ahead.root).round(3))
+        [1.] [[5.]]
+    """
     parts = [linalg.matmul(F, belief.root), root_Q, *([] if added_root is None else [added_root])]
     return GaussianRoot(factor.apply(F, belief.mean) + b, linalg.tria(jnp.hstack(parts)))
 
@@ -45,6 +54,14 @@ def update(
 
     The array algorithm of T. Kailath, A. Sayed, B. Hassibi, "Linear Estimation", 2000, section 12.3. The root is not
     triangular; it is as wide as that of `belief`, or square if that is wider.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> prior, one = jf.GaussianRoot(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+        >>> posterior, info = jf.arithmetic.square_root.update(prior, jnp.array([2.0]), one, one)
+        >>> print(posterior.mean.round(3), (posterior.root @ posterior.root.T).round(3))
+        [1.] [[0.5]]
     """
     noise = info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root]))
     usable = info.rows(belief.mean, y, H, noise, y_hat, mask)
@@ -75,6 +92,15 @@ def rts(
     The next step is `x' = F x + b + root_Q q`, q ~ N(0, I). Once x' is known, x has the covariance of an update that
     measured x'; what is not known of x' comes on top (H. Rauch, F. Tung, C. Striebel, "Maximum likelihood estimates of
     linear dynamic systems", AIAA J. 3(8), 1965).
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> earlier, later = jf.GaussianRoot(jnp.zeros(1), one), jf.GaussianRoot(jnp.ones(1), 0.5 * one)
+        >>> smoothed = jf.arithmetic.square_root.rts(earlier, later, one, 0.0 * one)
+        >>> print(smoothed.mean.round(3), (smoothed.root @ smoothed.root.T).round(3))
+        [1.] [[0.25]]
     """
     noise = root_Q if added_root is None else jnp.hstack([root_Q, added_root])
     root, cross, known = _conditioned(linalg.matmul(F, belief.root), noise, belief.root)
@@ -93,6 +119,14 @@ def backward(
     """State given the next one, x': the gain G and the belief N(g, C), so that x is N(g + G x', C).
 
     The next step is `x' = F x + b + root_Q q`, q ~ N(0, I), as for `rts`.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> one = jnp.eye(1)
+        >>> gain, rest = jf.arithmetic.square_root.backward(jf.GaussianRoot(jnp.zeros(1), one), one, one)
+        >>> print(gain.round(3), (rest.root @ rest.root.T).round(3))
+        [[0.5]] [[0.5]]
     """
     noise = root_Q if added_root is None else jnp.hstack([root_Q, added_root])
     root, cross, known = _conditioned(linalg.matmul(F, belief.root), noise, belief.root)
@@ -103,7 +137,17 @@ def backward(
 def noise_root(
     root_R: Float[Array, "m _"], mask: Bool[Array, " m"] | None = None, added_root: Float[Array, "m _"] | None = None
 ) -> Float[Array, "m m"]:
-    """Lower root of the noise and of what is added to it by a root, zero where masked."""
+    """Lower root of the noise and of what is added to it by a root, zero where masked.
+
+    Examples:
+        The second component is masked.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> print(jf.arithmetic.square_root.noise_root(2.0 * jnp.eye(2), jnp.array([True, False])))
+        [[2. 0.]
+         [0. 0.]]
+    """
     return linalg.tria(info.observed(mask, root_R if added_root is None else jnp.hstack([root_R, added_root])))
 
 

@@ -42,6 +42,17 @@ def halfspace(
     Raises:
         TypeError: `belief` is not Gaussian.
         ValueError: `normal` does not have one number for each component of the belief.
+
+    Examples:
+        The lower half of a standard normal variable has the mean -sqrt(2 / pi).
+
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> from jaxfilters.gaussian.constraints import cut
+        >>> belief = jf.Gaussian(jnp.zeros(2), jnp.eye(2))
+        >>> truncated, info = cut.halfspace(belief, jnp.array([1.0, 0.0]), 0.0)
+        >>> round(float(truncated.mean[0]), 3)
+        -0.798
     """
     _check_normal(belief, normal)
     direction = along(belief, normal)
@@ -69,6 +80,15 @@ def interval(
         TypeError: `belief` is not Gaussian.
         ValueError: `normal` does not have one number for each component of the belief, or `lower` exceeds `upper`
             where both are known.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> from jaxfilters.gaussian.constraints import cut
+        >>> belief = jf.Gaussian(jnp.zeros(1), jnp.eye(1))
+        >>> truncated, info = cut.interval(belief, jnp.ones(1), -1.0, 1.0)
+        >>> round(float(truncated.covariance[0, 0]), 3)
+        0.291
     """
     _check_normal(belief, normal)
     if not isinstance(lower, jax.core.Tracer) and not isinstance(upper, jax.core.Tracer) and not lower <= upper:
@@ -97,6 +117,16 @@ def sequential_halfspaces(
     Raises:
         TypeError: `belief` is not Gaussian.
         ValueError: The normals do not have one column for each component of the belief.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> from jaxfilters.gaussian.constraints import cut
+        >>> belief = jf.Gaussian(jnp.zeros(2), jnp.eye(2))
+        >>> rows = jf.constraints.linear_constraints(jnp.eye(2), -jnp.inf, jnp.zeros(2))
+        >>> truncated, info = cut.sequential_halfspaces(belief, rows)
+        >>> [round(float(number), 3) for number in truncated.mean]
+        [-0.798, -0.798]
     """
     check_width(belief, constraints)
 
@@ -123,6 +153,16 @@ def sequential_intervals(belief: Belief, constraints: LinearConstraints) -> tupl
     Raises:
         TypeError: `belief` is not Gaussian.
         ValueError: The normals do not have one column for each component of the belief.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> import jaxfilters as jf
+        >>> from jaxfilters.gaussian.constraints import cut
+        >>> belief = jf.Gaussian(jnp.zeros(2), jnp.eye(2))
+        >>> rows = jf.constraints.linear_constraints(jnp.eye(2), -jnp.ones(2), jnp.ones(2))
+        >>> truncated, info = cut.sequential_intervals(belief, rows)
+        >>> [round(float(number), 3) for number in jnp.diagonal(truncated.covariance)]
+        [0.291, 0.291]
     """
     check_width(belief, constraints)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
-from jaxfilters.hmm.semi_markov import SemiMarkovModel, advanced, check_frames, log_sum, started
+from jaxfilters.hmm.durations import SemiMarkovModel, advanced, check_frames, log_sum, started
 from jaxfilters.hmm.spotting import Candidate
 from jaxfilters.typing import AnyKey
 
