@@ -6,6 +6,7 @@ from typing import Any
 
 import jupytext
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files, InclusionLevel
 
 ROOT = Path(__file__).parents[1]
@@ -52,11 +53,18 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     up = "../" * page.file.src_uri.count("/")
     pages = FROM_ROOT | {"README.md": "index.md", "jaxfilters/__init__.pyi": "api/running.md"}
     markdown = re.sub(r"\]\((examples/\w+)\.py\)", r"](\1.md)", markdown)  # scripts are pages of the site
+    markdown = re.sub(r"^```python (\w+)$", r'```python title="\1"', markdown, flags=re.MULTILINE)
     return _LINK.sub(lambda found: f"]({up}{pages[found[1]]}{found[2] or ''})", markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Put MathML in the place of LaTeX, which browsers draw themselves."""
+    """Put MathML in the place of LaTeX, which browsers draw themselves.
+
+    Raises:
+        PluginError: If a block of code was taken for text.
+    """
+    if "```" in html:
+        raise PluginError(f"a fence that is no block of code: {html[html.index('```') :][:60]!r}")
 
     def drawn(found: re.Match[str]) -> str:
         latex = found[3].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">")
