@@ -32,9 +32,15 @@ def ratios() -> dict[str, float]:
         for key, value in metrics(path.stem).items():
             parts = re.fullmatch(r"ratio_(?:(.+)_)?to_([a-z]+)(.*)", key)
             if parts and parts[2] in PEERS and not LEFT_OUT.search(key):
-                what = f"{parts[1] or ''}{parts[3]}".replace("_", " ").strip()
-                found[f"{path.stem}: {what} / {parts[2]}"] = value
+                found[f"{label(path.stem, parts[1] or '', parts[3])} / {parts[2]}"] = value
     return dict(sorted(found.items(), key=lambda item: item[1]))
+
+
+def label(scenario: str, before: str, after: str) -> str:
+    """Name of a ratio: the scenario, then what else its metric's name says about each side."""
+    words = f"{before} {after}".replace("_", " ").strip()
+    words = words.removeprefix(scenario).strip()
+    return f"{scenario}: {words}" if words else scenario
 
 
 def coverages() -> dict[str, float]:
