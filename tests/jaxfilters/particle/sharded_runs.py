@@ -5,6 +5,7 @@ and a port it is one of two processes.
 """
 
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -120,6 +121,26 @@ def exchanges(mesh, num_devices):
     }
 
 
+def traffic(num_devices):
+    """Bytes that a device of each mesh sends in an exchange, by the compiled program, and those of its particles."""
+    share, found = 120, {}
+    for count in (2, num_devices):
+        mesh = jax.make_mesh((count,), ("particles",), devices=jax.devices()[:count])
+        filter = sharded(plain(share * count), mesh, island_threshold=1.0)
+        state = jaxfilters.init(filter, jax.random.key(0))
+        own = jax.tree.leaves((state.particles, state.log_weights, state.ancestors))
+        program = jax.jit(jaxfilters.predict).lower(filter, jax.random.key(0), state).compile().as_text()
+        received = sum(result_bytes(line) for line in program.splitlines() if " all-to-all(" in line)
+        found[count] = {"sent": received * (count - 1) / count, "has": sum(leaf.nbytes for leaf in own) / count}
+    return found
+
+
+def result_bytes(line):
+    """Size of what an operation of a compiled program returns; its operands follow its name."""
+    shapes = re.findall(r"[fsu]32\[([\d,]*)\]", line.partition(" all-to-all(")[0])
+    return sum(4 * np.prod([int(size) for size in shape.split(",")]) for shape in shapes)
+
+
 def dead(mesh, num_devices):
     """An observation that nothing explains, and log-likelihoods that are no numbers."""
     pf = sharded(plain(25 * num_devices), mesh)
@@ -194,6 +215,7 @@ def main():
             "marginalised": repeated(sharded(marginalised(100), mesh), ys),
             "placement": by_placement(mesh, ys),
             "exchanges": exchanges(mesh, num_devices),
+            "traffic": traffic(num_devices),
             "dead": dead(mesh, num_devices),
             "scores": scores(mesh, ys),
             "sequences": sequences(mesh, num_devices, ys),

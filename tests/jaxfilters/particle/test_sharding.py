@@ -86,6 +86,14 @@ def test_an_exchange_is_a_permutation_of_particles_that_weigh_the_same(found):
     assert found["exchanges"]["moved"]
 
 
+def test_an_exchange_sends_no_more_than_a_device_has(found):
+    traffic = found["traffic"]
+    assert set(traffic) == {"2", str(NUM_DEVICES)}
+    for num_devices, of_one in traffic.items():
+        # Of every particle, with its weight and its index, all but the part that stays.
+        assert of_one["sent"] == pytest.approx(of_one["has"] * (1 - 1 / int(num_devices)))
+
+
 def test_islands_of_like_weight_do_not_exchange_and_keep_their_shares(found):
     assert found["exchanges"]["stay"]
     # Effective number of islands of shares 1, 2, 3, 4: 10/3, above half of 4.
