@@ -282,8 +282,7 @@ def _scan(
     collect: Collect,
 ) -> tuple[PyTree, PyTree]:
     def body(state: PyTree, frame: tuple) -> tuple[PyTree, PyTree]:
-        step_key, observation, inputs, is_observed = frame
-        predict_key, update_key = jax.random.split(step_key)
+        (predict_key, update_key), observation, inputs, is_observed = frame
         state = filter.predict(filter.params, predict_key, state, inputs)
 
         def update(state: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
@@ -295,8 +294,9 @@ def _scan(
             state, info = _update_if(is_observed, update, state, observation)
         return state, collect(state, info)
 
-    keys = jax.random.split(key, _length(observations))
-    return jax.lax.scan(body, state, (keys, observations, inputs, mask))
+    # The keys that `step` would make of one for each step, all at once.
+    keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, _length(observations)))
+    return jax.lax.scan(body, state, ((keys[0], keys[1]), observations, inputs, mask))
 
 
 def _update_if(

@@ -49,9 +49,9 @@ def normalize(log_weights: Float[Array, " n"]) -> tuple[Float[Array, " n"], Floa
         >>> [round(w, 3) for w in jnp.exp(log_weights).tolist()], round(float(jnp.exp(log_sum)), 3)
         ([0.25, 0.75], 4.0)
     """
-    shifted, peak = _below_peak(log_weights)
+    shifted, peak, any_nan = _below_peak(log_weights)
     log_sum = jnp.log(jnp.sum(jnp.exp(shifted)))
-    return shifted - log_sum, jnp.where(jnp.any(jnp.isnan(log_weights)), jnp.nan, peak + log_sum)
+    return shifted - log_sum, jnp.where(any_nan, jnp.nan, peak + log_sum)
 
 
 def relative(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -79,11 +79,16 @@ def linear(log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
 
 def _below_peak(log_weights):
     _check(log_weights)
-    finite_above = jnp.minimum(log_weights, jnp.finfo(log_weights.dtype).max)
-    log_weights = jnp.where(jnp.isnan(log_weights), -jnp.inf, finite_above)
-    peak = jax.lax.stop_gradient(jnp.max(log_weights))
+    # NaN shows in the largest of all, which is all that is needed where there is none.
+    frozen = jax.lax.stop_gradient(log_weights)
+    largest = jnp.max(frozen)
+    any_nan = jnp.isnan(largest)
+    peak = jax.lax.cond(any_nan, lambda: jnp.max(jnp.where(jnp.isnan(frozen), -jnp.inf, frozen)), lambda: largest)
+    limit = jnp.finfo(log_weights.dtype).max
+    peak = jnp.minimum(peak, limit)
+    finite = jnp.where(jnp.isnan(log_weights), -jnp.inf, jnp.minimum(log_weights, limit))
     no_weight = peak == -jnp.inf
-    return jnp.where(no_weight, 0.0, log_weights - jnp.where(no_weight, 0.0, peak)), peak
+    return jnp.where(no_weight, 0.0, finite - jnp.where(no_weight, 0.0, peak)), peak, any_nan
 
 
 def _check(log_weights):

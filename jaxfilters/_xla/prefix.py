@@ -65,8 +65,8 @@ def in_rows(values: Num[Array, " n"]) -> Num[Array, "rows 32"]:
     return jnp.pad(values, (0, -values.size % ROW)).reshape(-1, ROW)
 
 
-def running_count(counts: Int[Array, "rows 32"]) -> Int[Array, "rows 32"]:
-    """The cumulative sum, row by row, of nonnegative integers whose sum is at most 2**24."""
+def running_count(counts: Num[Array, "rows 32"]) -> Int[Array, "rows 32"]:
+    """The cumulative sum, row by row, of nonnegative integers, of any type, whose sum is at most 2**24."""
     (running,) = _running_sums((counts.astype(jnp.float32),), lambda digits: digits)
     return running.astype(jnp.int32)
 

@@ -25,6 +25,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla import last_axis
 from jaxfilters._xla.last_axis import batch_last
 from jaxfilters._xla.materialize import materialized
+from jaxfilters._xla.noise import split
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import arithmetic
 from jaxfilters.gaussian.arithmetic import factor
@@ -293,7 +294,7 @@ def predict_ensemble(
     model: RaoBlackwell, key: AnyKey, state: RaoBlackwellState, inputs: PyTree
 ) -> tuple[RaoBlackwellState, Increments]:
     """Predict one step; returns the ensemble and the increments that moved it."""
-    resample_key, noise_key = jax.random.split(key)
+    resample_key, noise_key = split(key)
     axis = model.covariance_axis
     carried = (state.particles, state.linear_mean, None if axis is None else state.covariance)
     (particles, linear_mean, covariance), log_weights, ancestors = resample(

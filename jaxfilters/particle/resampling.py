@@ -26,6 +26,7 @@ Examples:
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ from jaxtyping import Array, Bool, Float, Int32, PRNGKeyArray
 
 from jaxfilters import weights
 from jaxfilters._xla import prefix
+from jaxfilters._xla.noise import uniform
 from jaxfilters.particle import checks
 
 Key = PRNGKeyArray | Array
@@ -48,10 +50,12 @@ def systematic(key: Key, log_weights: Float[Array, " n"], num_samples: int | Non
         >>> jf.resampling.systematic(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5, 0.0]))).tolist()
         [0, 0, 2, 2]
     """
-    m = _count(log_weights, num_samples)
-    whole, fraction = prefix.positions(_relative(log_weights), m)
-    offset = jax.random.uniform(key, (), log_weights.dtype)
-    return _ancestors(whole + (fraction > offset), m)
+    return _systematic(key, _relative(log_weights), _count(log_weights, num_samples))
+
+
+def _systematic(key: Key, relative: Float[Array, "rows 32"], m: int) -> Int32[Array, " m"]:
+    whole, fraction = prefix.positions(relative, m)
+    return _ancestors(whole + (fraction > uniform(key, relative.dtype)), m)
 
 
 def stratified(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
@@ -62,10 +66,21 @@ def stratified(key: Key, log_weights: Float[Array, " n"], num_samples: int | Non
         >>> jf.resampling.stratified(jax.random.key(0), jnp.log(jnp.array([0.5, 0.0, 0.5, 0.0]))).tolist()
         [0, 0, 2, 2]
     """
-    m = _count(log_weights, num_samples)
-    whole, fraction = prefix.positions(_relative(log_weights), m)
-    offsets = jax.random.uniform(key, (m,), log_weights.dtype)
+    return _stratified(key, _relative(log_weights), _count(log_weights, num_samples))
+
+
+def _stratified(key: Key, relative: Float[Array, "rows 32"], m: int) -> Int32[Array, " m"]:
+    whole, fraction = prefix.positions(relative, m)
+    offsets = jax.random.uniform(key, (m,), relative.dtype)
     return _ancestors(whole + (fraction > offsets[jnp.minimum(whole, m - 1)]), m)
+
+
+def _by_weights(draw: Callable) -> Callable:
+    return lambda key, weights, m: draw(key, prefix.in_rows(weights), m)
+
+
+BY_WEIGHTS = {systematic: _by_weights(_systematic), stratified: _by_weights(_stratified)}
+"""Schemes as functions `(key, weights (n,), m) -> ancestors (m,)` of weights of any positive sum, none of them NaN."""
 
 
 def multinomial(key: Key, log_weights: Float[Array, " n"], num_samples: int | None = None) -> Int32[Array, " m"]:
@@ -347,7 +362,9 @@ def _relative(log_weights: Array) -> Array:
 
 def _ancestors(ends: Int32[Array, "rows 32"], n: int) -> Int32[Array, " n"]:
     """Ancestor of each of n places, of which particle i fills those from `ends[i - 1]` to `ends[i]`."""
-    ended = jnp.zeros(n, jnp.int32).at[ends.reshape(-1)].add(1, mode="drop", indices_are_sorted=True)
+    # What ends beyond the last place, in the padding of the last row, has no effect.
+    ended = jnp.zeros(n - n % -prefix.ROW, jnp.float32)
+    ended = ended.at[ends.reshape(-1)].add(1.0, mode="drop", indices_are_sorted=True)
     return prefix.running_count(prefix.in_rows(ended)).reshape(-1)[:n]
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int32, PyTree
 from jaxfilters import weights
 from jaxfilters.particle import checks
 from jaxfilters.particle.differentiable_resampling import EnsembleScheme, Resampled
+from jaxfilters.particle.resampling import BY_WEIGHTS
 from jaxfilters.typing import AnyKey, ResamplingScheme, Temper
 
 
@@ -58,8 +59,9 @@ def resample(
     num_particles = log_weights.shape[0]
     normalized, log_sum = weights.normalize(log_weights)
     identity = jnp.arange(num_particles, dtype=jnp.int32)
-    # The effective sample size of weights that sum to one.
-    uneven = 1 / jnp.sum(jnp.exp(2 * normalized)) < ess_threshold * num_particles
+    relative = weights.relative(jax.lax.stop_gradient(log_weights))
+    # The effective sample size below the threshold, which a threshold of 1 does not leave to rounding.
+    uneven = jnp.square(jnp.sum(relative)) < ess_threshold * num_particles * jnp.sum(jnp.square(relative))
     uneven = uneven | (jnp.asarray(ess_threshold) >= 1.0)
     if isinstance(scheme, EnsembleScheme):
         unchanged = Resampled(particles, normalized, identity)
@@ -67,19 +69,32 @@ def resample(
         return result.particles, log_sum + result.log_weights, result.ancestors
 
     def draw() -> Int32[Array, " n"]:
+        if scheme in BY_WEIGHTS:
+            return BY_WEIGHTS[scheme](key, relative, num_particles)
         ancestors = scheme(key, jax.lax.stop_gradient(normalized))
         checks.check_ancestors(ancestors, num_particles)
         return jnp.asarray(ancestors, jnp.int32)
 
     ancestors = jax.lax.cond(uneven, draw, lambda: identity)
-    chosen = normalized[ancestors]
-    chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
-    equal = weights.uniform(num_particles, log_weights.dtype) + (chosen - jax.lax.stop_gradient(chosen))
     return (
         jax.tree.map(lambda leaf: jnp.take(leaf, ancestors, axis=-1, mode="clip"), particles),
-        log_sum + jnp.where(uneven, equal, normalized),
+        log_sum + jnp.where(uneven, _equal(normalized, ancestors), normalized),
         ancestors,
     )
+
+
+@jax.custom_jvp
+def _equal(normalized: Float[Array, " n"], ancestors: Int32[Array, " n"]) -> Float[Array, " n"]:
+    """Equal log weights, which change as those of the ancestors do."""
+    del ancestors
+    return weights.uniform(normalized.size, normalized.dtype)
+
+
+@_equal.defjvp
+def _equal_jvp(primals, tangents):
+    normalized, ancestors = primals
+    chosen = jnp.where(jnp.isfinite(normalized), tangents[0], 0.0)[ancestors]
+    return _equal(normalized, ancestors), chosen
 
 
 def reweight(

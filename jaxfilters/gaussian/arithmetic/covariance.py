@@ -154,7 +154,8 @@ def _whitening(P, H, R, usable):
         # Rows that are not valid get no gain below; that nothing in them is NaN is all that they need.
         H, R = (jnp.where(jnp.isfinite(A), A, 0.0) for A in (H, R))
     PH = factor.outer(P, H)
-    L = factor.plain_root(linalg.matmul(H, PH) + R)
+    S = linalg.matmul(H, PH) + R
+    L = factor.plain_root(S)
 
     def as_it_is(_H, _PH, _R, L, valid):
         return L, valid, jnp.ones((), bool)
@@ -165,7 +166,7 @@ def _whitening(P, H, R, usable):
         L, counts = factor.loosened_root(S)
         return L, counts, jnp.any(counts) | jnp.all(S == 0)
 
-    margins = jnp.where(valid, factor.margins(L), -1.0)
+    margins = jnp.where(valid, factor.margins(L, S), -1.0)
     L, counts, definite = jax.lax.cond(jnp.min(margins) > 0, as_it_is, repaired, H, PH, R, L, valid)
     return _Whitening(H, R, PH, L, counts, valid, definite)
 

@@ -34,7 +34,7 @@ def _root(S):
         return jnp.where(counts, L, 0.0), jnp.any(counts) | jnp.all(S == 0)
 
     L = plain_root(S)
-    L, definite = jax.lax.cond(jnp.min(margins(L)) > 0, sound, loose, S, L)
+    L, definite = jax.lax.cond(jnp.min(margins(L, S)) > 0, sound, loose, S, L)
     return jnp.where(definite, L, jnp.nan)
 
 
@@ -62,13 +62,13 @@ def plain_root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return lower_part(jax.lax.linalg.cholesky_p.bind(S.T))
 
 
-def margins(L: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """How far each variable is from depending on those before it, to rounding: positive where it does not.
+def margins(L: Float[Array, "n n"], S: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """How far each variable of S is from depending on those before it, to rounding: positive where it does not.
 
-    NaN where `plain_root` found no root.
+    L is the `plain_root` of S, or NaN, and so are the margins then.
     """
     pivots = diagonal(L)
-    return pivots * pivots - _tolerance(L) * jnp.sum(L * L, axis=1)
+    return pivots * pivots - _tolerance(L) * diagonal(S)
 
 
 def loosened_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
@@ -105,8 +105,8 @@ def inverse(L: Float[Array, "n n"], counts: Bool[Array, " n"]) -> Float[Array, "
     right = diagonal_matrix(counts.astype(L.dtype))
     if len(L) <= UNROLLED:
         return linalg.solve_triangular(L, right)
-    # The transpose of what is stored by rows is stored by columns, as LAPACK wants it.
-    return jax.lax.linalg.triangular_solve(L.T, right, left_side=True, lower=False, transpose_a=True)
+    # LAPACK reads and writes by columns: the transposes of what is stored by rows, without a copy.
+    return jax.lax.linalg.triangular_solve(L.T, right, left_side=False, lower=False).T
 
 
 def identity(n: int, dtype: DTypeLike) -> Shaped[Array | np.ndarray, "n n"]:
