@@ -194,12 +194,15 @@ def chain_model(capture: Capture) -> tuple[MarkedHand, Inequalities]:
         for joint, (low, high) in enumerate(_RANGES)
     ]
     limits += [within(f"r_{finger}{link}", 0.01, 0.12) for finger in range(1, 6) for link in (1, 2, 3)]
-    # The triangle is rigid: its markers are where they are taken to be.
-    std = np.repeat([0.0] * len(TRIANGLE) + [SOFT_TISSUE_STD] * 2 * len(FINGERS), 2)
-    soft = jf.GaussMarkov(jnp.asarray(SOFT_TISSUE_TIME, dtype=float), jnp.asarray(std**2, dtype=float))
-    marked = with_lasting_errors(marked_hand(hand, markers), soft)
+    marked = with_lasting_errors(marked_hand(hand, markers), soft_tissue())
     rows: LimitRows = limit_rows(marked.layout, limits)
     return marked, inequalities(rows)
+
+
+def soft_tissue() -> jf.GaussMarkov:
+    """Errors of the rows that last; the triangle is rigid, and its markers are where they are taken to be."""
+    std = np.repeat([0.0] * len(TRIANGLE) + [SOFT_TISSUE_STD] * 2 * len(FINGERS), 2)
+    return jf.GaussMarkov(jnp.asarray(SOFT_TISSUE_TIME, dtype=float), jnp.asarray(std**2, dtype=float))
 
 
 def chain_motion(layout: Layout) -> AboutEase:
@@ -211,9 +214,8 @@ def chain_motion(layout: Layout) -> AboutEase:
     return dataclasses.replace(motion, time=decay, speed_std=speed)
 
 
-def first_belief(capture: Capture, hand: MarkedHand, rng: np.random.Generator) -> Start:
+def first_belief(capture: Capture, layout: Layout, rng: np.random.Generator) -> Start:
     """The hand's place and rotation in the first frame, with an error; angles and lengths of a hand as such."""
-    layout = hand.layout
     axis = rng.normal(size=3)
     wrong = Rotation.from_rotvec(START_ERROR * axis / np.linalg.norm(axis)).as_matrix()
     x, y, z, w = Rotation.from_matrix(wrong @ capture.rotation).as_quat()
@@ -225,7 +227,7 @@ def first_belief(capture: Capture, hand: MarkedHand, rng: np.random.Generator) -
     std[layout.position], std[layout.angles] = 0.02, np.tile(_EASE_STD, 5)
     std[layout.rates] = np.asarray(layout.per_moving(0.01, 0.02, 0.05))
     std[layout.lengths] = np.tile(_LENGTHS_STD, 5)
-    std[layout.errors] = np.sqrt(np.asarray(hand.errors.covariance))
+    std[layout.errors] = np.sqrt(np.asarray(soft_tissue().covariance))
     # The two joints that hardly move have no rates to speak of.
     std[layout.angle_rates] *= np.tile((0.05, 0.05, 1.0, 1.0), 5)
     covariance = np.diag(std**2)
@@ -237,7 +239,7 @@ def track_lengths(capture: Capture, seed: int) -> EstimatedLengths:
     """The lengths at the end of a view, with noise and a wrong start drawn from the seed."""
     rng = np.random.default_rng(seed)
     hand, limits = chain_model(capture)
-    start = first_belief(capture, hand, rng)
+    start = first_belief(capture, hand.layout, rng)
     pixels = FOCAL * capture.points[..., :2] / capture.points[..., 2:]
     y = (pixels + NOISE * rng.normal(size=pixels.shape)).reshape(len(pixels), -1)
     observed = np.isfinite(y)
@@ -252,7 +254,5 @@ def track_lengths(capture: Capture, seed: int) -> EstimatedLengths:
     rate = len(y) / (time.perf_counter() - begin)
     link = np.arange(2, 15, 3)
     last = hand.layout.lengths.start + link
-    end = (
-        np.asarray(values)[-1] for values in (track.mean[:, last], track.std[:, last], track.length_observed[:, link])
-    )
-    return EstimatedLengths(*end, rate)
+    mean, std, observed = (np.asarray(values)[-1] for values in (track.mean, track.std, track.length_observed))
+    return EstimatedLengths(mean[last], std[last], observed[link], rate)
