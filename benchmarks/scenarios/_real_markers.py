@@ -40,7 +40,7 @@ class MarkedHand(ArticulatedHand):
         points = [_place(marker, size, joints) for marker in self.markers]
         return self.projection.camera_points(x, self.layout, jnp.stack(points))
 
-    def observe(self, x: Float[Array, " n"]) -> Float[Array, " rows"]:
+    def exact_features(self, x: Float[Array, " n"]) -> Float[Array, " rows"]:
         """Image of the markers, pixels."""
         return self.projection.image_points(self.marker_points(x)).ravel()
 

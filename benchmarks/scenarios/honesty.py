@@ -111,8 +111,8 @@ def articulated_claims(quick: bool, seed: int) -> Claims:
     recordings = []
     for view in list(VIEWS.values())[: 2 if quick else None]:
         capture = load_capture(path, QUICK_CAPTURE_FRAMES if quick else CAPTURE_FRAMES, view)
-        lengths, deviations, _ = track_lengths(capture, seed)
-        recordings.append(Recording(1e3 * (lengths - true_lengths(capture))[None], 1e3 * deviations[None]))
+        found = track_lengths(capture, seed)
+        recordings.append(Recording(1e3 * (found.lengths - true_lengths(capture))[None], 1e3 * found.std[None]))
     return Claims("articulated", "dfki", tuple(f"{finger}_mm" for finger in FINGERS), recordings)
 
 

@@ -22,6 +22,8 @@ from jaxfilters.models.articulated.kinematics import finger_frames, flexion_sums
 from jaxfilters.models.articulated.layout import LINKS, Layout
 
 SMALLEST_AMPLITUDE = 0.9
+NEAR_IMAGE_PLANE = float(np.deg2rad(20.0))
+"""Of a link whose image tells its length: there an error of 10 degrees changes its projected length by 6 % or less."""
 LARGEST_CHANGE = float(np.deg2rad(60.0))
 LARGEST_SEPARATION = float(np.deg2rad(25.0))
 STDS_TO_MIRROR = 1.25
@@ -91,6 +93,18 @@ def depth_mirror_alone(x: Float[Array, " n"], hand: ArticulatedHand, finger: Ind
     """As `depth_mirror`, with the next joint turned back, so that the links beyond keep their direction."""
     change, amplitude = (value[finger, link] for value in depth_mirrors(x, hand))
     return MirroredLink(turn_link_alone(x, hand.layout, finger, link, change), change, amplitude)
+
+
+def shows_length(x: Float[Array, " n"], hand: ArticulatedHand) -> Bool[Array, "fingers 3"]:
+    """Links that lie within `NEAR_IMAGE_PLANE` of the image plane: their image tells how long they are.
+
+    The projected length r cos(phi) hardly depends on a small inclination phi; that of a foreshortened link tells r
+    only as well as phi is known, which one camera takes from the limits and from the model of the hand.
+    """
+    points = hand.points(x)
+    link = points[:, 1:] - points[:, :-1]
+    depth = jnp.abs(jnp.sum(link * hand.projection.line_of_sight(points[:, :-1]), axis=-1))
+    return depth <= np.sin(NEAR_IMAGE_PLANE) * safe_norm(link)
 
 
 def mirror_trigger(x: Float[Array, " n"], std: Float[Array, " n"], hand: ArticulatedHand) -> Bool[Array, "fingers 3"]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
@@ -30,7 +31,13 @@ from jaxfilters.gaussian.constraints.constrained_filter import (
     constrained,
 )
 from jaxfilters.gaussian.extended import Observation, condition
-from jaxfilters.gaussian.linearize import Linearize, second_order_covariance_only, taylor
+from jaxfilters.gaussian.linearize import (
+    Function,
+    Linearization,
+    Linearize,
+    second_order_covariance_only,
+    taylor,
+)
 from jaxfilters.math import linalg
 from jaxfilters.models.articulated.ambiguity import (
     depth_mirrors,
@@ -99,7 +106,8 @@ class HandBelief:
 def recommended(hand: ArticulatedHand, prior: Gaussian, limits: Inequalities, *, gate: float = math.inf) -> Filter:
     """Second-order filter, limits counted once, lengths estimated from new views, of a `FeatureObservation` a frame."""
     inner = constrained(_belief(hand, prior, gate, second_order_covariance_only, turned), EPConstraints(*limits))
-    constant = jnp.arange(hand.layout.size) >= hand.layout.static.start
+    place, static = jnp.arange(hand.layout.size), hand.layout.static
+    constant = (place >= static.start) & (place < static.stop)
     return schmidt_kalman(inner, jax.tree_util.Partial(signature, hand), constant, NEW_VIEW * hand.point_std)
 
 
@@ -204,12 +212,35 @@ def _update(
     noise = jnp.diag(look.std**2)
     measured = Observation(look.y, look.mask & _within_gate(model, belief, look, H, at), noise)
     posterior, info = condition(
-        belief, measured, hand.observe, noise, at=at, linearize=model.linearize, residual=hand.residual
+        belief,
+        measured,
+        hand.observe,
+        noise,
+        at=at,
+        linearize=partial(_linearized, model.linearize, hand),
+        residual=hand.residual,
     )
     posterior = model.corrected(hand, belief.mean, posterior)
     # An innovation's likelihood cannot be compared between points of linearisation; the height of the mode can.
     log_evidence = laplace_log_evidence(hand, belief, posterior, info, H, look)
     return posterior, replace(info, log_evidence=log_evidence)
+
+
+def _linearized(linearize: Linearize, hand: ArticulatedHand, observe: Function, belief: Gaussian) -> Linearization:
+    """The linear approximation of the image, which says nothing of rates and in which errors are added.
+
+    Only what bends the image is handed on: second derivatives of the rest are zero and need not be computed.
+    """
+    layout = hand.layout
+    bends = np.r_[layout.moving, layout.static]
+
+    def image(part: Array) -> Array:
+        return observe(belief.mean.at[bends].set(part))
+
+    found = linearize(image, Gaussian(belief.mean[bends], belief.covariance[jnp.ix_(bends, bends)]))
+    F = jnp.zeros((found.value.size, layout.size), found.F.dtype).at[:, bends].set(found.F)
+    errors = jnp.eye(found.value.size, layout.num_errors, dtype=F.dtype)
+    return found._replace(F=F.at[:, layout.errors].set(errors))
 
 
 def added(hand: ArticulatedHand, before: Float[Array, " n"], after: Gaussian) -> Gaussian:

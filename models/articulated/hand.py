@@ -1,13 +1,16 @@
 """The articulated hand as one model: how its state moves, what is visible of it, and with how much noise."""
 
-from dataclasses import field
+from dataclasses import field, replace
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.math.linalg import matmul, safe_norm
+from jaxfilters.gaussian.gauss_markov import GaussMarkov
+from jaxfilters.math.linalg import matmul, safe_norm, safe_sqrt
 from jaxfilters.models.articulated.features import (
     FULL,
     SHORTEST_LINK,
@@ -22,6 +25,7 @@ from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.articulated.motion import ConstantVelocity, Motion
 from jaxfilters.models.articulated.projection import Projection, WeakPerspective
 
+Hand = TypeVar("Hand", bound="ArticulatedHand")
 POINT_STD, ALPHA_STD, RHO_STD = 1.0, float(np.deg2rad(2.0)), 1.0
 """Pixels, radians, pixels."""
 
@@ -45,6 +49,8 @@ class ArticulatedHand:
     """Noise of a line's distance from the origin, pixels, positive."""
     origin: Float[Array, " 2"]
     """The pixel that distances of lines are measured from; near the hand, as a line's noise grows with its distance."""
+    errors: GaussMarkov | None
+    """Errors of the measured rows that last, in frames and in the units of the rows; `None` without."""
     layout: Layout = field(metadata=dict(static=True))
     features: FeatureSet = field(metadata=dict(static=True))
     pivot: Pivot = field(metadata=dict(static=True))
@@ -54,7 +60,10 @@ class ArticulatedHand:
 
     def transition(self, x: Float[Array, " n"], inputs: Float[Array, ""] | float | None = None) -> Float[Array, " n"]:
         """The expected state after a frame, or after `inputs` frames."""
-        moved = self.motion.advance(x, self.layout, 1.0 if inputs is None else inputs)
+        dt = 1.0 if inputs is None else inputs
+        moved = self.motion.advance(x, self.layout, dt)
+        if self.errors is not None:
+            moved = moved.at[self.layout.errors].multiply(self.errors.decay(dt))
         return self.projection.settle(moved, self.layout)
 
     def process_noise(self, inputs: Float[Array, ""] | float | None = None) -> Float[Array, "n n"]:
@@ -64,7 +73,13 @@ class ArticulatedHand:
 
     def process_noise_root(self, inputs: Float[Array, ""] | float | None = None) -> Float[Array, "n columns"]:
         """A root of `process_noise`."""
-        return self.motion.noise_root(self.layout, 1.0 if inputs is None else inputs)
+        dt = 1.0 if inputs is None else inputs
+        root = self.motion.noise_root(self.layout, dt)
+        if self.errors is None:
+            return root
+        added = jnp.diag(safe_sqrt(self.errors.added(dt)))
+        pushed = jnp.zeros((self.layout.size, self.layout.num_errors), root.dtype).at[self.layout.errors].set(added)
+        return jnp.concatenate([root, pushed], axis=1)
 
     def points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 3"]:
         """Joints of every finger from base to tip in the camera frame: pixels from the wrist's depth, or metres."""
@@ -96,7 +111,12 @@ class ArticulatedHand:
         )
 
     def observe(self, x: Float[Array, " n"]) -> Float[Array, " rows"]:
-        """h(x) [7]: the chosen features of a hand in this state, pixels and radians."""
+        """h(x) [7]: the chosen features of a hand in this state with their lasting errors, pixels and radians."""
+        exact = self.exact_features(x)
+        return exact if self.errors is None else exact + x[self.layout.errors]
+
+    def exact_features(self, x: Float[Array, " n"]) -> Float[Array, " rows"]:
+        """The chosen features of a hand in this state, pixels and radians."""
         return self.features.stack(self.image(x))
 
     def usable(self, x: Float[Array, " n"], shortest: float = SHORTEST_LINK) -> Bool[Array, " rows"]:
@@ -170,8 +190,30 @@ def articulated_hand(
         alpha_std=jnp.asarray(alpha_std, dtype=float),
         rho_std=jnp.asarray(rho_std, dtype=float),
         origin=jnp.asarray(center, dtype=float),
+        errors=None,
         layout=layout,
         features=features,
         pivot=pivot,
         compare=compare,
     )
+
+
+def with_lasting_errors(hand: Hand, errors: GaussMarkov) -> Hand:
+    """The hand with an error of each measured row in its state that lasts from frame to frame.
+
+    A detector, a marker on the skin or a chain of hinges in place of a finger errs by the pose, which hardly changes
+    from one frame to the next. Such errors are no fresh noise, and do not average out (A. E. Bryson and L. J.
+    Henrikson, "Estimation using sampled data containing sequentially correlated noise", 1968). Limits and beliefs are
+    those of the layout of the hand that is returned; a belief about the errors begins with their covariance.
+
+    Args:
+        hand: The hand, without such errors.
+        errors: Independent errors of the rows of `observe`: variances (pixels and radians) and time constants (frames).
+
+    Raises:
+        ValueError: if there is not one variance for each row, or the hand has such errors already.
+    """
+    rows = jax.eval_shape(hand.observe, jnp.zeros(hand.layout.size)).shape
+    if hand.errors is not None or errors.covariance.shape != rows:
+        raise ValueError(f"errors must have {rows[0]} variances for a hand without; got {errors.covariance.shape}.")
+    return replace(hand, errors=errors, layout=replace(hand.layout, num_errors=rows[0]))

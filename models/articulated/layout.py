@@ -10,12 +10,14 @@ Image Sequence Based on Loose Constraints", Osaka University, c. 1997; equation 
     (rates)        of position, quaternion and angles, the same order, per frame
     lengths        finger by finger, three links from the base out; pixels at scale 1, or metres
     palm           width, height, thickness in the unit of the lengths
+    (errors)       of the measured rows, where these last from frame to frame; none unless a model has them
 
 so that m = position + 4 + 4 F entries move, as many are rates, and 3 F + 3 are constant. Palm frame: origin at the
 wrist, x to the fingers, y out of the palm's inner side, z = x cross y across the palm; fingers bend from x towards y.
 With the palm to the camera and the fingers up, z points to the right of the image: the thumb's side of a right hand.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -51,11 +53,15 @@ class Layout:
     in the middle and 1/2 on the thumb's edge. `None`: at the end of the palm, evenly spread from the thumb's side."""
     frames: tuple[tuple[float, float, float], ...] | None = None
     """Rotation vectors, palm from finger, radians: how each finger's frame is turned at zero angles. `None`: not."""
+    num_errors: int = 0
+    """Of measured rows whose error lasts; see `jaxfilters.models.articulated.hand.with_lasting_errors`."""
 
     def __post_init__(self):
         """Refuse what is no hand."""
         if self.num_fingers < 1:
             raise ValueError(f"num_fingers must be 1 or more; got {self.num_fingers}.")
+        if self.num_errors < 0:
+            raise ValueError(f"num_errors must be 0 or more; got {self.num_errors}.")
         if self.position_size not in (2, 3):
             raise ValueError(f"position_size must be 2 (image) or 3 (space); got {self.position_size}.")
         for name, value, width in (("bases", self.bases, 2), ("frames", self.frames, 3)):
@@ -79,7 +85,12 @@ class Layout:
     @property
     def size(self) -> int:
         """Size of the state."""
-        return 2 * self.num_moving + self.num_static
+        return 2 * self.num_moving + self.num_static + self.num_errors
+
+    @property
+    def body(self) -> "Layout":
+        """The layout of the hand alone, without the errors of what is measured; states begin alike."""
+        return dataclasses.replace(self, num_errors=0)
 
     @property
     def moving(self) -> slice:
@@ -94,7 +105,12 @@ class Layout:
     @property
     def static(self) -> slice:
         """Lengths and palm."""
-        return slice(2 * self.num_moving, self.size)
+        return slice(2 * self.num_moving, 2 * self.num_moving + self.num_static)
+
+    @property
+    def errors(self) -> slice:
+        """Lasting errors of the measured rows."""
+        return slice(self.static.stop, self.size)
 
     @property
     def position(self) -> slice:
@@ -124,22 +140,23 @@ class Layout:
     @property
     def lengths(self) -> slice:
         """Of the links, finger by finger."""
-        return slice(2 * self.num_moving, self.size - len(PALM_NAMES))
+        return slice(self.static.start, self.static.stop - len(PALM_NAMES))
 
     @property
     def palm(self) -> slice:
         """Width, height, thickness."""
-        return slice(self.size - len(PALM_NAMES), self.size)
+        return slice(self.static.stop - len(PALM_NAMES), self.static.stop)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all entries: `wrist_x`, `q_w`, `theta_10`, `theta_10_rate`, `r_11`, `r_w` and so on."""
+        """Of all entries: `wrist_x`, `q_w`, `theta_10`, `theta_10_rate`, `r_11`, `r_w`, `error_1` and so on."""
         fingers = range(1, self.num_fingers + 1)
         moving = [f"wrist_{axis}" for axis in "xyz"[: self.position_size]]
         moving += [f"q_{axis}" for axis in "wxyz"]
         moving += [f"theta_{finger}{joint}" for finger in fingers for joint in range(LINKS + 1)]
         lengths = [f"r_{finger}{link}" for finger in fingers for link in range(1, LINKS + 1)]
-        return (*moving, *(f"{name}_rate" for name in moving), *lengths, *PALM_NAMES)
+        errors = (f"error_{row + 1}" for row in range(self.num_errors))
+        return (*moving, *(f"{name}_rate" for name in moving), *lengths, *PALM_NAMES, *errors)
 
     @property
     def base_shares(self) -> np.ndarray:
@@ -207,7 +224,7 @@ def white_acceleration_root(
         std: Standard deviation of the acceleration of all that moves, per frame squared; not negative.
         dt: Frames.
     """
-    static = jnp.zeros((layout.num_static, layout.num_moving), std.dtype)
+    static = jnp.zeros((layout.size - layout.static.start, layout.num_moving), std.dtype)
     return jnp.concatenate([jnp.diag(0.5 * dt**2 * std), jnp.diag(dt * std), static])
 
 

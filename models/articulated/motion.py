@@ -85,7 +85,7 @@ class AboutEase:
         # What came earlier has left the rates and angles, and moved all else by as much as it ever will.
         recent = jnp.minimum(dt, REMEMBERED * self.time)
         push = self.speed_std * jnp.sqrt(np.where(is_angle, 4.0, 2.0) / self.time)
-        nothing = jnp.zeros((layout.num_static, layout.num_moving), push.dtype)
+        nothing = jnp.zeros((layout.size - layout.static.start, layout.num_moving), push.dtype)
         columns = []
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
             since = 0.5 * (1 + float(node)) * recent

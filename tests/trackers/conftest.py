@@ -173,6 +173,7 @@ def perfect_track(features):
         nis_per_row=ones,
         least_distance=ones,
         log_evidence=-ones,
+        length_observed=np.arange(FRAMES)[:, None] > np.arange(hand.layout.lengths.stop - hand.layout.lengths.start),
         status=np.arange(FRAMES, dtype=np.int32) % 3,
     )
 
@@ -196,6 +197,7 @@ def nothing_tracked():
             nis_per_row=one,
             least_distance=one,
             log_evidence=one,
+            length_observed=np.zeros((frames, LINKS * layout.num_fingers), bool),
             status=np.zeros(frames, np.int32),
         )
 
@@ -247,11 +249,12 @@ def build_fake_articulated(sequence, config):
             nis_per_row=one,
             least_distance=-one,
             log_evidence=walk[0],
+            length_observed=jnp.zeros(LINKS * layout.num_fingers, bool),
             status=jnp.asarray(1, jnp.int32),
         )
-        whole = {"num_hypotheses": 0, "is_new_view": False, "status": 0}
+        whole = {"num_hypotheses": 0, "is_new_view": False, "length_observed": False, "status": 0}
         nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(**dict.fromkeys(whole, 0.0)))
-        nothing = nothing._replace(**{name: jnp.asarray(x, getattr(row, name).dtype) for name, x in whole.items()})
+        nothing = nothing._replace(**{name: jnp.full_like(getattr(row, name), x) for name, x in whole.items()})
         row = jax.tree.map(partial(jnp.where, frame.mask.any()), row, nothing)
         return FakeState(key, state.frames + 1, mean), row
 

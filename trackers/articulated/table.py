@@ -27,6 +27,7 @@ class TimedArticulatedTrack(NamedTuple):
     nis_per_row: np.ndarray
     least_distance: np.ndarray
     log_evidence: np.ndarray
+    length_observed: np.ndarray
     status: np.ndarray
 
 
@@ -35,7 +36,9 @@ def articulated_table(layout: Layout) -> TrackTable:
     means = tuple(_column(name, "") for name in layout.names)
     stds = tuple(_column(name, "_std") for name in layout.names)
     diagnostics = (Columns((name,), attrgetter(name)) for name in _DIAGNOSTICS)
-    parts = (Columns(means, attrgetter("mean")), Columns(stds, attrgetter("std")), *diagnostics)
+    lengths = tuple(f"{name}_observed" for name in layout.names[layout.lengths])
+    observed = Columns(lengths, attrgetter("length_observed"))
+    parts = (Columns(means, attrgetter("mean")), Columns(stds, attrgetter("std")), *diagnostics, observed)
     return TrackTable(TimedArticulatedTrack, parts)
 
 

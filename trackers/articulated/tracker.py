@@ -19,6 +19,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.gaussian_sum import GaussianSumState, gaussian_sum, map_component
+from jaxfilters.models.articulated.ambiguity import shows_length
 from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
@@ -80,6 +81,9 @@ class ArticulatedTrack(NamedTuple):
     least_distance: Float[Array | np.ndarray, " b"]
     """Standard deviations to the nearest limit before truncation, negative outside; infinite without limits."""
     log_evidence: Float[Array | np.ndarray, " b"]
+    length_observed: Bool[Array | np.ndarray, "b lengths"]
+    """Whether a link has lain near the image plane since the hand was found; until then its length is that of the
+    prior, of the limits and of what the model says of foreshortened links."""
     status: Int[Array | np.ndarray, " b"]
 
 
@@ -91,6 +95,8 @@ class TrackState(NamedTuple):
     """Of the last frame, seconds."""
     misses: Array
     """Frames in a row in which the hand was not visible; starts above `PATIENCE`."""
+    length_observed: Bool[Array, " lengths"]
+    """As in the track."""
     key: Array
 
 
@@ -237,7 +243,7 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     least = 1 if setup.start is not None or setup.config.variant == "published" else NUM_STARTS
     bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, least))
     misses = jnp.where(starts.found, 0, PATIENCE + 1).astype(jnp.int32)
-    return TrackState(bank, jnp.zeros((), dtype=float), misses, key)
+    return TrackState(bank, jnp.zeros((), dtype=float), misses, _none_observed(setup), key)
 
 
 def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
@@ -281,7 +287,8 @@ def _found_again(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Ar
     def search() -> TrackState:
         starts = _keypoint_starts(setup, frame)
         bank = _with_slots(setup, _starting_bank(setup, starts), capacity)
-        return _select(starts.found, TrackState(bank, time, jnp.zeros_like(state.misses), state.key), state)
+        found = TrackState(bank, time, jnp.zeros_like(state.misses), _none_observed(setup), state.key)
+        return _select(starts.found, found, state)
 
     return jax.lax.cond(state.misses > PATIENCE, search, lambda: state)
 
@@ -312,8 +319,16 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     misses = jnp.where(observed, 0, state.misses + 1).astype(jnp.int32)
     status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
     misses = jnp.where(searching, state.misses, misses)
-    track = _report(setup, bank, reported, nis, jnp.where(measured, info.log_evidence, jnp.nan), status)
-    return TrackState(bank, time, misses, key), track
+    shown = shows_length(belief_of(map_component(bank)).mean, setup.hand).ravel()
+    shown = state.length_observed | (shown & observed & (status == TRACKING))
+    log_evidence = jnp.where(measured, info.log_evidence, jnp.nan)
+    track = _report(setup, bank, reported, nis, log_evidence, status)._replace(length_observed=shown)
+    return TrackState(bank, time, misses, shown, key), track
+
+
+def _none_observed(setup: _Setup) -> Bool[Array, " lengths"]:
+    lengths = setup.hand.layout.lengths
+    return jnp.zeros(lengths.stop - lengths.start, bool)
 
 
 def _report(
@@ -321,10 +336,10 @@ def _report(
 ) -> ArticulatedTrack:
     belief = belief_of(map_component(bank))
     hand, q = setup.hand, belief.mean[setup.hand.layout.quaternion]
-    nothing = jnp.isnan(log_evidence)
+    nothing, body = jnp.isnan(log_evidence), hand.layout.body.size
     return ArticulatedTrack(
-        mean=belief.mean,
-        std=jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance), 0.0)),
+        mean=belief.mean[:body],
+        std=jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance)[:body], 0.0)),
         points=hand.points(belief.mean),
         image_points=hand.image_points(belief.mean),
         scale=jnp.sum(q * q),
@@ -334,6 +349,7 @@ def _report(
         nis_per_row=jnp.where(nothing, jnp.nan, nis),
         least_distance=jnp.where(nothing, jnp.nan, reported.least_distance),
         log_evidence=log_evidence,
+        length_observed=_none_observed(setup),
         status=status,
     )
 

@@ -14,6 +14,7 @@ from jaxfilters.models.articulated.ambiguity import (
     reversal_trigger,
     reverse_depth,
     separated_points,
+    shows_length,
     turn_link_alone,
 )
 from jaxfilters.models.articulated.hand import articulated_hand
@@ -125,6 +126,13 @@ def test_a_finger_plane_across_the_line_of_sight_has_finite_derivatives():
     x = hand_state([0, 30, 20, 10], q=q, layout=Layout(1))
     np.testing.assert_allclose(depth_mirrors(x, hand).amplitude, 0, atol=1e-12)
     assert np.all(np.isfinite(jax.jit(jax.jacfwd(lambda x: depth_mirrors(x, hand).change))(x)))
+
+
+def test_the_image_shows_lengths_of_links_near_its_plane_only():
+    hand = articulated_hand(Layout(2))
+    # Links at 19, 21 and 0 degrees to the image plane, then at -10, -50 and 5.
+    x = hand_state([0, 19, 2, -21, 0, -10, -40, 55])
+    np.testing.assert_array_equal(shows_length(x, hand), [[True, False, True], [True, False, True]])
 
 
 @pytest.mark.system

@@ -14,10 +14,12 @@ import jaxfilters
 from jaxfilters import Gaussian
 from jaxfilters.gaussian import gaussian_sum
 from jaxfilters.gaussian.constraints import expectation_propagation, linear_constraints
-from jaxfilters.gaussian.extended import condition
+from jaxfilters.gaussian.extended import Observation, condition
+from jaxfilters.gaussian.gauss_markov import GaussMarkov
 from jaxfilters.gaussian.linearize import second_order_covariance_only, taylor
 from jaxfilters.models.articulated import filters
 from jaxfilters.models.articulated.ambiguity import separated_points
+from jaxfilters.models.articulated.hand import with_lasting_errors
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.synthetic import articulated as synthetic
 
@@ -141,6 +143,36 @@ def test_the_evidence_of_a_mode_is_that_of_the_innovation_where_the_image_is_lin
 
     evidence, of_the_innovation = evidences(prior, look)
     np.testing.assert_allclose(evidence, of_the_innovation, rtol=1e-6)
+
+
+@pytest.mark.system
+def test_an_update_is_that_of_the_whole_state_linearised_at_once(x64, limits):
+    """What the image does not bend for is left out of the second derivatives, and nothing else changes."""
+    sequence = synthetic.simulate_paper(jax.random.key(0))
+    plain = synthetic.paper_hand()
+    variances = jnp.linspace(0.5, 3.0, plain.observation_std().size)
+    hand = with_lasting_errors(plain, GaussMarkov(jnp.asarray(10.0), variances))
+    n, body = hand.layout.size, LAYOUT.size
+    rng = np.random.default_rng(0)
+    mix = jnp.asarray(rng.normal(size=(n, n)))
+    mean = jnp.concatenate([sequence.states[3], jnp.asarray(rng.normal(size=n - body))])
+    prior = Gaussian(mean, 1e-4 * mix @ mix.T)
+    look = filters.FeatureObservation(sequence.features[3], sequence.masks[3], sequence.noise_std)
+
+    @jax.jit
+    def both(prior, look):
+        filter = filters.unconstrained(hand, prior, limits)
+        found, _ = filter.update(filter.params, jax.random.key(0), prior, look, None)
+        noise = jnp.diag(look.std**2)
+        observe = lambda x: plain.observe(x[:body]) + x[body:]
+        linearize = second_order_covariance_only
+        measured = Observation(look.y, look.mask, noise)
+        whole, _ = condition(prior, measured, observe, noise, linearize=linearize, residual=plain.residual)
+        return found, filters.turned(hand, prior.mean, whole)
+
+    found, expected = both(prior, look)
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-10)
 
 
 def test_a_turn_of_the_quaternion_leaves_the_scale_alone(x64, hand):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxfilters.gaussian.gauss_markov import GaussMarkov
 from jaxfilters.models.articulated.features import FULL, KEYPOINTS, PAPER_EXPERIMENT, directed_residual
-from jaxfilters.models.articulated.hand import articulated_hand
+from jaxfilters.models.articulated.hand import articulated_hand, with_lasting_errors
 from jaxfilters.models.articulated.kinematics import pivot_base, pivot_wrist
 from jaxfilters.models.articulated.layout import Layout, five_fingers, transition_matrix
 from jaxfilters.models.articulated.projection import Perspective
@@ -215,3 +216,19 @@ def test_the_comparison_is_the_one_that_was_chosen():
 def test_bad_models_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         articulated_hand(**{"layout": Layout(2), **options})
+
+
+def test_lasting_errors_stay_as_large_and_as_alike_as_they_are(x64):
+    plain = articulated_hand(Layout(1))
+    variances = jnp.linspace(0.0, 4.0, plain.observation_std().size)
+    hand = with_lasting_errors(plain, GaussMarkov(jnp.asarray(5.0), variances))
+    layout, dt = hand.layout, 2.5
+    x = jnp.arange(float(layout.size)).at[layout.quaternion].set(jnp.array([1.0, 0, 0, 0]))
+    moved = hand.transition(x, dt)
+    np.testing.assert_allclose(moved[: layout.body.size], plain.transition(x[: layout.body.size], dt), rtol=1e-12)
+    np.testing.assert_allclose(moved[layout.errors], np.exp(-0.5) * x[layout.errors], rtol=1e-12)
+    added = np.asarray(hand.process_noise(dt))[layout.errors, layout.errors]
+    np.testing.assert_allclose(np.exp(-1.0) * np.diag(variances) + added, np.diag(variances), atol=1e-12)
+    np.testing.assert_allclose(hand.observe(x) - plain.observe(x[: layout.body.size]), x[layout.errors], atol=1e-9)
+    with pytest.raises(ValueError, match="29 variances"):
+        with_lasting_errors(plain, GaussMarkov(jnp.asarray(5.0), variances[:-1]))

@@ -23,9 +23,10 @@ def test_columns_have_the_names_of_the_state_and_units():
         *(f"theta_1{joint}_rate_std_rad_per_frame" for joint in range(4)),
         *("r_11_std_px", "r_12_std_px", "r_13_std_px", "r_w_std_px", "r_h_std_px", "r_d_std_px"),
         *DIAGNOSTICS,
+        *("r_11_observed", "r_12_observed", "r_13_observed"),
     )
     five = articulated_table(five_fingers()).columns
-    assert len(five) == len(set(five)) == 2 * five_fingers().size + len(DIAGNOSTICS)
+    assert len(five) == len(set(five)) == 2 * five_fingers().size + len(DIAGNOSTICS) + 15
 
 
 def test_a_row_is_the_track_at_one_frame(perfect_track):
