@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla import last_axis
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.ensemble_analysis import Analysis, Forecast, perturbed_observations, serial, transform
 from jaxfilters.gaussian.localization import Localization
@@ -185,7 +186,7 @@ def _init(model: EnsembleKalman, key: AnyKey) -> EnsembleState:
 
 def _predict(model: EnsembleKalman, key: AnyKey, state: EnsembleState, inputs: PyTree) -> EnsembleState:
     transition = checks.checked_transition(model.sample_transition)
-    move = jax.vmap(transition, in_axes=(-1, -1, None), out_axes=-1)
+    move = last_axis.vmap(transition, in_axes=(-1, -1, None))
     return EnsembleState(move(state.noise, state.particles, inputs), model.noise(key, model.num_particles))
 
 
@@ -216,7 +217,7 @@ def _forecast(
     observed = jnp.isfinite(observation)
     # For a component that was not observed, prediction, observation and noise are set to zero and its row of R to that
     # of the identity: it then changes no particle and adds nothing to the log evidence.
-    predicted = jax.vmap(_observe(model, inputs), in_axes=-1, out_axes=-1)(mean + deviations)
+    predicted = last_axis.vmap(_observe(model, inputs))(mean + deviations)
     predicted = jnp.where(observed[:, None], predicted, 0.0)
     R = jnp.where(observed[:, None] & observed, model.R, jnp.eye(m, dtype=model.R.dtype))
     spread = predicted - jnp.mean(predicted, axis=1, keepdims=True)

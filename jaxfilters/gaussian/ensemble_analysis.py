@@ -72,11 +72,26 @@ def perturbed_observations(key: AnyKey, forecast: Forecast) -> Float[Array, "n k
         1.0
     """
     predicted, observed = forecast.predicted, forecast.observed[:, None]
-    noise = matmul(forecast.noise_root, standard_normal(key, predicted.shape, predicted.dtype))
+    noise = _colored(forecast.noise_root, standard_normal(key, predicted.shape, predicted.dtype))
     noise = jnp.where(observed, noise - jnp.mean(noise, axis=1, keepdims=True), 0.0)
     innovations = jnp.where(observed, forecast.observation[:, None] + noise - predicted, 0.0)
     x = forecast.deviations
     return forecast.mean[:, None] + x + _gained(forecast, innovations) / (predicted.shape[1] - 1)
+
+
+@jax.custom_jvp
+def _colored(root: Float[Array, "m m"], noise: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """The product of root and noise, which for uncorrelated components is a scale for each."""
+    scale = jnp.diagonal(root)
+    is_diagonal = jnp.all(root == jnp.diag(scale))
+    return jax.lax.cond(is_diagonal, lambda: scale[:, None] * noise, lambda: matmul(root, noise))
+
+
+@_colored.defjvp
+def _colored_jvp(primals, tangents):
+    # Written out, because a correlation changes the product from zero on.
+    (root, noise), (d_root, d_noise) = primals, tangents
+    return _colored(root, noise), matmul(d_root, noise) + matmul(root, d_noise)
 
 
 def _gained(forecast: Forecast, innovations: Float[Array, "m k"]) -> Float[Array, "n k"]:

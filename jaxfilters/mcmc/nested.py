@@ -6,7 +6,7 @@ Society B 75, 2013). With exact filters it is iterated batch importance sampling
 filter method for static models", Biometrika 89, 2002).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import field
 from functools import partial
 from typing import NamedTuple
@@ -41,17 +41,24 @@ class SMC2Info(NamedTuple):
     """Mean acceptance probability of the moves; NaN where there were none."""
     num_invalid: Int32[Array, " t"]
     """Number of parameters whose log evidence was NaN or `+inf`, which lost their weight, and of such proposals."""
+    filter_index: Int32[Array, " t"]
+    """Which of the filters of `filter_of` was used, from 0."""
+
+
+FilterOf = Callable[[PyTree], Filter]
 
 
 @pytree_dataclass
 class _Problem:
     sample_prior: SamplePrior
     log_prior: Callable[[PyTree], Array]
-    filter_of: Callable[[PyTree], Filter]
+    filters: tuple[FilterOf, ...]
+    """By increasing number of particles."""
     observations: PyTree
     inputs: PyTree
     mask: PyTree
     ess_threshold: ArrayLike
+    min_acceptance: ArrayLike
     num_particles: int = field(metadata={"static": True})
     num_moves: int = field(metadata={"static": True})
     constraints: tuple = field(metadata={"static": True})
@@ -62,11 +69,16 @@ class _Carry(NamedTuple):
     """With the states of the filters as `auxiliary`."""
     log_weights: Float[Array, " n"]
     status: Int32[Array, ""]
+    time: Int32[Array, ""]
+    """Of the next frame."""
+    enlarge: Bool[Array, ""]
+    """Whether the filters of this number of particles have become too inexact."""
+    info: SMC2Info
 
 
 def smc2(
     key: AnyKey,
-    filter_of: Callable[[PyTree], Filter],
+    filter_of: FilterOf | Sequence[FilterOf],
     sample_prior: SamplePrior,
     log_prior: Callable[[PyTree], Array],
     observations: PyTree,
@@ -76,6 +88,7 @@ def smc2(
     mask: Bool[Array, " t"] | None = None,
     num_moves: int = 3,
     ess_threshold: ArrayLike = 0.5,
+    min_acceptance: ArrayLike = 0.2,
     constraints: PyTree = free,
 ) -> SMCPosterior:
     """Draw parameters from their posterior after every observation, and estimate the evidence of the model.
@@ -83,11 +96,18 @@ def smc2(
     Every frame advances the filters of all parameters, which weights these. Where the effective sample size falls
     below the threshold, parameters are resampled and moved by particle marginal Metropolis-Hastings steps: a random
     walk in unconstrained coordinates with the covariance of the ensemble, and a new filter from the first frame to the
-    present one for each proposed parameter. The number of particles of the filters is fixed.
+    present one for each proposed parameter.
+
+    The longer the sequence, the less exact is the evidence of a particle filter, and the fewer moves are accepted. A
+    sequence of functions `filter_of` is a ladder of filters with ever more particles: where the acceptance of the moves
+    falls below `min_acceptance`, every parameter gets a new filter of the next kind from the first frame on, and its
+    weight is multiplied by the ratio of the new evidence to the old one (the exchange step of Chopin, Jacob and
+    Papaspiliopoulos 2013, section 3.3).
 
     Args:
         key: Random key.
-        filter_of: `theta -> Filter`: of particles, with an unbiased evidence, or an exact one.
+        filter_of: `theta -> Filter`: of particles, with an unbiased evidence, or an exact one; or a sequence of such
+            functions by increasing number of particles, usually twice as many each.
         sample_prior: `key -> theta`, or one of `jaxfilters.priors`.
         log_prior: `theta -> log p(theta)`, the density of theta itself of which `sample_prior` draws.
         observations: Pytree whose leaves have time as their first axis, (t, ...).
@@ -96,6 +116,7 @@ def smc2(
         mask: Booleans (t,), `False` for frames without an observation.
         num_moves: Number of Metropolis-Hastings steps at a time.
         ess_threshold: Move the parameters if the effective sample size is below this fraction of n; 0 never.
+        min_acceptance: Mean acceptance probability of moves, in [0, 1], below which the next filter is used.
         constraints: Constraints of `jaxfilters.fit`: one, a tree of them like theta, or a prefix of it.
 
     Returns:
@@ -103,8 +124,9 @@ def smc2(
 
     Raises:
         TypeError: If a callback is not callable.
-        ValueError: If a count is not an integer of at least 1 (2 for `num_particles`), `ess_threshold` is negative, or
-            the lengths of the sequences differ; or, where results are known, if a draw of the prior is outside the
+        ValueError: If a count is not an integer of at least 1 (2 for `num_particles`), `ess_threshold` is negative,
+            `min_acceptance` is not in [0, 1], `filter_of` is an empty sequence, or the lengths of the sequences differ;
+            or, where results are known, if a draw of the prior is outside the
             support of `log_prior` or the constraints, its density is NaN, or no parameter explains a frame. Under
             `jit` and `vmap` `status` says which.
 
@@ -120,20 +142,27 @@ def smc2(
         >>> posterior.theta.shape, posterior.info.log_evidence.shape
         ((100,), (4,))
     """
-    check_callables(filter_of=filter_of, sample_prior=sample_prior, log_prior=log_prior)
+    filters = (filter_of,) if callable(filter_of) else tuple(filter_of)
+    if not filters:
+        raise ValueError("filter_of must be a function, or a sequence of at least one; got an empty sequence.")
+    check_callables(sample_prior=sample_prior, log_prior=log_prior)
+    for function in filters:
+        check_callables(filter_of=function)
     checks.check_count("num_particles", num_particles, 2)
     checks.check_count("num_moves", num_moves)
     check_scalar("ess_threshold", ess_threshold, "a fraction of num_particles, at least 0", lambda share: share >= 0)
+    check_scalar("min_acceptance", min_acceptance, "in [0, 1]", lambda share: (share >= 0) & (share <= 1))
     checks.shared_length(observations=observations, inputs=inputs, mask=mask)
     leaves, structure = jax.tree.flatten(constraints)
     problem = _Problem(
         as_pytree(sample_prior),
         as_pytree(log_prior),
-        as_pytree(filter_of),
+        tuple(map(as_pytree, filters)),
         observations,
         inputs,
         mask,
         ess_threshold,
+        min_acceptance,
         num_particles,
         num_moves,
         (tuple(leaves), structure),
@@ -148,54 +177,94 @@ def _run(key: AnyKey, problem: _Problem) -> SMCPosterior:
     theta, chart = ensembles.prior_draws(
         prior_key, problem.sample_prior, jax.tree.unflatten(structure, leaves), problem.num_particles
     )
-    target = Target(problem.log_prior, partial(_start, problem), chart)
+    target = Target(problem.log_prior, partial(_start, problem.filters[0]), chart)
     ensemble = ensembles.points(state_key, target, theta)
     status = ensembles.status_of_start(target, ensemble)
-    start = _Carry(ensemble, weights.uniform(problem.num_particles, ensemble.log_prior.dtype), status)
+    log_weights = weights.uniform(problem.num_particles, ensemble.log_prior.dtype)
     length = checks.shared_length(observations=problem.observations)
-    times = jnp.arange(length, dtype=jnp.int32)
-    keys = jax.random.split(scan_key, length)
-    last, info = jax.lax.scan(lambda carry, given: _frame(problem, chart, carry, *given), start, (times, keys))
-    return SMCPosterior(last.ensemble.theta, last.log_weights, jnp.sum(info.log_evidence), info, last.status)
+    carry = _Carry(ensemble, log_weights, status, jnp.int32(0), jnp.zeros((), bool), _no_info(length, log_weights))
+    for i, filter_of in enumerate(problem.filters):
+        if i > 0:
+            carry = _exchanged(jax.random.fold_in(scan_key, length + i), problem, filter_of, chart, carry)
+        is_last = i == len(problem.filters) - 1
+        carry = jax.lax.while_loop(
+            lambda carry, is_last=is_last: (carry.time < length) & (is_last | ~carry.enlarge),
+            lambda carry, i=i: _frame(problem, i, chart, carry, jax.random.fold_in(scan_key, carry.time)),
+            carry,
+        )
+    evidence = jnp.sum(carry.info.log_evidence)
+    return SMCPosterior(carry.ensemble.theta, carry.log_weights, evidence, carry.info, carry.status)
 
 
-def _start(problem: _Problem, key: AnyKey, theta: PyTree) -> tuple[Array, PyTree]:
+def _no_info(length: int, like: Array) -> SMC2Info:
+    zeros, counts = jnp.zeros(length, like.dtype), jnp.zeros(length, jnp.int32)
+    return SMC2Info(zeros, zeros, jnp.zeros(length, bool), zeros, counts, counts)
+
+
+def _start(filter_of: FilterOf, key: AnyKey, theta: PyTree) -> tuple[Array, PyTree]:
     """The log evidence of no observations, and the state before the first."""
-    return jnp.zeros(()), filters.init(problem.filter_of(theta), key)
+    return jnp.zeros(()), filters.init(filter_of(theta), key)
 
 
-def _advance(problem: _Problem, key: AnyKey, theta: PyTree, state: PyTree, time: Array) -> tuple[Array, PyTree]:
+def _exchanged(key: AnyKey, problem: _Problem, filter_of: FilterOf, chart, carry: _Carry) -> _Carry:
+    """Parameters with other filters of the frames before the present one, and the weights that this gives them."""
+    old = carry.ensemble
+    target = Target(problem.log_prior, partial(_until, problem, filter_of, carry.time), chart)
+    # Without frames to come nothing is needed but the shapes.
+    start = Target(problem.log_prior, partial(_start, filter_of), chart)
+    is_needed = carry.enlarge & (carry.time < carry.info.moved.shape[0])
+    new = jax.lax.cond(
+        is_needed,
+        lambda: ensembles.points(key, target, old.theta),
+        lambda: ensembles.points(key, start, old.theta),
+    )
+    # The mean of the ratios belongs to the estimate of the evidence, which it keeps unbiased.
+    ratio = new.log_likelihood - old.log_likelihood
+    ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
+    log_weights, log_mean = weights.normalize(carry.log_weights + ratio)
+    info = carry.info._replace(log_evidence=carry.info.log_evidence.at[carry.time - 1].add(log_mean))
+    kept = carry._replace(ensemble=new._replace(theta=old.theta), enlarge=jnp.zeros((), bool))
+    return kept._replace(
+        log_weights=jnp.where(is_needed, log_weights, carry.log_weights),
+        info=jax.tree.map(partial(jnp.where, is_needed), info, carry.info),
+    )
+
+
+def _advance(
+    problem: _Problem, filter_of: FilterOf, key: AnyKey, theta: PyTree, state: PyTree, time: Array
+) -> tuple[Array, PyTree]:
     """Log evidence of one frame, and the state after it."""
     frame = jax.tree.map(lambda leaf: leaf[time][None], (problem.observations, problem.inputs, problem.mask))
     observations, inputs, mask = frame
-    filter = problem.filter_of(theta)
+    filter = filter_of(theta)
     state, info = filters.run(filter, key, observations, inputs, mask=mask, state=state, collect=filters.keep_info)
     return info.log_evidence[0], state
 
 
-def _until(problem: _Problem, time: Array, key: AnyKey, theta: PyTree) -> tuple[Array, PyTree]:
-    """Log evidence of all frames up to one, by a new filter, and its state."""
+def _until(problem: _Problem, filter_of: FilterOf, time: Array, key: AnyKey, theta: PyTree) -> tuple[Array, PyTree]:
+    """Log evidence of all frames before one, by a new filter, and its state."""
     init_key, key = jax.random.split(key)
 
     def advance(frame: Array, carry: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
         total, state = carry
-        log_evidence, state = _advance(problem, jax.random.fold_in(key, frame), theta, state, frame)
+        log_evidence, state = _advance(problem, filter_of, jax.random.fold_in(key, frame), theta, state, frame)
         return total + log_evidence, state
 
-    return jax.lax.fori_loop(0, time + 1, advance, _start(problem, init_key, theta))
+    return jax.lax.fori_loop(0, time, advance, _start(filter_of, init_key, theta))
 
 
-def _frame(problem: _Problem, chart, carry: _Carry, time: Array, key: AnyKey) -> tuple[_Carry, SMC2Info]:
+def _frame(problem: _Problem, filter_index: int, chart, carry: _Carry, key: AnyKey) -> _Carry:
     filter_key, move_key = jax.random.split(key)
-    n, ensemble = problem.num_particles, carry.ensemble
-    advance = jax.vmap(partial(_advance, problem), in_axes=(0, -1, -1, None), out_axes=-1)
+    n, ensemble, time = problem.num_particles, carry.ensemble, carry.time
+    filter_of = problem.filters[filter_index]
+    advance = jax.vmap(partial(_advance, problem, filter_of), in_axes=(0, -1, -1, None), out_axes=-1)
     increments, states = advance(jax.random.split(filter_key, n), ensemble.theta, ensemble.auxiliary, time)
     invalid = jnp.isnan(increments) | jnp.isposinf(increments)
     increments = jnp.where(invalid, -jnp.inf, increments)
     log_weights, log_evidence = weights.normalize(carry.log_weights + increments)
     size = weights.effective_sample_size(log_weights)
     ensemble = ensemble._replace(log_likelihood=ensemble.log_likelihood + increments, auxiliary=states)
-    target = Target(problem.log_prior, partial(_until, problem, time), chart)
+    target = Target(problem.log_prior, partial(_until, problem, filter_of, time + 1), chart)
 
     def move() -> tuple[Point, Array, Array, Array]:
         return _moved(move_key, problem, target, ensemble, log_weights)
@@ -208,7 +277,9 @@ def _frame(problem: _Problem, chart, carry: _Carry, time: Array, key: AnyKey) ->
     hopeless = (log_evidence == -jnp.inf) & (carry.status == SMCStatus.FINISHED)
     status = jnp.where(hopeless, SMCStatus.NO_WEIGHT, carry.status).astype(jnp.int32)
     num_invalid = jnp.sum(invalid, dtype=jnp.int32) + num_rejected
-    return _Carry(ensemble, after, status), SMC2Info(log_evidence, size, uneven, acceptance, num_invalid)
+    new = SMC2Info(log_evidence, size, uneven, acceptance, num_invalid, jnp.int32(filter_index))
+    info = jax.tree.map(lambda of_all, value: of_all.at[time].set(value), carry.info, new)
+    return _Carry(ensemble, after, status, time + 1, uneven & (acceptance < problem.min_acceptance), info)
 
 
 def _moved(

@@ -151,3 +151,22 @@ def test_lorenz_96_is_followed_with_the_published_error():
     assert 0.12 < error < 0.25
     few = lorenz.build(problem, 10, lorenz.RADIUS, analysis=jf.ensemble.serial, inflation=1.03)
     assert lorenz.rmse(few, KEY, problem, 100) < 0.35
+
+
+def test_a_correlation_of_the_noise_has_its_derivative_where_it_is_zero(x64):
+    # Uncorrelated noise is scaled, not multiplied by a matrix; differences say what a correlation changes.
+    predicted = jax.random.normal(jax.random.key(0), (2, 30))
+
+    def moved(correlation):
+        R = jnp.array([[1.0, correlation], [correlation, 2.0]])
+        spread = predicted - predicted.mean(axis=1, keepdims=True)
+        root = jnp.linalg.cholesky(spread @ spread.T / 29 + R)
+        forecast = jf.ensemble.Forecast(
+            jnp.zeros(2), spread, predicted, jnp.ones(2), jnp.ones(2, bool), R, jnp.linalg.cholesky(R), root, None
+        )
+        return jf.ensemble.perturbed_observations(jax.random.key(1), forecast)
+
+    step = 1e-5
+    differences = (moved(step) - moved(-step)) / (2 * step)
+    np.testing.assert_allclose(jax.jacfwd(moved)(0.0), differences, atol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(lambda c: moved(c).sum())(0.0), differences.sum(), atol=1e-5)

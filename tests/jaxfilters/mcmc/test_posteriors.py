@@ -117,6 +117,7 @@ def draws_of_chain(name, key, ys):
     return jnp.log(theta["q"][:, 0]), jnp.zeros(()), jnp.zeros((), int)
 
 
+LADDER = tuple(partial(particle_filter_of, num_particles=count) for count in (2, 16))
 TEMPERATURES = (0.05, 0.25, 1.0)
 PROBLEM = {"num_particles": 64, "constraints": jf.fit.positive}
 
@@ -133,6 +134,10 @@ def smc(name, key, ys):
         return run(key, sample_prior, log_prior, likelihood, temperatures=temperatures, **options, **PROBLEM)
     if name == "smc2":
         return jf.mcmc.smc2(key, particle_filter_of, sample_prior, log_prior, ys, num_moves=2, **PROBLEM)
+    if name == "smc2_growing":
+        # The first move is followed by an exchange.
+        options = {"min_acceptance": 1.0, "num_moves": 2}
+        return jf.mcmc.smc2(key, LADDER, sample_prior, log_prior, ys, **options, **PROBLEM)
     return jf.mcmc.smc2(key, kalman_of, sample_prior, log_prior, ys[:, None], num_moves=2, **PROBLEM)
 
 
@@ -152,7 +157,8 @@ def check_within_error(values, expected):
 
 
 SAMPLERS = {name: partial(draws_of_chain, name) for name in CHAINS}
-SAMPLERS |= {name: partial(draws_of_smc, name) for name in ("tempered", "waste_free", "smc2", "iterated_importance")}
+SMC = ("tempered", "waste_free", "smc2", "smc2_growing", "iterated_importance")
+SAMPLERS |= {name: partial(draws_of_smc, name) for name in SMC}
 
 
 @pytest.mark.system
@@ -174,6 +180,24 @@ def test_samplers_have_the_posterior_of_quadrature_and_are_calibrated(name):
     ranks = np.sum(np.asarray(z) < np.log(np.asarray(truths["q"]))[:, None], axis=1)
     counts = np.bincount(ranks * BINS // (DRAWS + 1), minlength=BINS)
     assert stats.chisquare(counts).pvalue > 1e-3
+
+
+@pytest.mark.system
+def test_filters_grow_where_few_moves_are_accepted():
+    """As often as there are larger ones, after moves; never with a threshold of zero, which is one filter alone."""
+    ys = jnp.tile(YS, 3)
+    run = lambda filter_of, share: jf.mcmc.smc2(
+        KEY, filter_of, sample_prior, log_prior, ys, num_moves=2, min_acceptance=share, **PROBLEM
+    )
+    alone, never, grown = run(LADDER[0], 1.0), run(LADDER, 0.0), run(LADDER, 1.0)
+    np.testing.assert_array_equal(alone.theta["q"], never.theta["q"])
+    np.testing.assert_array_equal(alone.info.log_evidence, never.info.log_evidence)
+    assert not np.asarray(never.info.filter_index).any()
+    steps = np.diff(np.asarray(grown.info.filter_index))
+    assert grown.info.filter_index[-1] == 1
+    np.testing.assert_array_equal(steps, np.asarray(grown.info.moved)[:-1] & (np.cumsum(grown.info.moved)[:-1] <= 1))
+    with pytest.raises(ValueError, match="filter_of must be a function, or a sequence of at least one"):
+        run((), 0.2)
 
 
 @pytest.mark.system
