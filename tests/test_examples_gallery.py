@@ -10,6 +10,8 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 SCRIPTS = sorted((DOCS / "examples").glob("*.py"))
+LONG = {"bearings_only", "neural_observation", "stochastic_volatility"}
+"""Which run for longer than they compile."""
 LARGEST_PICTURE = 80 * 1024
 
 
@@ -19,9 +21,11 @@ def stated(script):
     return [float(number) for number in re.findall(r"\*\*(-?[\d.]+)\*\*", first.partition("**Result:**")[2])]
 
 
-@pytest.mark.optimised
 @pytest.mark.system
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(path, marks=[pytest.mark.optimised] * (path.stem in LONG), id=path.stem) for path in SCRIPTS],
+)
 def test_a_script_computes_what_it_states(script, tmp_path, monkeypatch):
     """Random numbers are the same everywhere; 10 percent are left to the rounding of other processors."""
     matplotlib = pytest.importorskip("matplotlib", reason="the pictures need the extra viz")

@@ -49,6 +49,33 @@ class HandTrack(NamedTuple):
     """Index into `STATUS_NAMES`."""
 
 
+def checked_times(times_s: Any, count: int | None = None) -> np.ndarray:
+    """The times of a recording in seconds, as float64.
+
+    Args:
+        times_s: One for each frame.
+        count: Of the frames; None where that is not known yet.
+
+    Raises:
+        ValueError: There are none, more or fewer than frames, or they are not finite and strictly increasing.
+    """
+    seconds = np.asarray(times_s, float)
+    if seconds.ndim != 1 or not len(seconds) or count not in (None, len(seconds)):
+        frames = "at least one frame" if count is None else f"each of {count} frames, at least one"
+        raise ValueError(f"times_s: expected one for {frames}; got shape {seconds.shape}.")
+    wrong = np.flatnonzero(~np.isfinite(seconds))
+    if len(wrong):
+        raise ValueError(f"times_s: expected finite seconds; got {seconds[wrong[0]]} for frame {wrong[0]}.")
+    wrong = np.flatnonzero(np.diff(seconds) <= 0)
+    if len(wrong):
+        before, after = seconds[wrong[0] : wrong[0] + 2]
+        raise ValueError(
+            f"times_s: expected strictly increasing seconds; got {before:.6f} for frame {wrong[0]}, "
+            f"{after:.6f} for frame {wrong[0] + 1}."
+        )
+    return seconds
+
+
 def step_chunk(tracker: Tracker, state: Any, frames: Sequence[Any], times_s: np.ndarray) -> tuple[Any, Any]:
     """State and track after at most `CHUNK` frames, by the one program that serves every chunk.
 
@@ -89,9 +116,9 @@ def track_frames(tracker: Tracker, key: Array, frames: Iterable[Any], times_s: n
         The track as NumPy arrays, the frame axis first.
 
     Raises:
-        ValueError: There are no frames, or more or fewer than times.
+        ValueError: There are no frames, or more or fewer than times, or see `checked_times`.
     """
-    source, since, parts, done = iter(frames), np.asarray(times_s, float), [], 0
+    source, since, parts, done = iter(frames), checked_times(times_s), [], 0
     state = None
     while chunk := list(islice(source, CHUNK)):
         if done + len(chunk) > len(since):

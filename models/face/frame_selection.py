@@ -39,10 +39,10 @@ def by_angles(
     return jnp.argmax(jnp.where(best, ages, -1)), jnp.max(spreads)
 
 
-def by_information(
+def information_gain(
     information: Float[Array, "n d d"], new: Float[Array, "d d"], prior: Float[Array, "d d"], may_go: Bool[Array, " n"]
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The frame that the new one replaces for the least uncertainty of who it is, and what is gained, in nats.
+    """The frame that the new one replaces for the least uncertainty of the identity, and what is gained, in nats.
 
     The gain is half the growth of the log determinant of the information; where it is not positive the frames so far
     tell more than any set with the new one.

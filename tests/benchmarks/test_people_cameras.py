@@ -95,7 +95,7 @@ def test_scores_are_of_all_seeds_together(monkeypatch, capsys):
 @pytest.mark.usefixtures("half_size")
 def test_nobody_is_lost_between_four_cameras(monkeypatch):
     monkeypatch.setattr(people_cameras, "SETUPS", {name: SETUPS[name] for name in ("_narrow", "_rates")})
-    tracks = people_cameras.room_tracks(1, 120)
+    tracks = people_cameras.room_tracks(1, 80)
     for suffix, (true, found) in tracks.items():
         scores = people_cameras.evaluate(true, found)
         assert scores.id_switches == 0, suffix

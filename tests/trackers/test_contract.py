@@ -17,11 +17,15 @@ from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.registry import SYSTEMS
 from jaxfilters.trackers.tracker import STATUS_WORDS
 
-OPTIONS = dict.fromkeys(("head-stereo", "head-mono", "people", "fingertips"), ("--seconds", "3"))
-"""That shorten the synthetic recordings."""
+OPTIONS = {
+    **dict.fromkeys(("head-stereo", "head-mono", "fingertips"), ("--seconds", "1.5")),
+    "people": ("--seconds", "3"),
+    "hand-depth": ("--particles", "64"),
+}
+"""That shorten the synthetic recordings, or have the programs of other tests serve here."""
 FILES = {"track.csv", "track.npz", "report.json", "summary.png", "checkpoint"}
 """Of every run; `overlay.mp4` is drawn unless `--no-video` is given."""
-HAND_FRAMES = 40
+HAND_FRAMES = 24
 """Of the depth recording, which no option shortens."""
 
 

@@ -22,6 +22,8 @@ from jaxfilters.trackers.tracker import STATUS_NAMES, Tracker
 
 Errors = dict[str, float | None]
 """Errors against the truth by name, with units in the names; None where no truth is known."""
+_SHOWN = {"m": (1000.0, "mm"), "rad": (math.degrees(1.0), "degrees")}
+"""Factors and units in which a person reads what a report holds in metres and radians."""
 
 
 class RunSpec(NamedTuple):
@@ -142,6 +144,7 @@ def _summary(report: dict[str, Any], errors: Errors, options: argparse.Namespace
 
 
 def _in_words(name: str, value: float) -> str:
-    """`mean joint error 1.5 mm` of `mean_joint_error_mm`."""
+    """`mean joint error 1.5 mm` of `mean_joint_error_m`, as people read lengths and angles."""
     *words, unit = name.split("_")
-    return f"{' '.join(words)} {value:.1f} {unit}"
+    factor, shown = _SHOWN.get(unit, (1.0, unit))
+    return f"{' '.join(words)} {factor * value:.1f} {shown}"

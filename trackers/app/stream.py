@@ -15,7 +15,7 @@ from jaxfilters.trackers.app.rerun_log import RerunLog, open_log
 from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, TrackTable, open_writer
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.io.errors import InputError, OutputError
-from jaxfilters.trackers.io.video_input import Moment, VideoSource, continued
+from jaxfilters.trackers.io.video_input import FrameSet, VideoSource, continued
 
 _MOST_COSTS = 10_000
 """Times of the session that count for their median; the last ones, so that a long run needs no more memory."""
@@ -30,15 +30,15 @@ class Session(Protocol):
         """What is followed now, in a few words."""
         ...
 
-    def is_due(self, waiting: Sequence[Moment]) -> bool:
+    def is_due(self, waiting: Sequence[FrameSet]) -> bool:
         """Whether these moments are to be processed now; otherwise one more is waited for."""
         ...
 
-    def process(self, moments: Sequence[Moment]) -> Any:
+    def process(self, moments: Sequence[FrameSet]) -> Any:
         """The rows that these moments add to the table, with the fields of its track."""
         ...
 
-    def pictures(self, moments: Sequence[Moment], rows: Any) -> Iterable[np.ndarray]:
+    def pictures(self, moments: Sequence[FrameSet], rows: Any) -> Iterable[np.ndarray]:
         """A picture (rows, cols, 3) uint8 for each of the moments that were processed last."""
         ...
 
@@ -55,7 +55,7 @@ class StreamSpec(NamedTuple):
     """What one command follows, and with what."""
 
     sources: Sequence[VideoSource]
-    moments: Iterable[Moment]
+    moments: Iterable[FrameSet]
     """From the first one."""
     trouble: Callable[[], list[str]]
     """What went wrong with the sources, for a person."""
@@ -74,7 +74,8 @@ class RunResult(NamedTuple):
     """Reading, drawing and writing included, without what was processed first, which compiles; NaN if that was all."""
     tracking_ms: float
     """Median time of the session alone, milliseconds a frame; NaN where all of it compiled."""
-    interrupted: bool
+    interrupt: KeyboardInterrupt | None
+    """Ctrl-C or SIGTERM, which ended the run."""
     failure: InputError | None
     """A source that could not be read any further."""
     trouble: list[str]
@@ -120,18 +121,18 @@ class StreamRun:
         self._costs: deque[float] = deque(maxlen=_MOST_COSTS)
 
     def follow(self) -> RunResult:
-        """Track until the sources end, the time is over, or Ctrl-C.
+        """Track until the sources end, the time is over, or Ctrl-C or SIGTERM, which the result tells.
 
         Raises:
             InputError: nothing could be read.
             OutputError: the results cannot be written.
             KeyboardInterrupt: before anything was tracked.
         """
-        interrupted = False
+        interrupt: KeyboardInterrupt | None = None
         try:
             self._take()
-        except KeyboardInterrupt:
-            interrupted = True
+        except KeyboardInterrupt as error:
+            interrupt = error
         finally:
             if self._video is not None:
                 self._video.close()
@@ -139,25 +140,33 @@ class StreamRun:
             self._video.check()
         trouble = self.spec.trouble()
         if not self.writer.frames:
-            if interrupted:
-                raise KeyboardInterrupt(self.writer.kept())
+            if interrupt is not None:
+                raise type(interrupt)(self.writer.kept())
             raise self._failure or InputError("; ".join(trouble or ["the sources hold no images"]) + ".")
         seconds = self._ends[-1][0] - self._ends[0][0] if self._ends else 0.0
         rate = (self._ends[-1][1] - self._ends[0][1]) / seconds if seconds else math.nan
         costs = [cost for cost in self._costs if not math.isnan(cost)]
         cost = float(np.median(costs)) if costs else math.nan
-        return RunResult(rate, 1000 * cost, interrupted, self._failure, trouble)
+        return RunResult(rate, 1000 * cost, interrupt, self._failure, trouble)
 
-    def conclude(self, result: RunResult) -> None:
-        """Say what went wrong on the way.
+    def conclude(self, result: RunResult, summary: str) -> str:
+        """Say what went wrong on the way; the summary of a run that ended by itself.
+
+        Args:
+            result: Of `follow`, whose results are written by now.
+            summary: A few lines for a person.
 
         Raises:
             InputError: a source could not be read to its end.
+            KeyboardInterrupt: as the run was, with what is kept and the summary as its text.
         """
         for trouble in result.trouble:
             warn(trouble)
         if result.failure is not None:
             raise InputError(f"{str(result.failure).removesuffix('.')}; {self.writer.kept()}.")
+        if result.interrupt is not None:
+            raise type(result.interrupt)(f"{self.writer.kept()}\n{summary}")
+        return summary
 
     def close(self) -> None:
         """Let other runs write into the folder."""
@@ -166,7 +175,7 @@ class StreamRun:
         self.writer.close()
 
     def _take(self) -> None:
-        waiting: list[Moment] = []
+        waiting: list[FrameSet] = []
         with ProgressLine("tracking", self.spec.frames, done=self._first) as line:
             for moment in self._readable():
                 waiting.append(moment)
@@ -184,14 +193,14 @@ class StreamRun:
         if self._failure is None:
             self._checkpoint(complete=True)
 
-    def _readable(self) -> Iterator[Moment]:
+    def _readable(self) -> Iterator[FrameSet]:
         """The moments after the last checkpoint, up to the first that cannot be read."""
         try:
             yield from continued(iter(self.spec.moments), self.spec.sources, self._first, self._last_s)
         except InputError as error:
             self._failure = error
 
-    def _advance(self, moments: Sequence[Moment]) -> None:
+    def _advance(self, moments: Sequence[FrameSet]) -> None:
         began = time.perf_counter()
         rows = self.spec.session.process(moments)
         self._costs.append((time.perf_counter() - began) / len(moments) if self._ends else math.nan)

@@ -73,7 +73,7 @@ def _errors(
 ) -> dict[str, float | None]:
     errors = errors_of(sequence, hand.layout, results)
     return {
-        "mean_angle_error_deg": None if errors is None else round(errors.angle_deg, 3),
+        "mean_angle_error_rad": None if errors is None else round(float(np.deg2rad(errors.angle_deg)), 5),
         "mean_length_error_px": None if errors is None else round(errors.length_px, 3),
         "lengths_within_2_sigma_percent": None if errors is None else round(100 * errors.within_2_sigma, 1),
     }

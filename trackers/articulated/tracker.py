@@ -6,7 +6,7 @@ Image Sequence Based on Loose Constraints". The filters are those of `jaxfilters
 
 import math
 from collections.abc import Callable
-from dataclasses import field
+from dataclasses import field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -49,7 +49,7 @@ from jaxfilters.trackers.articulated.recording import (
     keypoint_noise,
 )
 from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
-from jaxfilters.trackers.tracker import Tracker, track_frames
+from jaxfilters.trackers.tracker import Tracker, checked_times, track_frames
 
 SEARCHING, TRACKING, LOST = range(3)
 LOST_NIS = 25.0
@@ -109,6 +109,10 @@ class _Setup:
     start: Start | None
     config: ArticulatedConfig = field(metadata={"static": True})
 
+    def compiled(self) -> "_Setup":
+        """The same for compiled functions, which serve all seeds."""
+        return replace(self, config=replace(self.config, seed=0))
+
 
 def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> ArticulatedHand:
     """The model of the hand that the features are of: five fingers move about their angles at ease.
@@ -167,12 +171,11 @@ def track(
         The track as NumPy arrays, the frame axis first.
 
     Raises:
-        ValueError: as for `from_keypoints` and `build`.
+        ValueError: as for `checked_times`, `from_keypoints` and `build`.
     """
     points = np.asarray(keypoints, float)
-    sequence = from_keypoints(
-        np.asarray(times_s, float), points, "keypoints", confidence=confidence, image_shape=image_shape
-    )
+    seconds = checked_times(times_s, len(points))
+    sequence = from_keypoints(seconds, points, "keypoints", confidence=confidence, image_shape=image_shape)
     return track_sequence(sequence, config)
 
 
@@ -235,15 +238,21 @@ def _starting_bank(setup: _Setup, starts: Starts) -> GaussianSumState:
 
 def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     """State before the first frame: what is given, or hypotheses from its keypoints; searching where it has too few."""
+    bank, found = _first_bank(setup.compiled(), jax.tree.map(jnp.asarray, frame))
+    misses = jnp.where(found, 0, PATIENCE + 1).astype(jnp.int32)
+    return TrackState(bank, jnp.zeros((), dtype=float), misses, _none_observed(setup), key)
+
+
+@jax.jit
+def _first_bank(setup: _Setup, frame: FeatureFrame) -> tuple[GaussianSumState, Array]:
+    """The hypotheses before the first frame, and whether there is any."""
     if setup.start is not None:
         starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.zeros(1), jnp.ones((), bool))
     else:
-        starts = _keypoint_starts(setup, jax.tree.map(jnp.asarray, frame))
+        starts = _keypoint_starts(setup, frame)
     slots = setup.config.hypotheses if setup.config.variant == "recommended" else 1
     least = 1 if setup.start is not None or setup.config.variant == "published" else NUM_STARTS
-    bank = _with_slots(setup, _starting_bank(setup, starts), max(slots, least))
-    misses = jnp.where(starts.found, 0, PATIENCE + 1).astype(jnp.int32)
-    return TrackState(bank, jnp.zeros((), dtype=float), misses, _none_observed(setup), key)
+    return _with_slots(setup, _starting_bank(setup, starts), max(slots, least)), starts.found
 
 
 def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
@@ -267,7 +276,7 @@ def _advance(
     setup: _Setup, state: TrackState, frames: FeatureFrame, times: np.ndarray
 ) -> tuple[TrackState, ArticulatedTrack]:
     """Track a chunk of frames."""
-    return _scan(setup, state, jax.tree.map(jnp.asarray, frames), jnp.asarray(times, dtype=float))
+    return _scan(setup.compiled(), state, jax.tree.map(jnp.asarray, frames), jnp.asarray(times, dtype=float))
 
 
 @jax.jit

@@ -150,7 +150,7 @@ class Batch:
             one.process.communicate()  # closes its standard input
             code, report = one.process.returncode, report_of(self._folder(one.entry))
             ended_early = code < 0 or code in (128 + signal.SIGINT, 128 + signal.SIGTERM)
-            if ended_early or (code == 0 and report.get("interrupted")):
+            if ended_early:
                 self._claims.release(one.claim, counts=not stopping)
                 if not stopping:
                     note(f"{one.entry.name}: its process was ended ({_in_words(code)})")

@@ -27,7 +27,7 @@ from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 
 
 def track(options: argparse.Namespace) -> str:
@@ -36,7 +36,7 @@ def track(options: argparse.Namespace) -> str:
     Raises:
         InputError: the source, a file or an option cannot be used. What was tracked before is written.
         OutputError: the results cannot be written.
-        KeyboardInterrupt: before anything was tracked.
+        KeyboardInterrupt: with what is kept as its text; what was tracked before is written.
     """
     check_unused(options)
     symbols = _symbols(options.gestures)
@@ -88,8 +88,7 @@ def _tracked(
     report = _report(source, user, session, stream.tally, result, options, time.perf_counter() - began)
     run.writer.finish(report, status_names=np.asarray(STATUS))
     write_summary(options.out / "summary.png", run.writer.results, stream.tally, session.events, source.image_size)
-    run.conclude(result)
-    return format_report(report, options)
+    return run.conclude(result, format_report(report, options))
 
 
 def recogniser_of(file: SymbolsFile) -> Recogniser:
@@ -135,13 +134,13 @@ def _identity(source: Any, options: argparse.Namespace) -> dict[str, Any]:
     return {"input": source.name, "image_size": size, "fps": rate, "version": version("jaxfilters"), **given}
 
 
-def _moments(source: Any, seconds: float | None) -> Iterator[Moment]:
+def _moments(source: Any, seconds: float | None) -> Iterator[FrameSet]:
     """Those with an image; a live camera may have none when the time is over."""
     first = None
     for time_s, image in source.images():
         first = time_s if first is None else first
         if image is not None:
-            yield Moment(time_s - first, (image,))
+            yield FrameSet(time_s - first, (image,))
         if seconds and time_s - first >= seconds:
             return
 
@@ -167,7 +166,7 @@ def _report(
         "events": dict(Counter(f"{event.name} {event.phase}" for event in session.events)),
         "mean_error_px": finite(tally.mean_error_px),
         "share_of_right_counts": finite(float(right)),
-        "interrupted": result.interrupted,
+        "interrupted": result.interrupt is not None,
         "trouble": result.trouble,
         "open_hand": user.has_open_hand,
         "hand": dataclasses.asdict(user.parameters),

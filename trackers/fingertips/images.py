@@ -23,6 +23,7 @@ from jaxfilters.trackers.fingertips.events import Event, Recogniser
 from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, hands_of, parameters_of
 from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
 from jaxfilters.trackers.fingertips.state import FingertipConfig, HandReport
+from jaxfilters.trackers.tracker import checked_times
 
 OPEN_HAND_IMAGES = 60
 """Images in which an open hand is looked for before a recording is followed."""
@@ -66,7 +67,7 @@ def track(
 
     Args:
         images: (rows, cols) or (rows, cols, 3) uint8, or depths in metres; some of the first show an open hand.
-        times_s: Seconds, growing evenly.
+        times_s: Seconds, strictly increasing, evenly.
         mask: How hands differ from the desk: they are brighter (`infrared`), above it (`depth`), or have the colour of
             skin (`colour`).
         config: Constants of the tracker.
@@ -77,22 +78,23 @@ def track(
         The reports, (frames, hands, ...) on the host, and the events in their order.
 
     Raises:
-        ValueError: There are fewer than two images, more or fewer than times, an unknown mask, or no image in which a
-            hand differs from the desk.
+        ValueError: There are fewer than two images, an unknown mask, or no image in which a hand differs from the desk;
+            or as for `checked_times`.
     """
-    if len(images) < 2 or len(images) != len(times_s):
-        raise ValueError(f"times_s: expected one for each of two or more images; got {len(times_s)} and {len(images)}.")
+    seconds = checked_times(times_s, len(images))
+    if len(images) < 2:
+        raise ValueError("images: expected two or more; got one.")
     user = estimate_user(images[:: max(1, len(images) // OPEN_HAND_IMAGES)], mask)
     session = FingertipSession(
         angles_of(user),
         handedness=user.parameters.handedness,
         num_hands=num_hands,
         height=float(images[0].shape[0]),
-        fps=float(1 / np.median(np.diff(times_s))),
+        fps=float(1 / np.median(np.diff(seconds))),
         config=config or USUAL,
         recogniser=recogniser,
     )
-    seconds = np.asarray(times_s, float) - float(times_s[0])
+    seconds = seconds - seconds[0]
     reports = [session.process(hands_in(image, user, num_hands), seconds[i : i + 1]) for i, image in enumerate(images)]
     session.finish()
     return jax.tree.map(lambda *rows: np.concatenate(rows), *reports), session.events

@@ -14,7 +14,7 @@ from jaxfilters.trackers.fingertips.session import FingertipSession
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.fingertips.table import TimedTips, tip_rows
 from jaxfilters.trackers.fingertips.tally import Tally
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 
 
 class FingertipStream:
@@ -42,11 +42,11 @@ class FingertipStream:
         """How many fingertips there are."""
         return f"{0 if self._report is None else int(self._report.num_tips.sum())} fingertips"
 
-    def is_due(self, waiting: Sequence[Moment]) -> bool:
+    def is_due(self, waiting: Sequence[FrameSet]) -> bool:
         """Every image is processed when it comes."""
         return bool(waiting)
 
-    def process(self, moments: Sequence[Moment]) -> TimedTips:
+    def process(self, moments: Sequence[FrameSet]) -> TimedTips:
         """A row for every fingertip."""
         ((time_s, (image,)),) = moments
         found = self._session.process(self._observe(image), np.array([time_s]))
@@ -57,7 +57,7 @@ class FingertipStream:
         self.tally = self.tally.add(time_s, self._report, truth)
         return rows
 
-    def pictures(self, moments: Sequence[Moment], rows: TimedTips) -> Iterable[np.ndarray]:  # noqa: ARG002
+    def pictures(self, moments: Sequence[FrameSet], rows: TimedTips) -> Iterable[np.ndarray]:  # noqa: ARG002
         """The image with fingertips and events."""
         ((time_s, (image,)),) = moments
         assert self._report is not None

@@ -62,7 +62,7 @@ def _synthetic(seed: int) -> DepthSequence:
 
 def _errors(sequence: DepthSequence, results: TimedHandTrack) -> dict[str, float | None]:
     error = mean_joint_error(sequence, results)
-    return {"mean_joint_error_mm": None if error is None else round(1000 * error, 2)}
+    return {"mean_joint_error_m": None if error is None else round(error, 5)}
 
 
 def _draw_summary(sequence: DepthSequence, path: Path, results: TimedHandTrack) -> None:

@@ -112,6 +112,10 @@ class Setup:
     config: HandDepthConfig = field(metadata={"static": True})
     stride: int | None = field(metadata={"static": True})
 
+    def compiled(self) -> "Setup":
+        """The same for compiled functions: without the options that only the host reads, they serve all of these."""
+        return replace(self, config=replace(self.config, seed=0, hand="auto", scale=None, missing="auto"))
+
     def spacing(self, depth: Float[Array, ""]) -> int | Float[Array, ""]:
         """Pixels of the frame for one of the window about a hand at `depth` metres."""
         return window_stride(self.camera, depth, WINDOW[1]) if self.stride is None else self.stride

@@ -47,7 +47,7 @@ def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> T
     """
     starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
     for sighting in hand_sightings(setup.camera, image):
-        camera, window = _cropped(setup, jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
+        camera, window = _cropped(setup.compiled(), jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
         starts += find_starts(camera, window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
     wanted = [start for start in starts if not start.side * float(state.side) < 0]
     found = min(wanted, key=lambda start: start.cost, default=None)
@@ -69,7 +69,7 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     if int(state.misses) or not (np.isfinite(palm).all() and palm[2] > NEAREST):
         return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
     image = filled(jnp.asarray(frame), state.missing_is_background)
-    camera, window = _cropped(setup, image, jnp.asarray(palm))
+    camera, window = _cropped(setup.compiled(), image, jnp.asarray(palm))
     average = setup.likelihood.geometry
     track = registered(camera, window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
@@ -101,7 +101,9 @@ def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bo
         misses=jnp.zeros_like(state.misses),
         key=key,
     )
-    return state._replace(ensemble=placed(place_key, setup, jnp.asarray(found.pose), state.scale, state.side))
+    return state._replace(
+        ensemble=placed(place_key, setup.compiled(), jnp.asarray(found.pose), state.scale, state.side)
+    )
 
 
 def _sizes(state: TrackState) -> tuple[float, ...]:

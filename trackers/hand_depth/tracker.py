@@ -116,7 +116,7 @@ def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
         key=key,
     )
     nowhere = open_palm(jnp.array([0.0, 0.09, 0.7]))
-    state = state._replace(ensemble=placed(place_key, setup, nowhere, scale, side))
+    state = state._replace(ensemble=placed(place_key, setup.compiled(), nowhere, scale, side))
     return search(setup, state, frame, 0.0)
 
 
@@ -139,7 +139,7 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
             pieces.append(_nothing_found())
             first += 1
             continue
-        state, (track, done) = _scan(setup, state, frames, times, first)
+        state, (track, done) = _scan(setup.compiled(), state, frames, times, first)
         state = _through_the_host(state)
         if int(state.misses) >= PATIENCE:
             state = state._replace(race_time=jnp.asarray(times[first], dtype=float))

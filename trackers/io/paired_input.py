@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxfilters.trackers.io.input_files import check_rate
-from jaxfilters.trackers.io.video_input import ImageFolder, Moment, VideoSource
+from jaxfilters.trackers.io.video_input import FrameSet, ImageFolder, VideoSource
 
 _SAME_STEP = 0.1
 """Names of two folders count alike if their usual steps differ by no more than this share."""
@@ -25,7 +25,7 @@ class PairedInput:
         self._ended: list[str] = []
         self.moments = self.incomplete = 0
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[FrameSet]:
         streams = _streams(self._sources)
         waiting = [self._next(i, stream) for i, stream in enumerate(streams)]
         began = min((item[0] for item in waiting if item is not None), default=0.0)
@@ -35,7 +35,7 @@ class PairedInput:
             images = tuple(image if time_s <= until else None for time_s, image in items)
             now = until - self._half_s - began
             self._count(now, images)
-            yield Moment(now, images)
+            yield FrameSet(now, images)
             for i, image in enumerate(images):
                 if image is not None:
                     waiting[i] = self._next(i, streams[i])

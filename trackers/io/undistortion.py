@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 
 
 class Undistortion:
@@ -65,7 +65,7 @@ class Undistortion:
         return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)[0].reshape(np.shape(uv))
 
 
-def straightened(moments: Iterable[Moment], undistortions: Sequence[Undistortion]) -> Iterator[Moment]:
+def straightened(moments: Iterable[FrameSet], undistortions: Sequence[Undistortion]) -> Iterator[FrameSet]:
     """Moments whose images have no lens distortion, one undistortion for each source."""
     for moment in moments:
         pairs = zip(moment.images, undistortions, strict=True)

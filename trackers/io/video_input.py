@@ -249,7 +249,7 @@ def is_live(source: Any) -> bool:
     return getattr(source, "is_live", False)
 
 
-class Moment(NamedTuple):
+class FrameSet(NamedTuple):
     """What all sources have at one time."""
 
     time_s: float
@@ -259,8 +259,8 @@ class Moment(NamedTuple):
 
 
 def continued(
-    moments: Iterator[Moment], sources: Sequence[VideoSource], frames: int, time_s: float
-) -> Iterator[Moment]:
+    moments: Iterator[FrameSet], sources: Sequence[VideoSource], frames: int, time_s: float
+) -> Iterator[FrameSet]:
     """The moments that an interrupted run has not had.
 
     Args:
@@ -276,7 +276,7 @@ def continued(
     return (moment._replace(time_s=later_s + moment.time_s) for moment in moments)
 
 
-def together(sources: list[VideoSource]) -> Iterator[Moment]:
+def together(sources: list[VideoSource]) -> Iterator[FrameSet]:
     """The images of several sources on the clock of the fastest; a slower one has nothing new in between.
 
     Ends when the last recording ends; one that ends earlier has nothing new from then on.
@@ -293,4 +293,4 @@ def together(sources: list[VideoSource]) -> Iterator[Moment]:
             images.append(item[1] if due and item is not None else None)
             if due:
                 waiting[i] = next(streams[i], None)
-        yield Moment(now - began, tuple(images))
+        yield FrameSet(now - began, tuple(images))

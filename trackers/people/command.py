@@ -51,7 +51,7 @@ def track(options: argparse.Namespace) -> str:
     Raises:
         InputError: a source, a file or an option cannot be used. What was tracked before is written.
         OutputError: the results cannot be written.
-        KeyboardInterrupt: before anything was tracked.
+        KeyboardInterrupt: with what is kept as its text; what was tracked before is written.
     """
     check_unused(options)
     setup = _setup(options)
@@ -88,8 +88,7 @@ def _tracked(setup: Setup, options: argparse.Namespace, session: PeopleSession, 
     }
     report["trouble"] += session.trouble()
     run.writer.finish(report, as_rows(by_frame(tracks)) if is_smoothed else None, status_names=np.asarray(STATUS))
-    run.conclude(result)
-    return _summary(report, options)
+    return run.conclude(result, _summary(report, options))
 
 
 def _trouble(sources: Sequence[Any]) -> list[str]:
@@ -183,7 +182,7 @@ def _report(
         "frames_per_second": round(rate, 2) if rate == rate else None,
         "seconds": round(seconds, 2),
         "people": len(tracks),
-        "interrupted": result.interrupted,
+        "interrupted": result.interrupt is not None,
         "trouble": result.trouble,
         "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
         "background": "detections" if setup.detected else options.background,

@@ -46,7 +46,7 @@ LEARNING_RATE = 0.1
 NEWCOMER_SD_M = 0.3
 
 
-def judged(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], looked: Bool[Array, ""]) -> People:
+def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], looked: Bool[Array, ""]) -> People:
     """Log odds and modes after a frame that `looked` at the scene."""
     config = scene.config
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
@@ -117,7 +117,7 @@ def named(people: People) -> People:
     return people._replace(identity=jnp.where(people.mode == FREE, -1, people.identity))
 
 
-def admitted(config: PeopleConfig, people: People, found: Birth) -> People:
+def confirm(config: PeopleConfig, people: People, found: Birth) -> People:
     """With the birth in a free slot; without a free one, nobody is added."""
     free = people.mode == FREE
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found

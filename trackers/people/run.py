@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxfilters.trackers.app.video import side_by_side
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 from jaxfilters.trackers.people.drawing import drawn
 from jaxfilters.trackers.people.session import PeopleEstimate, PeopleSession
 from jaxfilters.trackers.people.state import TRACKED
@@ -27,17 +27,17 @@ class PeopleStream:
         inside = 0 if self._now is None else int(np.sum(self._now.people.mode == TRACKED))
         return f"{inside} {'person' if inside == 1 else 'people'}"
 
-    def is_due(self, waiting: Sequence[Moment]) -> bool:
+    def is_due(self, waiting: Sequence[FrameSet]) -> bool:
         """Every moment is processed when it comes."""
         return bool(waiting)
 
-    def process(self, moments: Sequence[Moment]) -> TimedPeopleTrack:
+    def process(self, moments: Sequence[FrameSet]) -> TimedPeopleTrack:
         """A row for everybody and, for newly confirmed people, of the frames before."""
         (moment,) = moments
         self._now = self._session.process(moment.images, moment.time_s)
         return as_rows(self._now.added)
 
-    def pictures(self, moments: Sequence[Moment], rows: TimedPeopleTrack) -> Iterable[np.ndarray]:  # noqa: ARG002
+    def pictures(self, moments: Sequence[FrameSet], rows: TimedPeopleTrack) -> Iterable[np.ndarray]:  # noqa: ARG002
         """The images of all cameras with everybody's outline."""
         assert self._now is not None
         views = zip(self._session.last_images, self._session.last_outlines, strict=True)

@@ -18,6 +18,7 @@ from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, f
 from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
+from jaxfilters.trackers.tracker import checked_times
 
 PRIMING_IMAGES = 40
 """Images from which the empty room is estimated before a recording is tracked."""
@@ -64,11 +65,9 @@ def track(
         The tracks: positions and velocities in metres with their covariances, one `Sighting` a frame.
 
     Raises:
-        ValueError: There are no images, or more or fewer than times; or no such method.
+        ValueError: As for `checked_times`; or there is no such method.
     """
-    seconds = np.asarray(times_s, float)
-    if not len(images) or seconds.shape != (len(images),):
-        raise ValueError(f"times_s: expected one for each of at least one image; got {seconds.shape}, {len(images)}.")
+    seconds = checked_times(times_s, len(images))
     if config is not None:
         scene = people_scene(scene.cameras, scene.floor, furniture=scene.furniture, config=config)
     session = PeopleSession(scene, subtraction)

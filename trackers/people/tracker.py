@@ -112,14 +112,14 @@ def step(
     belief, nis = _updated(scene, predicted, fit)
     people = people._replace(belief=chosen(active, belief, people.belief))
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
-    people = lifecycle.judged(scene, people, fit, dt, looked)
+    people = lifecycle.existence(scene, people, fit, dt, looked)
     places = _observed_places(scene, people)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
     people = identity_switch_correction(people, histograms, good, dt)
     people = lifecycle.named(lifecycle.remembered(people, histograms, good))
-    people = lifecycle.admitted(scene.config, people, birth(scene, places, active, frames))
+    people = lifecycle.confirm(scene.config, people, birth(scene, places, active, frames))
     return people, _report(scene, people, fit, nis)
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face import frame_selection
 from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Views, all_residuals, projected
-from jaxfilters.models.face.frame_selection import by_angles, by_information
+from jaxfilters.models.face.frame_selection import by_angles, information_gain
 from jaxfilters.models.face.multilinear import expression_basis, learn, shape
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import monocular
@@ -61,14 +61,14 @@ def test_information_chooses_as_exhaustive_search_does(x64, seed):
         * (np.linalg.slogdet(prior + frames.sum(0) - frames[i])[1] - np.linalg.slogdet(prior + frames[:5].sum(0))[1])
         for i in range(5)
     ]
-    place, gain = by_information(*(jnp.asarray(a) for a in (frames[:5], frames[5], prior, may_go)))
+    place, gain = information_gain(*(jnp.asarray(a) for a in (frames[:5], frames[5], prior, may_go)))
     assert place == 1 + int(np.argmax(gains[1:]))
     assert float(gain) == pytest.approx(max(gains[1:]), rel=1e-9)
 
 
 def test_a_frame_that_tells_nothing_gains_nothing(x64):
     frames = jnp.asarray(random_information(np.random.default_rng(0), 5))
-    _, gain = by_information(frames, jnp.zeros((4, 4)), jnp.eye(4), jnp.ones(5, bool))
+    _, gain = information_gain(frames, jnp.zeros((4, 4)), jnp.eye(4), jnp.ones(5, bool))
     assert gain < 0
 
 

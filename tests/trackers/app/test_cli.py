@@ -42,7 +42,7 @@ def test_track_writes_all_results(npz_file, tmp_path, depth_mm, capsys):
     assert report["config"]["num_particles"] == 100
     assert report["config"]["seed"] == 5
     assert report["status"] == {"searching": 1, "tracking": 39, "lost": 0, "doubtful": 0}
-    assert report["mean_joint_error_mm"] is None
+    assert report["mean_joint_error_m"] is None
     assert report["frames_per_second"] > 0
     captured = capsys.readouterr()
     assert "40 frames in" in captured.out
@@ -58,8 +58,8 @@ def test_demo_follows_the_synthetic_recording_and_knows_its_error(tmp_path, reco
         assert np.isnan(track["joints"][5]).all()
         error = np.nanmean(np.linalg.norm(track["joints"] - recording.joints, axis=-1))
     report = json.loads((out / "report.json").read_text())
-    assert abs(report["mean_joint_error_mm"] - 1000 * error) < 0.01
-    assert f"mean joint error {report['mean_joint_error_mm']:.1f} mm" in capsys.readouterr().out
+    assert abs(report["mean_joint_error_m"] - error) < 1e-5
+    assert f"mean joint error {1000 * report['mean_joint_error_m']:.1f} mm" in capsys.readouterr().out
 
 
 @pytest.mark.system
@@ -73,7 +73,7 @@ def test_a_recording_without_a_hand_has_empty_results_and_no_crash(tmp_path, rec
     assert {file.name for file in out.iterdir()} == OUTPUTS
     report = json.loads((out / "report.json").read_text())
     assert report["status"] == {"searching": 20, "tracking": 0, "lost": 0, "doubtful": 0}
-    assert report["mean_joint_error_mm"] is None
+    assert report["mean_joint_error_m"] is None
     assert "20 searching" in capsys.readouterr().out
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 20
 

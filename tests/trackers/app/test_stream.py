@@ -15,7 +15,7 @@ from jaxfilters.trackers.app import results, stream
 from jaxfilters.trackers.app.results import Columns, TrackTable
 from jaxfilters.trackers.app.stream import StreamRun, StreamSpec
 from jaxfilters.trackers.io.errors import CheckpointError, InputError, OutputError
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 
 FRAMES = 40
 
@@ -54,7 +54,7 @@ class Source:
         for i in range(self.frames):
             if i == self._broken:
                 raise InputError("numbers: image cannot be read.")
-            yield Moment(i / self.fps, (None if i == 7 else np.array(i),))
+            yield FrameSet(i / self.fps, (None if i == 7 else np.array(i),))
 
 
 class LiveSource(Source):
@@ -112,7 +112,7 @@ def follow(out, source=None, session=None, **changes):
     with closing(StreamRun(options(out, **changes), spec)) as run:
         result = run.follow()
         run.writer.finish({"frames": run.writer.frames})
-        run.conclude(result)
+        run.conclude(result, "The summary")
     return result
 
 
@@ -162,7 +162,8 @@ def test_a_run_that_an_error_ended_goes_on_bit_for_bit(stop, whole, tmp_path):
 def test_ctrl_c_keeps_what_is_done_and_the_run_can_go_on(whole, tmp_path):
     session = Sums()
     session.stop_at = 10, KeyboardInterrupt()
-    assert follow(tmp_path / "out", session=session, video=True).interrupted
+    with pytest.raises(KeyboardInterrupt, match=r"the first 10 frames are kept in [^\n]*\nThe summary"):
+        follow(tmp_path / "out", session=session, video=True)
     assert len(table(tmp_path / "out").splitlines()) == 1 + 2 * 7
     assert (tmp_path / "out" / "track.npz").exists()
     assert (tmp_path / "out" / "overlay.mp4").exists()

@@ -14,7 +14,7 @@ from jaxfilters.trackers.articulated.table import articulated_table
 from jaxfilters.trackers.tracker import CHUNK
 
 OUTPUTS = {"track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4", "checkpoint"}
-ERRORS = ("mean_angle_error_deg", "mean_length_error_px", "lengths_within_2_sigma_percent")
+ERRORS = ("mean_angle_error_rad", "mean_length_error_px", "lengths_within_2_sigma_percent")
 
 
 @pytest.fixture(autouse=True)

@@ -10,11 +10,11 @@ from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.hand_depth.tracker import DOUBTFUL, LOST, SEARCHING, TRACKING
 from jaxfilters.trackers.io.depth import open_depth
+from jaxfilters.trackers.tracker import CHUNK
 
 pytestmark = pytest.mark.optimised
 
-CHUNK = 12
-NUM_PARTICLES = 96
+NUM_PARTICLES = 64
 
 
 @pytest.fixture(scope="module")

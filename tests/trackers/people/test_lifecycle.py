@@ -16,7 +16,7 @@ from jaxfilters.trackers.people.tracker import people_scene
 SLOTS = 4
 CONFIG = PeopleConfig(capacity=SLOTS, cell_m=2.0)
 RED, BLUE = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3))
-judge, name = jax.jit(lifecycle.judged), jax.jit(lifecycle.named)
+judge, name = jax.jit(lifecycle.existence), jax.jit(lifecycle.named)
 
 
 @pytest.fixture(scope="module")
@@ -174,17 +174,17 @@ def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
     people = people_of(TRACKED, FREE, TRACKED, FREE, identity=[4, -1, 5, -1], log_odds=[8.0, 3.0, 8.0, 0.0])
     people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
     found = Birth(jnp.array([1.5, 2.5]), jnp.array(True))
-    after = lifecycle.admitted(CONFIG, people, found)
+    after = lifecycle.confirm(CONFIG, people, found)
     assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
     np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m, 0, 0, 0])
     assert after.log_odds.tolist() == [8, 0, 8, 0]
     np.testing.assert_allclose(after.appearance[1], 1 / 8)
     np.testing.assert_array_equal(after.belief.mean[2], people.belief.mean[2])
-    unchanged = lifecycle.admitted(CONFIG, people, found._replace(found=jnp.array(False)))
+    unchanged = lifecycle.confirm(CONFIG, people, found._replace(found=jnp.array(False)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(unchanged), jax.tree.leaves(people), strict=True))
 
 
 def test_a_full_house_admits_nobody():
     full = people_of(TRACKED, TENTATIVE, DORMANT, TRACKED)
-    after = lifecycle.admitted(CONFIG, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
+    after = lifecycle.confirm(CONFIG, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))

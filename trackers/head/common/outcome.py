@@ -21,7 +21,7 @@ def run_report(stream: HeadStream, results: HeadRows, followed: RunResult) -> di
         **shares(results),
         "frames_per_second": finite(followed.frames_per_second),
         "tracking_ms_per_frame": finite(followed.tracking_ms),
-        "interrupted": followed.interrupted,
+        "interrupted": followed.interrupt is not None,
         "trouble": followed.trouble,
         "note": place.note,
         "events": events,

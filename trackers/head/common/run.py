@@ -15,7 +15,7 @@ from jaxfilters.trackers.head.common.input import Setup
 from jaxfilters.trackers.head.common.table import SKIPPED, STATUS_WORDS, HeadRows, with_gaps
 from jaxfilters.trackers.io.paired_input import PairedInput
 from jaxfilters.trackers.io.undistortion import straightened
-from jaxfilters.trackers.io.video_input import Moment
+from jaxfilters.trackers.io.video_input import FrameSet
 
 MOST_WAITING = 32
 """Moments after which rows are written, however few of them are whole."""
@@ -71,11 +71,11 @@ class HeadStream:
         self.status = "no images of one moment"
         self._rows, self._chunk, self._frames = rows, chunk, 0
 
-    def is_due(self, waiting: Sequence[Moment]) -> bool:
+    def is_due(self, waiting: Sequence[FrameSet]) -> bool:
         """Whether enough moments are whole."""
         return sum(map(_is_whole, waiting)) == self._chunk or len(waiting) == MOST_WAITING
 
-    def process(self, moments: Sequence[Moment]) -> HeadRows:
+    def process(self, moments: Sequence[FrameSet]) -> HeadRows:
         """A row for every moment; skipped where it is not whole."""
         whole = [_is_whole(moment) for moment in moments]
         track = self._track([moment for moment, is_whole in zip(moments, whole, strict=True) if is_whole])
@@ -85,7 +85,7 @@ class HeadStream:
         track = None if track is None else self._rows.in_metres(track)
         return with_gaps(track, times_s, whole, self._rows.nothing)
 
-    def pictures(self, moments: Sequence[Moment], rows: HeadRows) -> Any:
+    def pictures(self, moments: Sequence[FrameSet], rows: HeadRows) -> Any:
         """The images of all cameras with the head in them."""
         return (draw_frame(list(moment.images), self.place.rig, rows, i) for i, moment in enumerate(moments))
 
@@ -98,7 +98,7 @@ class HeadStream:
         self.session.restore(saved)
         self.frame_of, self._frames = np.flatnonzero(rows.status != SKIPPED).tolist(), len(rows.status)
 
-    def _track(self, moments: Sequence[Moment]) -> Any:
+    def _track(self, moments: Sequence[FrameSet]) -> Any:
         if not moments:
             return None
         grey = [
@@ -139,5 +139,5 @@ def _identity(place: Setup, config: Any, files: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def _is_whole(moment: Moment) -> bool:
+def _is_whole(moment: FrameSet) -> bool:
     return all(image is not None for image in moment.images)

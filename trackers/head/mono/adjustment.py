@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face import person_prior
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Views, adjust, square
-from jaxfilters.models.face.frame_selection import FrameInformation, by_angles, by_information, frame_information
+from jaxfilters.models.face.frame_selection import FrameInformation, by_angles, frame_information, information_gain
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
@@ -94,7 +94,7 @@ def choose(
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
         beside = known(face, prior, person)
-        place, gain = by_information(window.information, frame.about_person.information, beside, may_go)
+        place, gain = information_gain(window.information, frame.about_person.information, beside, may_go)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)

@@ -44,7 +44,7 @@ def track(options: argparse.Namespace) -> str:
     Raises:
         InputError: the source, a file or an option cannot be used. What was tracked before is written.
         OutputError: the results cannot be written.
-        KeyboardInterrupt: before anything was tracked.
+        KeyboardInterrupt: with what is kept as its text; what was tracked before is written.
     """
     check_unused(options)
     settings = as_input_error(partial(config_from_args, VARIANTS[options.variant], options))
@@ -103,9 +103,8 @@ def _tracked(
         write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.remembered), face)
     truth = None if place.truth is None else place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
-    run.conclude(followed)
     lines = format_report(report, options.out, has_video=options.video)
-    return lines if focal is None else f"{lines}\n{_in_words(focal)}"
+    return run.conclude(followed, lines if focal is None else f"{lines}\n{_in_words(focal)}")
 
 
 def _model(options: argparse.Namespace) -> FaceModelFile:

@@ -33,6 +33,7 @@ from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack, prior_of
 from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_points
 from jaxfilters.trackers.io.face_models import people_face_model
+from jaxfilters.trackers.tracker import checked_times
 
 MOST_REPROJECTION = 0.05
 """Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
@@ -164,7 +165,7 @@ def track(
 
     Args:
         images: Grey, without lens distortion.
-        times_s: Seconds, growing.
+        times_s: Seconds, strictly increasing.
         camera: Which took them.
         config: Constants.
         face: Model of ten landmarks, or of the 68 of iBUG; by default the general one of
@@ -175,11 +176,12 @@ def track(
         The track: millimetres and radians, NaN where the head is not tracked.
 
     Raises:
-        ValueError: as for `MonoSession` and its `process`.
+        ValueError: as for `MonoSession` and its `process`, and for `checked_times`.
     """
+    seconds = checked_times(times_s, len(images))
     face = people_face_model().model if face is None else face
     session = MonoSession(monocular(camera), face, config, **known)
-    return session.process(images[:, None], np.asarray(times_s))
+    return session.process(images[:, None], seconds)
 
 
 class _MonoTracker:

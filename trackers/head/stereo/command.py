@@ -29,7 +29,7 @@ def track(options: argparse.Namespace) -> str:
     Raises:
         InputError: a source, a file or an option cannot be used. What was tracked before is written.
         OutputError: the results cannot be written.
-        KeyboardInterrupt: before anything was tracked.
+        KeyboardInterrupt: with what is kept as its text; what was tracked before is written.
     """
     check_unused(options)
     settings = as_input_error(partial(config_from_args, HeadConfig(), options))
@@ -63,8 +63,7 @@ def _tracked(
     run.writer.finish(report, **_learned(session))
     truth = None if stream.place.truth is None else stream.place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth)
-    run.conclude(followed)
-    return format_report(report, options.out, has_video=options.video)
+    return run.conclude(followed, format_report(report, options.out, has_video=options.video))
 
 
 def _session(place: Setup, settings: HeadConfig) -> HeadSession:

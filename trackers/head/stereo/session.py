@@ -19,6 +19,7 @@ from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import INITIALISING, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
 from jaxfilters.trackers.head.stereo.tracking import advance, begin
+from jaxfilters.trackers.tracker import checked_times
 
 SAME_FACE_MM = 4.0
 """Root mean square distance between two registered shapes up to which they are of one person."""
@@ -104,7 +105,7 @@ def track(
 
     Args:
         images: Grey, of all cameras at one moment each, without lens distortion.
-        times_s: Seconds, growing.
+        times_s: Seconds, strictly increasing.
         rig: One camera or more.
         config: Constants.
         points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
@@ -113,9 +114,9 @@ def track(
         The track: millimetres and radians, NaN where the head is not tracked.
 
     Raises:
-        ValueError: as for `HeadSession` and its `process`.
+        ValueError: as for `HeadSession` and its `process`, and for `checked_times`.
     """
-    return HeadSession(rig, config, points).process(images, np.asarray(times_s))
+    return HeadSession(rig, config, points).process(images, checked_times(times_s, len(images)))
 
 
 def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:

@@ -162,8 +162,9 @@ def test_ctrl_c_writes_what_there_is(stereo, fake_head, tmp_path, monkeypatch, c
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(ProgressLine, "show", show_and_interrupt)
-        assert run(*stereo, "--out", out) == 0
-    assert "interrupted" in capsys.readouterr().out
+        assert run(*stereo, "--out", out) == 130
+    assert "interrupted; " in (message := capsys.readouterr().err)
+    assert f"results in {out}" in message
     assert len(rows_of(out)) == 16
     assert {file.name for file in out.iterdir()} == OUTPUTS - {"checkpoint"}
     assert json.loads((out / "report.json").read_text())["interrupted"] is True
