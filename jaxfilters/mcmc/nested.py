@@ -187,13 +187,14 @@ def _run(key: AnyKey, problem: _Problem) -> SMCPosterior:
         if i > 0:
             carry = _exchanged(jax.random.fold_in(scan_key, length + i), problem, filter_of, chart, carry)
         is_last = i == len(problem.filters) - 1
-        carry = jax.lax.while_loop(
-            lambda carry, is_last=is_last: (carry.time < length) & (is_last | ~carry.enlarge),
-            lambda carry, i=i: _frame(problem, i, chart, carry, jax.random.fold_in(scan_key, carry.time)),
-            carry,
-        )
+        carry = jax.lax.while_loop(partial(_is_usable, is_last), partial(_frame, problem, i, chart, scan_key), carry)
     evidence = jnp.sum(carry.info.log_evidence)
     return SMCPosterior(carry.ensemble.theta, carry.log_weights, evidence, carry.info, carry.status)
+
+
+def _is_usable(is_last: bool, carry: _Carry) -> Array:
+    """Whether there is a next frame for filters of this number of particles."""
+    return (carry.time < carry.info.moved.shape[0]) & (is_last | ~carry.enlarge)
 
 
 def _no_info(length: int, like: Array) -> SMC2Info:
@@ -253,8 +254,8 @@ def _until(problem: _Problem, filter_of: FilterOf, time: Array, key: AnyKey, the
     return jax.lax.fori_loop(0, time, advance, _start(filter_of, init_key, theta))
 
 
-def _frame(problem: _Problem, filter_index: int, chart, carry: _Carry, key: AnyKey) -> _Carry:
-    filter_key, move_key = jax.random.split(key)
+def _frame(problem: _Problem, filter_index: int, chart, scan_key: AnyKey, carry: _Carry) -> _Carry:
+    filter_key, move_key = jax.random.split(jax.random.fold_in(scan_key, carry.time))
     n, ensemble, time = problem.num_particles, carry.ensemble, carry.time
     filter_of = problem.filters[filter_index]
     advance = jax.vmap(partial(_advance, problem, filter_of), in_axes=(0, -1, -1, None), out_axes=-1)

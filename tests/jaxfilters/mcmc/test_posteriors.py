@@ -72,9 +72,9 @@ def particle_filter_of(theta, num_particles=8):
     )
 
 
-def kalman_of(theta):
+def kalman_of(theta, noise=R):
     one = jnp.eye(1)
-    return jf.kalman(jf.Gaussian(jnp.zeros(1), one), A * one, jnp.square(theta["q"]) * one, one, R**2 * one)
+    return jf.kalman(jf.Gaussian(jnp.zeros(1), one), A * one, jnp.square(theta["q"]) * one, one, noise**2 * one)
 
 
 def exact_log_likelihood(ys, theta):
@@ -134,10 +134,10 @@ def smc(name, key, ys):
         return run(key, sample_prior, log_prior, likelihood, temperatures=temperatures, **options, **PROBLEM)
     if name == "smc2":
         return jf.mcmc.smc2(key, particle_filter_of, sample_prior, log_prior, ys, num_moves=2, **PROBLEM)
-    if name == "smc2_growing":
-        # The first move is followed by an exchange.
-        options = {"min_acceptance": 1.0, "num_moves": 2}
-        return jf.mcmc.smc2(key, LADDER, sample_prior, log_prior, ys, **options, **PROBLEM)
+    if name == "smc2_exchanged":
+        # The filters of the first frame are those of another model; what is left of it are errors of the exchange.
+        filters, options = (partial(kalman_of, noise=2 * R), kalman_of), {"min_acceptance": 1.0, "ess_threshold": 1.0}
+        return jf.mcmc.smc2(key, filters, sample_prior, log_prior, ys[:, None], num_moves=2, **options, **PROBLEM)
     return jf.mcmc.smc2(key, kalman_of, sample_prior, log_prior, ys[:, None], num_moves=2, **PROBLEM)
 
 
@@ -157,7 +157,7 @@ def check_within_error(values, expected):
 
 
 SAMPLERS = {name: partial(draws_of_chain, name) for name in CHAINS}
-SMC = ("tempered", "waste_free", "smc2", "smc2_growing", "iterated_importance")
+SMC = ("tempered", "waste_free", "smc2", "smc2_exchanged", "iterated_importance")
 SAMPLERS |= {name: partial(draws_of_smc, name) for name in SMC}
 
 
