@@ -100,9 +100,7 @@ PIECES = {
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.optimised] * (name == "hand-depth")) for name in PIECES]
-)
+@pytest.mark.parametrize("name", PIECES)
 def test_frames_one_by_one_give_the_track_of_all_at_once(name, monkeypatch):
     """To the rounding of programs of other shapes."""
     whole, pieces = PIECES[name](monkeypatch)
