@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 
-_MAY_BE_ZERO = ("spread_px", "silhouette_bias_px")
+_MAY_BE_ZERO = ("spread_px", "silhouette_bias_px", "calibration_error")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,9 @@ class PeopleConfig:
     spread_px: float = 0.5
     """How far silhouettes reach beyond their edges: an edge that lens, video coder and resampling blur by 0.8 pixels
     crosses a threshold of 30 grey levels that much too far out where the contrast is 100."""
+    calibration_error: float = 0.0
+    """Standard deviation of the shift of silhouettes by the calibration of each camera but the first, which defines the
+    floor, as a share of the columns of its image; 0 for cameras that agree, .005 for those that disagree by decimetres."""
     grid: tuple[int, int] = (32, 16)
     """Samples of a person's window, rows and columns."""
     cell_m: float = 0.3
@@ -67,6 +70,6 @@ class PeopleConfig:
             raise ValueError(f"capacity and grid must be positive integers; got {self.capacity!r}, {self.grid!r}.")
         for name in _MAY_BE_ZERO:
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be 0 or more pixels; got {getattr(self, name)!r}.")
+                raise ValueError(f"{name} must be 0 or more; got {getattr(self, name)!r}.")
         if not self.dropped < 0:
             raise ValueError(f"dropped must be negative log odds; got {self.dropped!r}.")

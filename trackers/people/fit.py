@@ -9,13 +9,15 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.image_shift import best_shift, has_shifts, shifted, weighted
 from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
     contrasts_of,
     line_of_sight,
     log_likelihood,
+    log_likelihoods,
     observed_place,
-    share_seen,
+    shares_seen,
     unexplained_of,
     views_of,
 )
@@ -56,19 +58,29 @@ class Fit(NamedTuple):
     steps: Float[Array, "slots 4"]
     """Metres along `axes` over which the score was taken for a parabola."""
     quadratic: Quadratic
-    """The log likelihood around `place`, along `axes`."""
+    """The log likelihood around `place`, along `axes`, of all cameras, or of each where they may be wrong; leaves
+    (slots, readings, ...)."""
     score: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel."""
-    share_seen: Float[Array, " slots"]
+    shift: Float[Array, "slots cameras 2"]
+    """Of their silhouettes in each image, pixels."""
+    shares_seen: Float[Array, "slots cameras"]
+    """Of the silhouette, how much each camera shows."""
     flatness: Float[Array, " slots"]
     surplus: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel that a person explains which the nearest senior could not explain alone, in
     the best place for that; `inf` without a senior near by."""
 
+    @property
+    def share_seen(self) -> Float[Array, " slots"]:
+        """Of the silhouette, how much the camera shows that shows most."""
+        return jnp.max(self.shares_seen, axis=-1)
+
 
 def fit_people(
     scene: PeopleScene,
     predicted: Gaussian,
+    shifts: Float[Array, "slots cameras 2"],
     active: Bool[Array, " slots"],
     seniority: Float[Array, " slots"],
     frames: tuple[CameraFrame, ...],
@@ -78,6 +90,7 @@ def fit_people(
     Args:
         scene: Cameras, furniture, floor.
         predicted: Beliefs of all slots.
+        shifts: Of their silhouettes after the frame before.
         active: Which of them hold a person.
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
@@ -88,12 +101,19 @@ def fit_people(
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
     reach = _reach(covariance, axes)
     views = jax.vmap(views_of, in_axes=(None, None, 0, 0, 0))(scene, frames, start, axes, reach)
+    if has_shifts(scene):
+        views = jax.vmap(weighted, in_axes=(None, 0, 0))(scene, start, views)
     order = _nearest_first(scene, views, start, active)
 
-    def one_person(turn, places):
+    def one_person(turn, found):
+        places, shifts = found
         k = order[turn % num_active]
-        mine = jax.tree.map(lambda leaf: leaf[k], views)
+        unshifted = jax.tree.map(lambda leaf: leaf[k], views)
+        mine = shifted(unshifted, shifts[k]) if has_shifts(scene) else unshifted
         contrasts = contrasts_of(mine, unexplained_of(scene, places, active.at[k].set(False), mine))
+        if has_shifts(scene):
+            shifts = shifts.at[k].set(best_shift(scene, places[k], unshifted, contrasts, shifts[k]))
+            mine = shifted(unshifted, shifts[k])
 
         def best(place, offsets):
             candidates = place + offsets @ axes[k]
@@ -107,11 +127,13 @@ def fit_people(
         offsets = lattices * jnp.append(reach[k] / 2, jnp.array([HEIGHT_STEP_M, 0.0]))
         widest = jnp.where(turn < num_active, 0, 1)
         place = jax.lax.fori_loop(widest, len(lattices), lambda i, p: best(p, offsets[i]), places[k])
-        return places.at[k].set(place)
+        return places.at[k].set(place), shifts
 
     lattices, num_active = _lattices(), jnp.sum(active)
-    places = jax.lax.fori_loop(0, PASSES * num_active, one_person, start)
-    return _curvature(scene, places, active, seniority, views, axes, _steps(scene, start))
+    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, (start, shifts))
+    if has_shifts(scene):
+        views = jax.vmap(shifted)(views, shifts)
+    return _curvature(scene, places, shifts, active, seniority, views, axes, _steps(scene, start))
 
 
 def _lattices():
@@ -124,38 +146,46 @@ def _lattices():
     return jnp.stack([jnp.concatenate([wide, middle]), narrow / 2, narrow / 4])
 
 
-def _curvature(scene, places, active, seniority, views, axes, steps) -> Fit:
+def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> Fit:
     around = foreground.lattice(4)
     away = PROFILE_M * jnp.eye(1, 4)
     middle = len(around) // 2
+    readings = len(scene.cameras) if has_shifts(scene) else 1
+
+    def by_reading(scene, candidates, mine, contrasts):
+        each = log_likelihoods if has_shifts(scene) else log_likelihood
+        values = jax.vmap(each, in_axes=(None, 0, None, None), out_axes=-1)(scene, candidates, mine, contrasts)
+        return values.reshape(readings, len(candidates))
 
     def one(k, fits):
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
         candidates = places[k] + jnp.concatenate([around * steps[k], -away, away]) @ axes[k]
-        values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
-        scores = values / scene.config.independent_patches
+        values = by_reading(scene, candidates, mine, contrasts)
+        scores = jnp.sum(values, axis=0) / scene.config.independent_patches
         fit = Fit(
             places[k],
             axes[k],
             steps[k],
-            foreground.quadratic_fit(values[:-2], steps[k]),
+            jax.vmap(foreground.quadratic_fit, in_axes=(0, None))(values[:, :-2], steps[k]),
             scores[middle],
-            share_seen(scene, places[k], mine, unexplained),
+            shifts[k],
+            shares_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
             _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
-    n = len(places)
+    n, cameras = len(places), len(scene.cameras)
     empty = Fit(
         places,
         axes,
         steps,
-        Quadratic(jnp.zeros(n), jnp.zeros((n, 4)), jnp.zeros((n, 4, 4))),
+        Quadratic(jnp.zeros((n, readings)), jnp.zeros((n, readings, 4)), jnp.zeros((n, readings, 4, 4))),
         jnp.zeros(n),
-        jnp.zeros(n),
+        jnp.zeros((n, cameras, 2)),
+        jnp.zeros((n, cameras)),
         jnp.zeros(n),
         jnp.full(n, jnp.inf),
     )
@@ -183,10 +213,18 @@ def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
     return jax.lax.cond(apart[senior] < NEAR_M, alone, lambda: jnp.full_like(score, jnp.inf))
 
 
-def as_measurement(
-    fit: Fit, silhouette_sd: float
-) -> tuple[Float[Array, "slots 4"], Float[Array, "slots 4 4"], Float[Array, "slots 4 4"], Bool[Array, "slots 4"]]:
-    """Readings y = H place, H, their covariance R, and which of them say anything, from the curvature of the score.
+class Readings(NamedTuple):
+    """What all cameras, or each of them, measure of everybody: y = H place."""
+
+    y: Float[Array, "slots readings 4"]
+    H: Float[Array, "slots readings 4 4"]
+    R: Float[Array, "slots readings 4 4"]
+    observed: Bool[Array, "slots readings 4"]
+    """Which rows say anything."""
+
+
+def as_measurement(fit: Fit, silhouette_sd: float) -> Readings:
+    """Readings with their covariance from the curvature of the score.
 
     A parabola of curvature J and slope g at z0 is that of a Gaussian reading z0 + J^-1 g with covariance J^-1. In the
     directions of the eigenvectors of J each reading stands alone, and those without curvature drop out.
@@ -199,9 +237,9 @@ def as_measurement(
         limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_SHIFT_M))
         shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
         H = vectors.T @ axes
-        return H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed
+        return Readings(H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed)
 
-    return jax.vmap(one)(fit.place, fit.axes, fit.steps, fit.quadratic)
+    return jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)))(fit.place, fit.axes, fit.steps, fit.quadratic)
 
 
 def _observed_covariance(scene, predicted):

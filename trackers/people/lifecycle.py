@@ -133,4 +133,5 @@ def confirm(config: PeopleConfig, people: People, found: Birth) -> People:
         log_odds=jnp.where(slot, 0.0, people.log_odds),
         unseen_s=jnp.where(slot, 0.0, people.unseen_s),
         appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
+        shift=jnp.where(slot[:, None, None], 0.0, people.shift),
     )

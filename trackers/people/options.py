@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="boxes of any detector (MOT text or COCO .json) in place of background subtraction, one for each source",
     )
-    add_config(parser, PeopleConfig, "capacity", "height_m", "height_sd_m", "memory_s", "hidden_s")
+    add_config(parser, PeopleConfig, "capacity", "height_m", "height_sd_m", "memory_s", "hidden_s", "calibration_error")
     add_video_options(parser)
     add_resume(parser)
     parser.add_argument("--mot", action="store_true", help="write tracks_mot.txt as well (MOT challenge)")

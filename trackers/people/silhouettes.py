@@ -44,7 +44,7 @@ class View(NamedTuple):
     visible: Float[Array, " samples"]
     """1 where the person would be visible in the image and before the furniture, else 0."""
     area: Float[Array, ""]
-    """Of the predicted outline, square pixels."""
+    """Over which the log likelihood is averaged: of the predicted outline, square pixels; more where it counts less."""
 
 
 def place_of(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots 4"]:
@@ -173,25 +173,32 @@ def contrasts_of(views: View, unexplained: Float[Array, "cameras samples"]) -> F
     return contrast(views.foreground, unexplained) * views.visible
 
 
-def log_likelihood(
+def log_likelihoods(
     scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
-) -> Float[Array, ""]:
-    """Log likelihood of a person at a place over that of nobody, over all cameras, as of independent looks."""
+) -> Float[Array, " cameras"]:
+    """Log likelihood of a person at a place over that of nobody, in each camera, as of independent looks."""
 
     def in_camera(P, view, b):
         ratio = log_likelihood_ratio(presence_of(scene.config, P, place, view.window.uv), b)
         return ratio * view.window.area / view.area
 
-    return scene.config.independent_patches * jnp.sum(jax.vmap(in_camera)(scene.projections(), views, contrasts))
+    return scene.config.independent_patches * jax.vmap(in_camera)(scene.projections(), views, contrasts)
 
 
-def share_seen(
-    scene: PeopleScene, place: Float[Array, " 4"], views: View, unexplained: Float[Array, "cameras samples"]
+def log_likelihood(
+    scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
 ) -> Float[Array, ""]:
-    """Of the silhouette, how much is in the image and hidden by nobody and nothing; the largest over the cameras."""
+    """`log_likelihoods` of all cameras together."""
+    return jnp.sum(log_likelihoods(scene, place, views, contrasts))
+
+
+def shares_seen(
+    scene: PeopleScene, place: Float[Array, " 4"], views: View, unexplained: Float[Array, "cameras samples"]
+) -> Float[Array, " cameras"]:
+    """Of the silhouette, how much is in each image and hidden by nobody and nothing."""
 
     def in_camera(P, view, free):
         mine = presence_of(scene.config, P, place, view.window.uv)
         return jnp.sum(mine * free * view.visible) / jnp.maximum(jnp.sum(mine), 1e-6)
 
-    return jnp.max(jax.vmap(in_camera)(scene.projections(), views, unexplained))
+    return jax.vmap(in_camera)(scene.projections(), views, unexplained)

@@ -105,6 +105,8 @@ class People(NamedTuple):
     appearance: Float[Array, "slots 48"]
     meetings: Meetings
     next_identity: Int32[Array, ""]
+    shift: Float[Array, "slots cameras 2"]
+    """Of their silhouettes in the image of each camera, pixels (`image_shift`)."""
 
 
 class Report(NamedTuple):
@@ -133,7 +135,7 @@ class Report(NamedTuple):
     """Normalised innovation squared of the update, over its four coordinates."""
 
 
-def nobody(config: PeopleConfig) -> People:
+def nobody(config: PeopleConfig, cameras: int = 1) -> People:
     """The state before anybody has come."""
     n = config.capacity
     return People(
@@ -145,6 +147,7 @@ def nobody(config: PeopleConfig) -> People:
         jnp.full((n, APPEARANCE), 1 / 8),
         no_meetings(n),
         jnp.zeros((), jnp.int32),
+        jnp.zeros((n, cameras, 2)),
     )
 
 

@@ -9,26 +9,19 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters.gaussian.arithmetic import joseph
-from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.gaussian.consider import consider
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.appearance import appearances
 from jaxfilters.trackers.people.births import birth, cells_of, padded
 from jaxfilters.trackers.people.exchange import identity_switch_correction
-from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
+from jaxfilters.trackers.people.fit import Fit, fit_people
 from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.silhouette_bias import bias_factor
-from jaxfilters.trackers.people.silhouettes import body_of, observed_place, stature
+from jaxfilters.trackers.people.silhouettes import body_of, observed_place
 from jaxfilters.trackers.people.state import (
-    BIAS,
     HEIGHT,
-    PLACE,
-    STATE,
     TENTATIVE,
     TRACKED,
-    WIDTH,
     CameraFrame,
     People,
     PeopleConfig,
@@ -37,6 +30,7 @@ from jaxfilters.trackers.people.state import (
     chosen,
     nobody,
 )
+from jaxfilters.trackers.people.update import updated
 
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""
@@ -45,8 +39,6 @@ NO_DEPTH = 0.05
 pair of a desk that hides the feet and a border that hides the head gives as much, either alone gives less."""
 CLEAR = 0.5
 """Share of the silhouette from which on clothes are looked at."""
-WHOLE = 0.9
-"""Share of the silhouette from which on a person's height is measured."""
 
 
 def people_scene(
@@ -89,7 +81,7 @@ def people_scene(
 
 def start(scene: PeopleScene) -> People:
     """The state before the first frame."""
-    return nobody(scene.config)
+    return nobody(scene.config, len(scene.cameras))
 
 
 @jax.jit
@@ -108,9 +100,9 @@ def step(
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     F, Q = motion(scene.config, dt)
     predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
-    fit = fit_people(scene, predicted, active, lifecycle.seniority(people), frames)
-    belief, nis = _updated(scene, predicted, fit)
-    people = people._replace(belief=chosen(active, belief, people.belief))
+    fit = fit_people(scene, predicted, people.shift, active, lifecycle.seniority(people), frames)
+    belief, nis = updated(scene, predicted, fit, dt)
+    people = people._replace(belief=chosen(active, belief, people.belief), shift=fit.shift)
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.existence(scene, people, fit, dt, looked)
     places = _observed_places(scene, people)
@@ -132,20 +124,6 @@ def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
 
 def _observed_places(scene: PeopleScene, people: People) -> Array:
     return jax.vmap(observed_place, in_axes=(None, 0))(scene, people.belief.mean)
-
-
-def _updated(scene: PeopleScene, predicted: Gaussian, fit: Fit) -> tuple[Gaussian, Array]:
-    y, H, R, observed = as_measurement(fit, scene.config.silhouette_sd_m)
-    in_state = jnp.eye(STATE)[jnp.array(PLACE)]
-
-    def one(belief, y, H, R, observed, whole):
-        biases = H @ bias_factor(scene, belief.mean)
-        H = (H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean)).at[:, BIAS].set(biases)
-        after, info = joseph.update(belief, y, H, R, mask=observed)
-        size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
-        return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
-
-    return jax.vmap(one)(predicted, y, H, R, observed, fit.share_seen > WHOLE)
 
 
 def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:

@@ -34,16 +34,17 @@ def parabolas(seed, n):
     gradient = np.einsum("nai,nij,nj->na", axes, precision, mean - place)
     curvature = np.einsum("nai,nij,nbj->nab", axes, precision, axes)
     none = jnp.zeros(n)
-    quadratic = Quadratic(none, jnp.asarray(gradient), jnp.asarray(curvature))
+    quadratic = Quadratic(none[:, None], jnp.asarray(gradient)[:, None], jnp.asarray(curvature)[:, None])
     steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
-    return Fit(jnp.asarray(place), jnp.asarray(axes), steps, quadratic, none, none, none, none), mean, precision
+    place, axes, shift = jnp.asarray(place), jnp.asarray(axes), jnp.zeros((n, 1, 2))
+    return Fit(place, axes, steps, quadratic, none, shift, none[:, None], none, none), mean, precision
 
 
 @pytest.mark.usefixtures("x64")
 def test_readings_of_an_exact_parabola_are_its_gaussian():
     """Information H^T R^-1 H and information times mean, added up over the four readings."""
     fit, mean, precision = parabolas(0, 20)
-    y, H, R, observed = (np.asarray(leaf) for leaf in as_measurement(fit, 0.0))
+    y, H, R, observed = (np.asarray(leaf)[:, 0] for leaf in as_measurement(fit, 0.0))
     assert observed.all()
     weighted = np.einsum("nri,nrs->nis", H, np.linalg.inv(R))
     np.testing.assert_allclose(
@@ -63,9 +64,9 @@ def test_shape_and_gait_add_to_every_reading():
 @pytest.mark.usefixtures("x64")
 def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_moves_nobody_far():
     fit, *_ = parabolas(2, 1)
-    curvature = jnp.diag(jnp.array([0.0, 500.0, -20.0, 2.0]))[None]
-    fit = fit._replace(quadratic=Quadratic(jnp.zeros(1), jnp.full((1, 4), 1e6), curvature))
-    y, H, R, observed = (np.asarray(leaf)[0] for leaf in as_measurement(fit, 0.0))
+    curvature = jnp.diag(jnp.array([0.0, 500.0, -20.0, 2.0]))[None, None]
+    fit = fit._replace(quadratic=Quadratic(jnp.zeros((1, 1)), jnp.full((1, 1, 4), 1e6), curvature))
+    y, H, R, observed = (np.asarray(leaf)[0, 0] for leaf in as_measurement(fit, 0.0))
     assert observed.sum() == 2
     assert np.isfinite(R).all()
     assert np.abs(y - H @ np.asarray(fit.place)[0]).max() <= 1.001 * MOST_SHIFT_M
@@ -86,7 +87,9 @@ def found(camera, draw, floor):
         sd = np.array([0.15, 0.15, 0.5, 0.5, 0.05, 0.05, 0.1, 0.1, 0.1], np.float32)
         belief = Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), (SLOTS, STATE, STATE)))
         active = jnp.array([slot in order for slot in range(SLOTS)])
-        return jax.tree.map(np.asarray, search(scene, belief, active, -jnp.arange(SLOTS, dtype=float), (shown,)))
+        no_shift, seniority = jnp.zeros((SLOTS, 1, 2)), -jnp.arange(SLOTS, dtype=float)
+        fit = search(scene, belief, no_shift, active, seniority, (shown,))
+        return jax.tree.map(np.asarray, fit)
 
     return run, frame, np.bincount(who[who >= 0], minlength=3)
 
@@ -109,14 +112,14 @@ def test_slots_mean_nothing_to_the_search(found):
     run, *_ = found
     plain, moved = run({0: 0, 1: 1, 2: 2}), run({3: 0, 0: 1, 4: 2})
     for name in ("place", "score", "share_seen", "flatness"):
-        a, b = getattr(plain, name)[[0, 1, 2]], getattr(moved, name)[[3, 0, 4]]
+        a, b = (np.asarray(getattr(fit, name))[at] for fit, at in ((plain, [0, 1, 2]), (moved, [3, 0, 4])))
         np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)
 
 
 def test_depth_is_seen_worse_than_the_side(found):
     """Axes are away from the camera and sideways; the camera looks 25 degrees down."""
     run, *_ = found
-    curvature = run({0: 0}).quadratic.curvature[0]
+    curvature = run({0: 0}).quadratic.curvature[0, 0]
     assert curvature[0, 0] < curvature[1, 1]
 
 

@@ -35,7 +35,7 @@ def people_of(*modes, **fields):
 
 def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
     full = lambda value: jnp.broadcast_to(jnp.asarray(value, float), (SLOTS,))
-    blank = Quadratic(full(0), jnp.zeros((SLOTS, 4)), jnp.zeros((SLOTS, 4, 4)))
+    blank = Quadratic(full(0)[:, None], jnp.zeros((SLOTS, 1, 4)), jnp.zeros((SLOTS, 1, 4, 4)))
     axes = jnp.zeros((SLOTS, 4, 4))
     return Fit(
         jnp.zeros((SLOTS, 4)),
@@ -43,7 +43,8 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
         jnp.full((SLOTS, 4), 0.1),
         blank,
         full(score),
-        full(share_seen),
+        jnp.zeros((SLOTS, 1, 2)),
+        full(share_seen)[:, None],
         full(0),
         full(surplus),
     )

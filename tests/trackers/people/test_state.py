@@ -16,7 +16,8 @@ from jaxfilters.trackers.people.state import APPEARANCE, FREE, STATE, PeopleConf
         ({"width_sd_m": -0.1}, "width_sd_m must be positive; got -0.1"),
         ({"capacity": 0}, "capacity and grid must be positive integers; got 0"),
         ({"grid": (32, 0)}, r"capacity and grid must be positive integers; got 32, \(32, 0\)"),
-        ({"spread_px": -0.1}, "spread_px must be 0 or more pixels; got -0.1"),
+        ({"spread_px": -0.1}, "spread_px must be 0 or more; got -0.1"),
+        ({"calibration_error": -0.1}, "calibration_error must be 0 or more; got -0.1"),
         ({"dropped": 0.0}, "dropped must be negative log odds; got 0.0"),
     ],
 )
