@@ -42,7 +42,7 @@ class PeopleConfig:
     crosses a threshold of 30 grey levels that much too far out where the contrast is 100."""
     calibration_error: float = 0.0
     """Standard deviation of the shift of silhouettes by the calibration of each camera but the first, which defines the
-    floor, as a share of the columns of its image; 0 for cameras that agree, .005 for those that disagree by decimetres."""
+    floor, as a share of the columns of its image; 0 for cameras that agree, .005 where they differ by decimetres."""
     grid: tuple[int, int] = (32, 16)
     """Samples of a person's window, rows and columns."""
     cell_m: float = 0.3

@@ -168,7 +168,9 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
             places[k],
             axes[k],
             steps[k],
-            jax.vmap(foreground.quadratic_fit, in_axes=(0, None))(values[:, :-2], steps[k]),
+            jax.tree.map(
+                lambda *leaves: jnp.stack(leaves), *(foreground.quadratic_fit(v[:-2], steps[k]) for v in values)
+            ),
             scores[middle],
             shifts[k],
             shares_seen(scene, places[k], mine, unexplained),
@@ -239,6 +241,9 @@ def as_measurement(fit: Fit, silhouette_sd: float) -> Readings:
         H = vectors.T @ axes
         return Readings(H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed)
 
+    if fit.quadratic.value.shape[1] == 1:
+        alone = jax.vmap(one)(fit.place, fit.axes, fit.steps, jax.tree.map(lambda leaf: leaf[:, 0], fit.quadratic))
+        return jax.tree.map(lambda leaf: leaf[:, None], alone)
     return jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)))(fit.place, fit.axes, fit.steps, fit.quadratic)
 
 
