@@ -176,9 +176,9 @@ def filtered(variant: str) -> Callable[[HandSet, Detections], Lifted]:
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
         times = FRAME_INTERVAL * np.arange(len(detections.pixels))
-        detections = detections._replace(noise=persistence(times) * detections.noise)
         hand, limits = hand_of(chosen, detections)
-        frames = _frames(detections)
+        # What is a new view follows from the noise in one frame; the filter takes errors that last for larger ones.
+        frames = _frames(detections._replace(noise=persistence(times) * detections.noise))
         tracker = tracker_of(hand, limits, None, ArticulatedConfig(variant=variant, hypotheses=HYPOTHESES))
         state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
         jax.block_until_ready(tracker.step(state, frames, times))

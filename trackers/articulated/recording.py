@@ -76,6 +76,9 @@ class FeatureSequence:
     start: Start | None = None
     truth: np.ndarray | None = None
     """True states (frames, n), where known; NaN in frames without."""
+    noise_px: float | None = None
+    """Standard deviation of a keypoint's coordinate in one frame at full confidence, pixels; `std` is larger by
+    `persistence`. `None` for other features."""
 
     def __post_init__(self) -> None:
         check_times(self.times_s, self.name)
@@ -166,6 +169,7 @@ def from_keypoints(
         std=_keypoint_rows(np.repeat(std[..., None], 2, axis=-1)),
         name=name,
         image_shape=image_shape,
+        noise_px=noise_px,
     )
 
 

@@ -126,7 +126,9 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
         layout = five_fingers(side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
         motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=diagonal / HAND_DIAGONAL)
-        return articulated_hand(layout, features=KEYPOINTS, motion=motion)
+        # Views differ by what a detector errs by in one frame, however long its errors last.
+        noise = sequence.noise_px or float(np.median(sequence.std[np.isfinite(sequence.y)]))
+        return articulated_hand(layout, features=KEYPOINTS, motion=motion, point_std=noise)
     if sequence.start is None:
         raise ValueError(
             f"{sequence.name}: a start (mean and covariance of the state before the first frame) is needed for "

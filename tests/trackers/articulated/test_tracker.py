@@ -15,7 +15,7 @@ from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
-from jaxfilters.trackers.articulated.recording import FeatureSequence
+from jaxfilters.trackers.articulated.recording import FeatureSequence, from_keypoints
 from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING
 
 KEY = jax.random.key(0)
@@ -151,3 +151,12 @@ def test_features_that_are_no_keypoints_need_a_start():
     without = FeatureSequence(2, FULL, sequence.times_s, sequence.y, sequence.std, "file.npz")
     with pytest.raises(ValueError, match=r"file.npz: a start .* is needed"):
         tracker.build(without)
+
+
+def test_what_is_a_new_view_follows_from_the_noise_in_one_frame():
+    """The filter takes errors that last for larger ones; views must not have to differ by as much."""
+    points = np.random.default_rng(0).uniform(100, 300, (20, 21, 2))
+    sequence = from_keypoints(np.arange(20) / 30, points, "keypoints", noise_px=3.0)
+    hand = tracker.hand_model(sequence, ArticulatedConfig())
+    assert float(hand.point_std) == pytest.approx(3.0)
+    assert sequence[0].std.min() > 4 * float(hand.point_std)
