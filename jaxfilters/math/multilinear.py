@@ -54,9 +54,9 @@ def unfold(X: Float[Array, "..."], mode: int) -> Float[Array, "rows columns"]:
     Examples:
         >>> import jax.numpy as jnp
         >>> from jaxfilters.math import multilinear
-        >>> print(multilinear.unfold(jnp.arange(8).reshape(2, 2, 2), mode=1))
-        [[0 1 4 5]
-         [2 3 6 7]]
+        >>> print(multilinear.unfold(jnp.arange(8.0).reshape(2, 2, 2), mode=1))
+        [[0. 1. 4. 5.]
+         [2. 3. 6. 7.]]
     """
     _check_mode(X.ndim, mode)
     return jnp.moveaxis(X, mode, 0).reshape(X.shape[mode], -1)
@@ -71,7 +71,7 @@ def fold(Y: Float[Array, "rows columns"], mode: int, shape: tuple[int, ...]) -> 
     Examples:
         >>> import jax.numpy as jnp
         >>> from jaxfilters.math import multilinear
-        >>> X = jnp.arange(24).reshape(2, 3, 4)
+        >>> X = jnp.arange(24.0).reshape(2, 3, 4)
         >>> print(bool((multilinear.fold(multilinear.unfold(X, 1), 1, X.shape) == X).all()))
         True
     """

@@ -86,8 +86,8 @@ def resample(
 @jax.custom_jvp
 def _equal(normalized: Float[Array, " n"], ancestors: Int32[Array, " n"]) -> Float[Array, " n"]:
     """Equal log weights, which change as those of the ancestors do."""
-    del ancestors
-    return weights.uniform(normalized.size, normalized.dtype)
+    # Under `vmap` the value must be mapped where its derivative is: JAX 0.10 does not transpose the other case.
+    return weights.uniform(normalized.size, normalized.dtype) + 0.0 * ancestors.astype(normalized.dtype)
 
 
 @_equal.defjvp
