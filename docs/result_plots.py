@@ -32,14 +32,14 @@ def ratios() -> dict[str, float]:
         for key, value in metrics(path.stem).items():
             parts = re.fullmatch(r"ratio_(?:(.+)_)?to_([a-z]+)(.*)", key)
             if parts and parts[2] in PEERS and not LEFT_OUT.search(key):
-                found[f"{label(path.stem, parts[1] or '', parts[3])} / {parts[2]}"] = value
+                which = f" ({parts[3].replace('_', ' ').strip()})" if parts[3] else ""
+                found[f"{label(path.stem, parts[1] or '')} / {parts[2]}{which}"] = value
     return dict(sorted(found.items(), key=lambda item: item[1]))
 
 
-def label(scenario: str, before: str, after: str) -> str:
-    """Name of a ratio: the scenario, then what else its metric's name says about each side."""
-    words = f"{before} {after}".replace("_", " ").strip()
-    words = words.removeprefix(scenario).strip()
+def label(scenario: str, metric: str) -> str:
+    """Name of a ratio: the scenario, then what else its metric's name says."""
+    words = metric.replace("_", " ").removeprefix(scenario).strip()
     return f"{scenario}: {words}" if words else scenario
 
 
