@@ -61,7 +61,7 @@ def checked_times(times_s: Any, count: int | None = None) -> np.ndarray:
     """
     seconds = np.asarray(times_s, float)
     if seconds.ndim != 1 or not len(seconds) or count not in (None, len(seconds)):
-        frames = "at least one frame" if count is None else f"each of {count} frames, at least one"
+        frames = "each frame, at least one" if count is None else f"each of {count} frames, at least one"
         raise ValueError(f"times_s: expected one for {frames}; got shape {seconds.shape}.")
     wrong = np.flatnonzero(~np.isfinite(seconds))
     if len(wrong):
