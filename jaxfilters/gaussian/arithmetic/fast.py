@@ -24,7 +24,7 @@ def update(
     mask: Bool[Array, " m"] | None = None,
     added_root: Float[Array, "m _"] | None = None,
 ) -> tuple[Gaussian, info.KalmanInfo]:
-    """Belief after seeing `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics; as `joseph.update`.
+    """Belief given `y = y_hat + H (x - mean) + r`, r ~ N(0, R), and its diagnostics; as `joseph.update`.
 
     The covariance is `P - W W^T` with `W = P H^T S^-1/2`.
 
