@@ -19,8 +19,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
-_UNROLLED = 8
-"""Largest number of terms of a sum that is written out."""
+from jaxfilters._xla.product import LARGEST, small_product
 
 _ELEMENTWISE = """abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e cbrt ceil clamp
     complex conj convert_element_type copy cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt igamma
@@ -218,7 +217,7 @@ def _stack(eqn, size, values):
 
 def _reduce_sum(eqn, size, values):
     axes, x = sorted(eqn.params["axes"], reverse=True), values[0].array
-    if not 0 < np.prod([x.shape[axis] for axis in axes], dtype=int) <= _UNROLLED:
+    if not 0 < np.prod([x.shape[axis] for axis in axes], dtype=int) <= LARGEST:
         return _leading_axes_only(eqn, size, values)
     for axis in axes:
         x = reduce(add, (lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])))
@@ -226,20 +225,22 @@ def _reduce_sum(eqn, size, values):
 
 
 def _dot_general(eqn, size, values):
-    del size
     contracted, batch = eqn.params["dimension_numbers"]
     shapes = [_shape(value) for value in values]
-    if batch != ((), ()) or len(contracted[0]) != 1 or not 0 < max(*shapes[0], *shapes[1]) <= _UNROLLED:
+    if batch != ((), ()) or len(contracted[0]) != 1 or not 0 < max(*shapes[0], *shapes[1]) <= LARGEST:
         return NotImplemented
-    axes, count = [of[0] for of in contracted], shapes[0][contracted[0][0]]
-    kind = eqn.outvars[0].aval.dtype
-    a, b = ((value.array if value.batched else value.array[..., None]).astype(kind) for value in values)
+    (left,), (right,) = contracted
+    count = shapes[0][left]
+    if count == 0:
+        return NotImplemented
+    a, b = (_full(value, size).astype(eqn.outvars[0].aval.dtype) for value in values)
+    a = jnp.moveaxis(a, left, -2).reshape(-1, count, size)
+    b = jnp.moveaxis(b, right, 0).reshape(count, -1, size)
+    return small_product(a, b).reshape(*eqn.outvars[0].aval.shape, size)
 
-    def term(i):
-        left, right = (lax.index_in_dim(x, i, axis, keepdims=False) for x, axis in zip((a, b), axes, strict=True))
-        return left.reshape(*left.shape[:-1], *(1,) * (right.ndim - 1), left.shape[-1]) * right
 
-    return reduce(add, map(term, range(count))) if count else NotImplemented
+def _small_product(eqn, size, values):
+    return small_product(*(_full(value, size) for value in values), **eqn.params)
 
 
 def _call(eqn, size, values):
@@ -306,6 +307,7 @@ _RULES |= {
     "reduce_sum": _reduce_sum,
     "reshape": _reshape,
     "slice": _slice,
+    "small_product": _small_product,
     "stack": _stack,
     "transpose": _transpose,
 }

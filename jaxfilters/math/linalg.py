@@ -5,17 +5,20 @@ ensemble and is ten times faster on a CPU than a LAPACK call for each matrix; ab
 """
 
 from collections.abc import Callable
-from functools import reduce
-from operator import add
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
 from jaxtyping import Array, Float
 
+from jaxfilters._xla.last_axis import batch_last
 from jaxfilters._xla.materialize import materialized
+from jaxfilters._xla.one_or_many import one_or_many
+from jaxfilters._xla.product import LARGEST, small_product
 
-_UNROLLED = 8
+LARGEST_WIDTH = 24
+"""Number of columns up to which algebra on the elements of a matrix with few rows is faster than LAPACK."""
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -57,9 +60,10 @@ def matmul(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"
     """
     if a.shape[1] != b.shape[0]:
         raise ValueError(f"a and b must be (n, k) and (k, m); got {a.shape} and {b.shape}.")
-    if max(*a.shape, *b.shape) > _UNROLLED or a.shape[1] == 0:
+    if len(a) > LARGEST or not 0 < len(b) <= LARGEST_WIDTH >= b.shape[1]:
         return jnp.matmul(a, b, precision="highest")
-    return materialized(reduce(add, (a[:, i, None] * b[None, i, :] for i in range(a.shape[1]))))
+    kind = jnp.result_type(a, b)
+    return materialized(small_product(a.astype(kind), b.astype(kind)))
 
 
 def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -82,7 +86,7 @@ def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
     if S.shape != S.shape[:1] * 2:
         raise ValueError(f"S must be square; got {S.shape}.")
     n = S.shape[0]
-    if n > _UNROLLED:
+    if n > LARGEST:
         fixed = jnp.diagonal(S) == 0
         L = jnp.linalg.cholesky(jnp.where(fixed[:, None] | fixed, jnp.eye(n, dtype=S.dtype), S))
         return jnp.where(fixed[:, None] | fixed, 0.0, L)
@@ -119,12 +123,18 @@ def solve_triangular(
     n = L.shape[0]
     if L.shape != (n, n) or b.shape[:1] != (n,):
         raise ValueError(f"L and b must be (n, n) and (n,) or (n, m); got {L.shape} and {b.shape}.")
-    if n > _UNROLLED:
+    if n > LARGEST:
         fixed = jnp.diagonal(L) == 0
         rest = jnp.where(fixed.reshape((n,) + (1,) * (b.ndim - 1)), 0.0, b)
         # An unknown that is fixed at zero must not influence the others through its column or row.
         square = jnp.where(fixed[:, None] | fixed, jnp.eye(n, dtype=L.dtype), L)
         return lapack_solve_triangular(square, rest, lower=True, trans=1 if transpose else 0)
+    return materialized(_substituted(transpose, L, b))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _substituted(transpose, L, b):
+    n = L.shape[0]
     diagonal = jnp.stack([L[i, i] for i in range(n)])
     fixed = diagonal == 0
     scale = jnp.where(fixed, 0.0, 1 / jnp.where(fixed, 1.0, diagonal))
@@ -132,7 +142,16 @@ def solve_triangular(
     for i in reversed(range(n)) if transpose else range(n):
         known = range(i + 1, n) if transpose else range(i)
         x[i] = (b[i] - sum((L[k, i] if transpose else L[i, k]) * x[k] for k in known)) * scale[i]
-    return materialized(jnp.stack(x))
+    return jnp.stack(x)
+
+
+@_substituted.defjvp
+def _substituted_jvp(transpose, primals, tangents):
+    # The derivative of L x = b; as products of matrices it is transposed to products.
+    (L, b), (dL, db) = primals, tangents
+    x = _substituted(transpose, L, b)
+    changed = matmul(jnp.tril(dL).T if transpose else jnp.tril(dL), x.reshape(len(b), -1)).reshape(b.shape)
+    return x, _substituted(transpose, L, db - changed)
 
 
 def tria(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
@@ -193,31 +212,67 @@ def tria_of_many(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """
     n, m = A.shape
     A = jnp.pad(A, ((0, 0), (0, max(0, n - m))))
-    return _reflected(A) if n <= _UNROLLED else _tria(A)
+    return _small_tria(A) if n <= LARGEST else _tria(A)
 
 
-@jax.custom_jvp
-def _reflected(A):
-    n, m = A.shape
+def reflected(count: int, A: Float[Array, "n m"], *others: Float[Array, "_ m"]) -> tuple[Float[Array, "_ m"], ...]:
+    """`A` and the other matrices times the reflections that make the first `count` rows of `A` lower triangular.
+
+    These are Householder's, written as algebra on the elements, for many matrices under `vmap`. Elements on the
+    diagonal may be negative. A row that is a linear combination of those before it has a zero there.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> L, Q = linalg.reflected(1, jnp.array([[3.0, 4.0]]), jnp.eye(2))
+        >>> print(L.round(3), Q.round(3))
+        [[-5.  0.]] [[-0.6 -0.8]
+         [-0.8  0.6]]
+    """
     # Sums of squares must neither overflow nor vanish.
     largest = jnp.max(jnp.abs(A))
     scale = jnp.where(largest > 0, largest, 1.0)
-    A = A / scale
-    for i in range(min(n, m - 1)):
-        row = jnp.where(jnp.arange(m) >= i, A[i], 0.0)
-        length = jnp.sqrt(jnp.sum(row * row))
-        normal = row + jnp.where(jnp.arange(m) == i, jnp.where(row[i] < 0, -length, length), 0.0)
-        square = jnp.sum(normal * normal)
-        along = jnp.sum(A * normal, axis=1) * jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
-        A = materialized(A - along[:, None] * normal)
-    L = A[:, :n]
-    return jnp.tril(L * jnp.where(jnp.diagonal(L) < 0, -scale, scale))
+    rest, done = [A / scale, *others], []
+    for i in range(count):
+        if rest[0].shape[1] > 1:
+            normal = _normal(rest[0][i : i + 1])
+            square = small_product(normal, normal.T)
+            twice = jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
+            rest = [materialized(x - small_product(small_product(x, normal.T) * twice, normal)) for x in rest]
+        # Later reflections do not change this column.
+        done.append([x[:, :1] for x in rest])
+        rest = [x[:, 1:] for x in rest]
+    A, *others = map(jnp.hstack, zip(*done, rest, strict=True))
+    return A * scale, *others
 
 
-def _factors(A):
+def _normal(row):
+    """Of the mirror that takes a row (1, m) to its first axis."""
+    first = row[:, :1]
+    length = jnp.sqrt(small_product(row, row.T))
+    return jnp.hstack([first + jnp.where(first < 0, -length, length), row[:, 1:]])
+
+
+def _factors_of_one(A):
     Q, R = jnp.linalg.qr(A.T)
     sign = jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0).astype(A.dtype)
     return jnp.tril(R.T * sign), Q * sign
+
+
+def _small_factors(A):
+    n, m = A.shape
+    L, Q = reflected(n, A, jnp.eye(m, dtype=A.dtype))
+    sign = jnp.where(jnp.diagonal(L) < 0, -1.0, 1.0).astype(A.dtype)
+    return jnp.tril(L[:, :n] * sign), Q[:, :n] * sign
+
+
+def _factors_of_many(A):
+    small = A.shape[2] <= LARGEST_WIDTH
+    return jax.vmap(batch_last(_small_factors))(A) if small else jax.lax.map(_factors, A)
+
+
+_factors = one_or_many(_factors_of_one, _factors_of_many)
+"""L and Q of A = L Q^T with a nonnegative diagonal of L, for A with no fewer columns than rows."""
 
 
 @jax.custom_jvp
@@ -225,15 +280,20 @@ def _tria(A):
     return _factors(A)[0]
 
 
-@_reflected.defjvp
+@jax.custom_jvp
+def _small_tria(A):
+    return _small_factors(A)[0]
+
+
+@_small_tria.defjvp
 @_tria.defjvp
 def _tria_jvp(primals, tangents):
     # A = L Q^T. For every skew-symmetric W, dL = dA Q + L W satisfies d(L L^T) = d(A A^T), at any rank. The W for which
     # dL is lower triangular follows from the upper triangle of L^-1 dA Q, which needs independent rows only.
     (A,), (dA,) = primals, tangents
     L, Q = _factors(A)
-    turned = jnp.matmul(dA, Q, precision="highest")
-    dependent = jnp.diagonal(L) <= 4 * jnp.finfo(L.dtype).eps * jnp.linalg.norm(L, axis=1)
+    turned = matmul(dA, Q)
+    dependent = jnp.diagonal(L) <= 4 * jnp.finfo(L.dtype).eps * safe_norm(L)
     independent = jnp.where(dependent[:, None], jnp.eye(len(L), dtype=L.dtype), L)
-    upper = jnp.triu(lapack_solve_triangular(independent, jnp.where(dependent[:, None], 0.0, turned), lower=True), 1)
-    return L, jnp.tril(turned + jnp.matmul(L, upper.T - upper, precision="highest"))
+    upper = jnp.triu(solve_triangular(independent, jnp.where(dependent[:, None], 0.0, turned)), 1)
+    return L, jnp.tril(turned + matmul(L, upper.T - upper))

@@ -3,11 +3,14 @@
 Roots may have any width: `root root^T` is the covariance.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular as lapack_solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._xla.last_axis import batch_last
+from jaxfilters._xla.one_or_many import one_or_many
 from jaxfilters.gaussian.arithmetic import factor, info
 from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.math import linalg
@@ -164,16 +167,34 @@ def _conditioned(measured, noise, state):
     measured = jnp.pad(measured, ((0, 0), (0, state.shape[1] - measured.shape[1])))
     V, G = jnp.hstack([measured, noise]), jnp.pad(state, ((0, 0), (0, m)))
 
-    def sound(_V, _G, root, cross, posterior):
-        return root, cross, posterior
+    return _triangular(V, G)
 
-    def deficient(V, G, *_):
-        # A reflection was spent on a row that needs none, and hid a direction of the state.
-        root, cross, posterior = _ordered(V, G)
-        return root, cross, jnp.pad(posterior, ((0, 0), (0, state.shape[1] - n)))
 
-    found = _reflected(V, G)[:3]
-    return jax.lax.cond(jnp.all(_independent(found[0])), sound, deficient, V, G, *found)
+def _triangular_one(V, G):
+    return _repaired(V, G, *_reflected(V, G)[:3])
+
+
+def _repaired(V, G, root, *found):
+    return jax.lax.cond(jnp.all(_independent(root)), _sound, _deficient, V, G, root, *found)
+
+
+def _triangular_many(V, G):
+    # Most batches have no deficient element, and `vmap` of a condition computes both sides.
+    found = jax.vmap(_reflected)(V, G)[:3]
+    independent = jax.vmap(batch_last(_independent))(found[0])
+
+    return jax.lax.cond(jnp.all(independent), _sound, jax.vmap(_repaired), V, G, *found)
+
+
+def _sound(_V, _G, root, cross, posterior):
+    return root, cross, posterior
+
+
+def _deficient(V, G, *_):
+    # A reflection was spent on a row that needs none, and hid a direction of the state.
+    root, cross, posterior = _ordered(V, G)
+    width = G.shape[1] - V.shape[0]
+    return root, cross, jnp.pad(posterior, ((0, 0), (0, width - posterior.shape[1])))
 
 
 def _independent(root):
@@ -188,16 +209,42 @@ def _ordered(V, G):
     return joint[:m, :m], joint[m:, :m], joint[m:, m:]
 
 
-@jax.custom_jvp
-def _reflected(V, G):
-    # One reflection a row of V, and none for the state: its root need not be triangular.
+def _reflected_one(V, G):
     m, width = V.shape
     packed, scales = jnp.linalg.qr(V.T, mode="raw")
     packed = packed.T
-    sign = jnp.where(jnp.diagonal(packed) < 0, -1.0, 1.0).astype(V.dtype)
     turned = jax.lax.linalg.ormqr(packed, scales, G.T, transpose=True)
     rest = jax.lax.linalg.ormqr(packed, scales, jnp.eye(width, dtype=V.dtype)[:, m:])
-    return jnp.tril(packed[:m].T * sign), turned[:m].T * sign, turned[m:].T, rest
+    return _signed(packed[:m].T, turned.T, rest)
+
+
+def _reflected_small(V, G):
+    m, width = V.shape
+    L, turned, Q = linalg.reflected(m, V, G, jnp.eye(width, dtype=V.dtype))
+    return _signed(L[:, :m], turned, Q[:, m:])
+
+
+def _reflected_many(V, G):
+    small = V.shape[2] <= linalg.LARGEST_WIDTH
+    return jax.vmap(batch_last(_reflected_small))(V, G) if small else jax.lax.map(lambda one: _reflect(*one), (V, G))
+
+
+def _signed(L, turned, rest):
+    m = len(L)
+    sign = jnp.where(jnp.diagonal(L) < 0, -1.0, 1.0).astype(L.dtype)
+    return jnp.tril(L * sign), turned[:, :m] * sign, turned[:, m:], rest
+
+
+_reflect = one_or_many(_reflected_one, _reflected_many)
+
+
+_triangular = one_or_many(_triangular_one, _triangular_many)
+
+
+@jax.custom_jvp
+def _reflected(V, G):
+    # One reflection a row of V, and none for the state: its root need not be triangular.
+    return _reflect(V, G)
 
 
 @_reflected.defjvp
@@ -207,7 +254,7 @@ def _reflected_jvp(primals, tangents):
     (V, G), (dV, dG) = primals, tangents
     L, C, D, rest = _reflected(V, G)
     independent = jnp.where(_independent(L)[:, None], L, jnp.eye(L.shape[0], dtype=L.dtype))
-    solve = lambda b, trans=0: lapack_solve_triangular(independent, b, lower=True, trans=trans)
+    solve = partial(linalg.solve_triangular, independent)
     first = solve(V).T
     turned = linalg.matmul(dV, first)
     upper = jnp.triu(solve(turned), 1)

@@ -3,6 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.gaussian.arithmetic import square_root
+from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.math import linalg
 
 SIZES = [1, 2, 5, 8, 9, 12]
@@ -130,6 +132,37 @@ def test_tria_gradient_is_finite_at_any_rank(A):
     L = tria(A)
     np.testing.assert_allclose(L @ L.T, A @ A.T, atol=1e-5)
     assert np.isfinite(jax.jit(jax.grad(lambda A: jnp.sum(linalg.tria(A))))(A)).all()
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (9, 11)])
+def test_tria_of_a_batch_is_that_of_each(x64, rng, shape):
+    many = rng.normal(size=(5, *shape))
+    many[1, 1] = 0
+    many[2, 2] = many[2, 0] - many[2, 1]
+    many[3] = 0
+    weight = jnp.asarray(rng.normal(size=(shape[0], shape[0])))
+    both = jax.value_and_grad(lambda A: (lambda L: (jnp.sum(weight * L), L))(linalg.tria(A)), has_aux=True)
+    found, change = jax.jit(jax.vmap(both))(many)
+    for one, L, gradient, independent in zip(many, found[1], change, [True, False, False, False, True], strict=True):
+        np.testing.assert_allclose(L, tria(one), atol=1e-12)
+        if independent:
+            np.testing.assert_allclose(gradient, jax.jit(both)(one)[1], atol=1e-10)
+    assert np.isfinite(change).all()
+
+
+@pytest.mark.parametrize(
+    "transform", [lambda f: jax.grad(lambda A: jax.vmap(f)(A).sum()), lambda f: jax.vmap(jax.grad(f))]
+)
+def test_gradient_of_a_batch_calls_no_lapack(transform):
+    """Two such calls at a time wait for each other for ever on a processor with two cores."""
+    shapes = [jnp.ones((10, 3, 5)), jnp.ones((10, 3, 3)), jnp.ones((10, 3))]
+
+    def update(root, H, y):
+        posterior, info = square_root.update(GaussianRoot(y, root), y, H, jnp.eye(3))
+        return info.log_evidence + linalg.tria(posterior.root)[0, 0]
+
+    program = jax.jit(transform(lambda A: update(A, *(x[0] for x in shapes[1:])))).lower(shapes[0]).as_text()
+    assert "lapack" not in program
 
 
 def test_safe_root_and_length_have_zero_derivative_at_zero():
