@@ -80,7 +80,7 @@ def scene(sequence: FeatureSequence, hand: ArticulatedHand, results: TimedArticu
     return Scene(
         canvas=_canvas(sequence.image_shape, _measured(sequence, slice(None)), joints),
         measured=_measured(sequence, frames),
-        wrist=results.mean[:, hand.layout.position].astype(float),
+        wrist=np.asarray(_wrists(jnp.asarray(results.mean), hand), float),
         joints=joints,
         palm=np.asarray(_palm_corners(jnp.asarray(results.mean), hand), float),
         true_joints=_true_joints(sequence, hand, frames),
@@ -179,6 +179,15 @@ def _palm_corners(states: jax.Array, hand: ArticulatedHand) -> jax.Array:
         return hand.projection.image_points(hand.projection.camera_points(x, hand.layout, points))
 
     return jax.vmap(corners)(states)
+
+
+@jax.jit
+def _wrists(states: jax.Array, hand: ArticulatedHand) -> jax.Array:
+    """(frames, 2) pixels."""
+    origin = jnp.zeros(3, states.dtype)
+    return jax.vmap(lambda x: hand.projection.image_points(hand.projection.camera_points(x, hand.layout, origin)))(
+        states
+    )
 
 
 @jax.jit

@@ -14,7 +14,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ".npz with features or keypoints, folder of OpenPose's *_keypoints.json, or .json or .csv of MediaPipe's "
         "landmarks",
     )
-    add_config(parser, ArticulatedConfig, "variant", "hypotheses", "gate", "hand")
+    add_config(parser, ArticulatedConfig, "variant", "hypotheses", "gate", "hand", "focal", "palm_width")
     parser.add_argument(
         "--image-size", type=image_size, metavar="WIDTHxHEIGHT", help="of the image, for coordinates from 0 to 1"
     )

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters.gaussian.constraints import LinearConstraints
 from jaxfilters.math.lie import quaternion_multiply, so3_exp
-from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
+from jaxfilters.models.articulated.anatomy import PALM_WIDTH, relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.articulated.motion import ANGLE_SPREAD
@@ -29,6 +29,11 @@ ROTATION_STD, ANGLE_STD = math.radians(15.0), ANGLE_SPREAD
 """About the fitted pose; angles also about the relaxed hand while it is fitted, radians."""
 SIZE_STD, LENGTH_STD = 0.1, 0.08
 """Of the hand as a whole, and of each length on its own: shares of the average hand's."""
+SIZE_STD_OF_WIDTH = 0.05
+"""Of the size of the fingers where the width of the palm was measured: lengths and widths of hands each vary by about
+5 to 6 % (S. Pheasant, Bodyspace, 1996), and so does their ratio by 5 % where the two correlate by .6."""
+WIDTH_STD = 2.0
+"""Millimetres, of a palm's width by a ruler."""
 POSITION_STD = 5.0
 """Pixels."""
 LIMIT_STD = math.radians(3.0)
@@ -42,6 +47,29 @@ SAME_POSE = math.radians(15.0)
 _SET_BACK = 1e6
 _OUTLIER = 3.0
 """Standard deviations of a point beyond which its pull on the fit grows no more."""
+
+
+class HandSize(NamedTuple):
+    """What is known of the size of a hand before a camera in perspective."""
+
+    share: Float[Array, ""] | float = 1.0
+    """Of the average hand's."""
+    std: Float[Array, ""] | float = SIZE_STD
+    """Of its logarithm."""
+    width_std: Float[Array, ""] | float = LENGTH_STD
+    """Of the palm's width, a share of it."""
+    width_varies: Float[Array, ""] | float = 1.0
+    """1 where the palm's width goes with the size, 0 where it was measured."""
+
+
+AVERAGE_SIZE = HandSize()
+
+
+def size_of(palm_width: float | None) -> HandSize:
+    """The size of a hand whose palm is as wide, in metres; `None` is any hand."""
+    if palm_width is None:
+        return AVERAGE_SIZE
+    return HandSize(1e3 * palm_width / PALM_WIDTH, SIZE_STD_OF_WIDTH, 1e-3 * WIDTH_STD / palm_width, 0.0)
 
 
 class Starts(NamedTuple):
@@ -61,6 +89,7 @@ def starts_from_points(
     y: Float[Array, " rows"],
     mask: Bool[Array, " rows"],
     std: Float[Array, " rows"],
+    size: HandSize = AVERAGE_SIZE,
 ) -> Starts:
     """The poses of an average hand that explain one image best, from many orientations.
 
@@ -73,14 +102,16 @@ def starts_from_points(
         y: Pixels; what was not measured may hold anything finite.
         mask: Which rows were measured.
         std: Noise of the rows, pixels.
+        size: Of the hand; in weak perspective it means nothing.
     """
     layout = hand.layout
     observed = mask.reshape(-1, 2).all(axis=1)
     target = jnp.where(observed[:, None], y.reshape(-1, 2), 0.0)
     found = jnp.sum(observed) >= FEWEST_POINTS
-    states, misfits = jax.vmap(lambda q: _laid_over(hand, _template(hand, q), target, observed))(_orientations(y.dtype))
+    orientations = _orientations(y.dtype)
+    states, misfits = jax.vmap(lambda q: _laid_over(hand, _template(hand, q, size), target, observed))(orientations)
     order = jnp.argsort(misfits)[: 2 * NUM_STARTS]
-    fit = partial(_fitted, hand, limits, y, jnp.repeat(observed, 2), std)
+    fit = partial(_fitted, hand, limits, y, jnp.repeat(observed, 2), std, size)
     # One after the other: LAPACK calls in a batch stand still in jaxlib 0.10 on two cores.
     means, costs = jax.lax.map(fit, states[order])
     costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -88,8 +119,8 @@ def starts_from_points(
     best = jnp.argsort(apart)[:NUM_STARTS]
     means = jnp.where(jnp.isfinite(means[best]), means[best], states[order][best])
     found = found & jnp.all(jnp.isfinite(means))
-    means = jnp.where(found, means, jax.vmap(partial(_template, hand))(_orientations(y.dtype)[:NUM_STARTS]))
-    covariances = jax.vmap(partial(_covariance, hand))(means)
+    means = jnp.where(found, means, jax.vmap(lambda q: _template(hand, q, size))(orientations[:NUM_STARTS]))
+    covariances = jax.vmap(partial(_covariance, hand, size))(means)
     return Starts(means, covariances, apart[best], found)
 
 
@@ -114,11 +145,11 @@ def _orientations(dtype: np.dtype) -> Float[Array, "k 4"]:
     return jax.vmap(one)(jnp.asarray(rolls.ravel(), dtype), jnp.asarray(tilts.ravel(), dtype))
 
 
-def _template(hand: ArticulatedHand, q: Array) -> Float[Array, " n"]:
-    """The average hand, relaxed, on the optical axis: lengths in millimetres for pixels, or in metres."""
+def _template(hand: ArticulatedHand, q: Array, size: HandSize) -> Float[Array, " n"]:
+    """An average hand of this size, relaxed, on the optical axis: lengths in millimetres for pixels, or in metres."""
     layout = hand.layout
     in_space = isinstance(hand.projection, Perspective)
-    shape = jnp.asarray(template_shape() * (1e-3 if in_space else 1.0), q.dtype)
+    shape = jnp.asarray(template_shape(), q.dtype) * (1e-3 * size.share if in_space else 1.0)
     x = jnp.zeros(layout.size, q.dtype).at[layout.quaternion].set(q).at[layout.static].set(shape)
     x = x.at[layout.angles].set(jnp.asarray(relaxed_angles(layout), q.dtype).ravel())
     return x.at[2].set(_DISTANCE) if in_space else x
@@ -151,11 +182,17 @@ def _laid_over(hand: ArticulatedHand, x: Array, target: Array, observed: Array) 
 
 
 def _fitted(
-    hand: ArticulatedHand, limits: LinearConstraints | None, y: Array, observed: Array, std: Array, start: Array
+    hand: ArticulatedHand,
+    limits: LinearConstraints | None,
+    y: Array,
+    observed: Array,
+    std: Array,
+    size: HandSize,
+    start: Array,
 ) -> tuple[Array, Array]:
     """Gauss-Newton from one state, and the cost at its end."""
     layout = hand.layout
-    position, rotation, size = layout.position.stop, layout.position.stop + 3, layout.position.stop + 4
+    position, rotation, angles = layout.position.stop, layout.position.stop + 3, layout.position.stop + 4
     in_space = isinstance(hand.projection, Perspective)
     unit = start[2] if in_space else 1.0
     relaxed = jnp.asarray(relaxed_angles(layout), start.dtype).ravel()
@@ -163,7 +200,7 @@ def _fitted(
     def state(p: Array) -> Array:
         x = start.at[layout.position].add(unit * p[:position])
         x = x.at[layout.quaternion].set(quaternion_multiply(so3_exp(p[position:rotation]), start[layout.quaternion]))
-        return x.at[layout.static].multiply(jnp.exp(p[rotation])).at[layout.angles].add(p[size:])
+        return x.at[layout.static].multiply(jnp.exp(p[rotation])).at[layout.angles].add(p[angles:])
 
     def deviations(p: Array) -> Array:
         x = state(p)
@@ -171,7 +208,7 @@ def _fitted(
         pair = jnp.sum(jax.lax.stop_gradient(missed).reshape(-1, 2) ** 2, axis=1)
         missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
         parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]
-        parts += [p[rotation : rotation + 1] / SIZE_STD] if in_space else []
+        parts += [p[rotation:angles] / size.std] if in_space else []
         if limits is not None:
             value = limits.normals @ x
             outside = jnp.maximum(value - limits.upper, 0.0) + jnp.maximum(limits.lower - value, 0.0)
@@ -190,13 +227,13 @@ def _fitted(
         damping = jnp.where(better, 0.2 * damping, 5.0 * damping)
         return (jnp.where(better, tried, p), jnp.where(better, after, cost), damping), None
 
-    zero = jnp.zeros(size + 4 * layout.num_fingers, start.dtype)
+    zero = jnp.zeros(angles + 4 * layout.num_fingers, start.dtype)
     first = (zero, 0.5 * jnp.sum(deviations(zero) ** 2), jnp.asarray(0.1, start.dtype))
     (p, cost, _), _ = jax.lax.scan(step, first, None, length=STEPS)
     return state(p), cost
 
 
-def _covariance(hand: ArticulatedHand, x: Array) -> Array:
+def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
     """Pose as fitted; a hand as a whole may be larger or smaller, in perspective at a distance in proportion."""
     layout: Layout = hand.layout
     projection = hand.projection
@@ -204,11 +241,15 @@ def _covariance(hand: ArticulatedHand, x: Array) -> Array:
     position, quaternion, angle = RATE_STD
     rates = layout.per_moving(1.0, quaternion, angle).at[layout.position].multiply(position * pixel) ** 2
     moving = layout.per_moving(1.0, 0.0, ANGLE_STD).at[layout.position].multiply(POSITION_STD * pixel) ** 2
-    variances = jnp.concatenate([moving, rates, (LENGTH_STD * x[layout.static]) ** 2]).astype(x.dtype)
+    if not isinstance(projection, Perspective):
+        size = AVERAGE_SIZE
+    width = layout.palm.start
+    shape_std = (LENGTH_STD * x[layout.static]).at[width - layout.static.start].set(size.width_std * x[width])
+    variances = jnp.concatenate([moving, rates, shape_std**2]).astype(x.dtype)
     q = x[layout.quaternion]
     across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
     covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)
     grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static])
     if isinstance(projection, Perspective):
-        grows = grows.at[layout.position].set(x[layout.position])
-    return covariance + SIZE_STD**2 * jnp.outer(grows, grows)
+        grows = grows.at[layout.position].set(x[layout.position]).at[width].multiply(size.width_varies)
+    return covariance + size.std**2 * jnp.outer(grows, grows)

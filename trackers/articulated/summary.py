@@ -116,11 +116,11 @@ def _charts(sequence: FeatureSequence, layout: Layout, results: TimedArticulated
         chart("hypotheses", [Curve("", results.num_hypotheses.astype(float), _INK)], 2, from_zero=True),
     ]
     thirds: list[np.ndarray] = []
-    groups = _lengths(layout)
+    groups, unit = _lengths(layout), "px" if layout.position_size == 2 else "m"
     for i, names in enumerate(groups):
         pairs = [states.curves(name, color, labelled=True) for name, color in zip(names, _COLORS, strict=True)]
         curves = [curve for pair in pairs for curve in pair]
-        thirds.append(chart("px", curves, 3, "time (s)" if i >= len(groups) - 3 else ""))
+        thirds.append(chart(unit, curves, 3, "time (s)" if i >= len(groups) - 3 else ""))
     return [*_rows(halves, 2), *_rows(thirds, 3)]
 
 

@@ -33,8 +33,9 @@ class TimedArticulatedTrack(NamedTuple):
 
 def articulated_table(layout: Layout) -> TrackTable:
     """The columns of a hand with these fingers: its state, standard deviations and what the filter says of itself."""
-    means = tuple(_column(name, "") for name in layout.names)
-    stds = tuple(_column(name, "_std") for name in layout.names)
+    unit = "_px" if layout.position_size == 2 else "_m"
+    means = tuple(_column(name, "", unit) for name in layout.names)
+    stds = tuple(_column(name, "_std", unit) for name in layout.names)
     diagnostics = (Columns((name,), attrgetter(name)) for name in _DIAGNOSTICS)
     lengths = tuple(f"{name}_observed" for name in layout.names[layout.lengths])
     observed = Columns(lengths, attrgetter("length_observed"))
@@ -42,7 +43,7 @@ def articulated_table(layout: Layout) -> TrackTable:
     return TrackTable(TimedArticulatedTrack, parts)
 
 
-def _column(name: str, suffix: str) -> str:
-    """`r_11_px`, `theta_13_rate_std_rad_per_frame`; the parts of the quaternion have no unit."""
-    unit = "_rad" if name.startswith("theta") else "" if name.startswith("q_") else "_px"
+def _column(name: str, suffix: str, length: str) -> str:
+    """`r_11_px` or `r_11_m`, `theta_13_rate_std_rad_per_frame`; the parts of the quaternion have no unit."""
+    unit = "_rad" if name.startswith("theta") else "" if name.startswith("q_") else length
     return f"{name}{suffix}{unit}" + ("_per_frame" if name.endswith("_rate") else "")

@@ -38,6 +38,8 @@ from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
+from jaxfilters.models.articulated.projection import Perspective
+from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import (
@@ -48,7 +50,7 @@ from jaxfilters.trackers.articulated.recording import (
     from_keypoints,
     keypoint_noise,
 )
-from jaxfilters.trackers.articulated.start import NUM_STARTS, Starts, starts_from_points
+from jaxfilters.trackers.articulated.start import NUM_STARTS, HandSize, Starts, size_of, starts_from_points
 from jaxfilters.trackers.tracker import Tracker, checked_times, track_frames
 
 SEARCHING, TRACKING, LOST = range(3)
@@ -67,10 +69,11 @@ class ArticulatedTrack(NamedTuple):
     """States, in the order of the layout."""
     std: Float[Array | np.ndarray, "b n"]
     points: Float[Array | np.ndarray, "b fingers 4 3"]
-    """Joints from base to tip in the camera frame, pixels; depth is counted from the wrist's."""
+    """Joints from base to tip in the camera frame: pixels, with depth counted from the wrist's; metres with `focal`."""
     image_points: Float[Array | np.ndarray, "b fingers 4 2"]
     """Pixels."""
     scale: Float[Array | np.ndarray, " b"]
+    """The quaternion's squared length: pixels of the image for one of a length; 1 with `focal`."""
     weight: Float[Array | np.ndarray, " b"]
     """Share of the heaviest hypothesis."""
     num_hypotheses: Int[Array | np.ndarray, " b"]
@@ -107,11 +110,12 @@ class _Setup:
     hand: ArticulatedHand
     limits: Inequalities
     start: Start | None
+    size: HandSize
     config: ArticulatedConfig = field(metadata={"static": True})
 
     def compiled(self) -> "_Setup":
-        """The same for compiled functions, which serve all seeds."""
-        return replace(self, config=replace(self.config, seed=0))
+        """The same for compiled functions, which serve all seeds and sizes."""
+        return replace(self, config=replace(self.config, seed=0, palm_width=None))
 
 
 def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> ArticulatedHand:
@@ -120,21 +124,40 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
     Other hands move with constant velocity, as in the paper.
 
     Raises:
-        ValueError: where neither a start is given nor keypoints of five fingers, from which one is found.
+        ValueError: where neither a start is given nor keypoints of five fingers, from which one is found; or the
+            configuration has a focal length, and the recording no size of the image, or other features, a start or
+            true states.
     """
     if sequence.features == KEYPOINTS and sequence.num_fingers == 5:
-        layout = five_fingers(side=1.0 if config.hand == "right" else -1.0)
+        camera = _camera(sequence, config)
+        layout = five_fingers(2 if camera is None else 3, side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
-        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=diagonal / HAND_DIAGONAL)
+        per_metre = diagonal / HAND_DIAGONAL if camera is None else 1.0
+        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=per_metre)
         # Views differ by what a detector errs by in one frame, however long its errors last.
         noise = sequence.noise_px or float(np.median(sequence.std[np.isfinite(sequence.y)]))
-        return articulated_hand(layout, features=KEYPOINTS, motion=motion, point_std=noise)
+        projection = None if camera is None else Perspective(camera)
+        return articulated_hand(layout, projection=projection, features=KEYPOINTS, motion=motion, point_std=noise)
+    if config.focal is not None:
+        raise ValueError(f"{sequence.name}: focal is of use with the 21 keypoints of a hand only.")
     if sequence.start is None:
         raise ValueError(
             f"{sequence.name}: a start (mean and covariance of the state before the first frame) is needed for "
             f"features other than the 21 keypoints of a hand."
         )
     return articulated_hand(Layout(sequence.num_fingers), features=sequence.features)
+
+
+def _camera(sequence: FeatureSequence, config: ArticulatedConfig) -> Pinhole | None:
+    """The camera in perspective that the configuration asks for."""
+    if config.focal is None:
+        return None
+    if sequence.start is not None or sequence.truth is not None:
+        raise ValueError(f"{sequence.name}: a start and true states are in pixels; they cannot be used with focal.")
+    if sequence.image_shape is None:
+        raise ValueError(f"{sequence.name}: focal needs the size of the image, whose middle is on the camera's axis.")
+    rows, columns = sequence.image_shape
+    return Pinhole.from_intrinsics(config.focal, (0.5 * (columns - 1), 0.5 * (rows - 1)), (rows, columns))
 
 
 def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> Tracker:
@@ -201,7 +224,8 @@ def track_sequence(sequence: FeatureSequence, config: ArticulatedConfig | None =
 
 def tracker_of(hand: ArticulatedHand, limits: Inequalities, start: Start | None, config: ArticulatedConfig) -> Tracker:
     """A tracker of any hand; without a start, one of five fingers whose features are points finds its own."""
-    setup = _Setup(hand, limits, start, config)
+    size = jax.tree.map(lambda value: jnp.asarray(value, dtype=float), size_of(config.palm_width))
+    setup = _Setup(hand, limits, start, size, config)
     return Tracker(partial(_start, setup), partial(_advance, setup))
 
 
@@ -271,7 +295,7 @@ def _first_belief(bank: GaussianSumState) -> Gaussian:
 
 def _keypoint_starts(setup: _Setup, frame: FeatureFrame) -> Starts:
     limits = None if setup.config.variant == "unconstrained" else setup.limits.constraints
-    return starts_from_points(setup.hand, limits, frame.y, frame.mask, frame.std)
+    return starts_from_points(setup.hand, limits, frame.y, frame.mask, frame.std, setup.size)
 
 
 def _advance(

@@ -14,7 +14,7 @@ from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
 from jaxfilters.models.articulated.projection import Perspective, WeakPerspective
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.articulated.start import NUM_STARTS, starts_from_points
+from jaxfilters.trackers.articulated.start import NUM_STARTS, size_of, starts_from_points
 
 pytestmark = pytest.mark.system
 
@@ -95,3 +95,23 @@ def test_too_few_points_are_no_start(scene):
     assert not bool(found.found)
     assert found.means.shape[0] == NUM_STARTS
     assert bool(jnp.all(jnp.isfinite(found.means)))
+
+
+def test_a_measured_palm_gives_the_size_and_the_distance():
+    """A small hand: its image alone is that of an average hand farther away; with its palm's width it is not."""
+    hand, limits = hand_in(Perspective(CAMERA))
+    layout, share = hand.layout, 0.8
+    truth = true_state(hand, (0, 0, 0), np.random.default_rng(5)).at[layout.static].multiply(share)
+    y, mask, std = hand.observe(truth), jnp.ones(42, bool), jnp.full(42, 2.0)
+    average, measured = (
+        jax.jit(lambda size: starts_from_points(hand, limits, y, mask, std, size))(size_of(width))
+        for width in (None, share * 0.08)
+    )
+    wide, deep = layout.palm.start, 2
+    assert average.means[0, deep] > 1.1 * truth[deep]
+    assert measured.means[0, deep] == pytest.approx(float(truth[deep]), rel=0.06)
+    assert measured.means[0, wide] == pytest.approx(share * 0.08, rel=0.03)
+    # A ruler's error for the width, and a third of what nobody measured for the distance's.
+    deviations = [np.sqrt(np.diagonal(found.covariances[0])) for found in (average, measured)]
+    assert deviations[1][wide] == pytest.approx(0.002, rel=0.05)
+    assert deviations[1][deep] < 0.6 * deviations[0][deep]

@@ -29,6 +29,12 @@ def test_columns_have_the_names_of_the_state_and_units():
     assert len(five) == len(set(five)) == 2 * five_fingers().size + len(DIAGNOSTICS) + 15
 
 
+def test_lengths_of_a_hand_in_space_are_in_metres():
+    columns = articulated_table(five_fingers(3)).columns
+    assert {"wrist_z_m", "r_11_m", "r_w_std_m", "wrist_z_rate_m_per_frame", "theta_13_rad"} <= set(columns)
+    assert not any(column.endswith("_px") for column in columns)
+
+
 def test_a_row_is_the_track_at_one_frame(perfect_track):
     table = articulated_table(Layout(2))
     parts = [part.values(perfect_track).reshape(len(perfect_track.times_s), -1) for part in table.parts]

@@ -4,14 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.models.articulated.anatomy import template_shape
+from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
 from jaxfilters.models.articulated.features import FULL, KEYPOINTS
 from jaxfilters.models.articulated.filters import FeatureObservation, belief_of, inequalities, literal
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
+from jaxfilters.models.articulated.projection import Perspective
+from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
@@ -160,3 +163,52 @@ def test_what_is_a_new_view_follows_from_the_noise_in_one_frame():
     hand = tracker.hand_model(sequence, ArticulatedConfig())
     assert float(hand.point_std) == pytest.approx(3.0)
     assert sequence[0].std.min() > 4 * float(hand.point_std)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"palm_width": 0.08}, "palm_width needs focal"),
+        ({"palm_width": 80.0, "focal": 500.0}, "metres"),
+        ({"focal": 0.0}, "focal must be positive"),
+        ({"focal": float("nan")}, "focal must be positive"),
+    ],
+)
+def test_a_size_without_a_camera_or_in_another_unit_is_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        ArticulatedConfig(**wrong)
+
+
+def test_a_focal_length_needs_an_image_and_keypoints():
+    points = np.random.default_rng(0).uniform(100, 200, (2, 21, 2))
+    with pytest.raises(ValueError, match="size of the image"):
+        tracker.track(points, np.arange(2) / 30, None, ArticulatedConfig(focal=500.0))
+    with pytest.raises(ValueError, match="21 keypoints"):
+        tracker.build(tracker.synthetic_sequence(0), ArticulatedConfig(focal=500.0))
+
+
+@pytest.mark.system
+def test_the_measured_size_of_a_hand_in_space_is_kept():
+    """A small hand that turns before a camera; its joints are where they are, in metres."""
+    focal, shape, share = 600.0, (480, 640), 0.8
+    camera = Pinhole.from_intrinsics(focal, (319.5, 239.5), shape)
+    hand = articulated_hand(five_fingers(3), projection=Perspective(camera), features=KEYPOINTS)
+    layout, n = hand.layout, np.arange(30)
+    up = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
+    turned = Rotation.from_rotvec(np.stack([0.3 * np.sin(n / 8), 0.4 * np.cos(n / 9), 0 * n], axis=1)) * up
+    states = np.zeros((len(n), layout.size))
+    states[:, layout.position] = np.stack([0.01 * np.sin(n / 9), 0.05 + 0 * n, 0.4 + 0 * n], axis=1)
+    states[:, layout.quaternion] = np.roll(turned.as_quat(), 1, axis=1)
+    states[:, layout.angles] = relaxed_angles(layout).ravel()
+    states[:, layout.static] = 1e-3 * share * template_shape()
+    states = jnp.asarray(states, jnp.float32)
+    rows = np.asarray(jax.vmap(hand.observe)(states), float)
+    wrist, bases, joints = rows[:, None, :2], rows[:, 2:12].reshape(-1, 5, 1, 2), rows[:, 12:].reshape(-1, 5, 3, 2)
+    points = np.concatenate([wrist, np.concatenate([bases, joints], axis=2).reshape(len(n), 20, 2)], axis=1)
+    errors = {}
+    for width in (None, share * 0.08):
+        config = ArticulatedConfig(hypotheses=2, focal=focal, palm_width=width)
+        found = tracker.track(points, n / 30, shape, config)
+        errors[width] = np.linalg.norm(found.points - np.asarray(jax.vmap(hand.points)(states)), axis=-1)[-10:].mean()
+    assert errors[share * 0.08] < 0.03
+    assert errors[None] > 2 * errors[share * 0.08]
