@@ -54,8 +54,8 @@ def errors_of(sequence: FeatureSequence, layout: Layout, results: TimedArticulat
 def draw_summary(sequence: FeatureSequence, layout: Layout, scene: Scene, results: TimedArticulatedTrack) -> np.ndarray:
     """(rows, cols, 3) uint8: frames above, charts below, with 2-sigma bands and the truth in grey where it is known.
 
-    The charts are scale, a part of the quaternion, an angle, the number of hypotheses, and the lengths of each finger
-    and of the palm (figures 12 to 16 of the paper).
+    The charts are scale (of a hand in space its distance), a part of the quaternion, an angle, the number of
+    hypotheses, and the lengths of each finger and of the palm (figures 12 to 16 of the paper).
     """
     return np.concatenate([_montage(scene, results), *_charts(sequence, layout, results)])
 
@@ -109,14 +109,17 @@ def _charts(sequence: FeatureSequence, layout: Layout, results: TimedArticulated
     def chart(title: str, curves: list[Curve], cells: int, x_label: str = "", *, from_zero: bool = False) -> np.ndarray:
         return draw_chart((_ROWS, _WIDTH // cells), title, times_s, curves, x_label, from_zero=from_zero)
 
+    in_space = layout.position_size == 3
     halves = [
-        chart("scale", states.scale(_COLORS[2]), 2),
+        chart("distance, m, with 2 sigma", states.curves("wrist_z", _COLORS[2]), 2)
+        if in_space
+        else chart("scale", states.scale(_COLORS[2]), 2),
         chart("q_x, with 2 sigma", states.curves("q_x", _COLORS[1]), 2),
         chart("theta_13, degrees, with 2 sigma", states.curves("theta_13", _COLORS[0], factor=180 / np.pi), 2),
         chart("hypotheses", [Curve("", results.num_hypotheses.astype(float), _INK)], 2, from_zero=True),
     ]
     thirds: list[np.ndarray] = []
-    groups, unit = _lengths(layout), "px" if layout.position_size == 2 else "m"
+    groups, unit = _lengths(layout), "m" if in_space else "px"
     for i, names in enumerate(groups):
         pairs = [states.curves(name, color, labelled=True) for name, color in zip(names, _COLORS, strict=True)]
         curves = [curve for pair in pairs for curve in pair]
