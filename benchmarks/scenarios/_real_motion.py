@@ -3,7 +3,7 @@
 Only (u, v) of a network is used. The noise is what the tracker takes for keypoints, motion and the hand at ease are its
 own: nothing but the meaning of the markers is from these recordings.
 
-`backprojection` puts every detection at the true depth of the root, frame by frame: it is told where the hand is, and
+`backprojection` puts every detection at the true depth of the root, frame by frame: it is given where the hand is, and
 with that how large it is, which no other variant knows. `backprojection_estimated_depth` is the same at the depth that
 an average hand of the same extent would have. `recommended_known_size` is the tracker with the width of the palm.
 
@@ -90,7 +90,7 @@ class HandSet(NamedTuple):
     root: int
     image_shape: tuple[int, int]
     palm_width: float
-    """Metres, of the average hand whose size fits the true points best: what a ruler would have told."""
+    """Metres, of the average hand whose size fits the true points best: what a ruler would have measured."""
 
 
 SETS = {
@@ -164,7 +164,7 @@ def hand_of(chosen: HandSet, detections: Detections) -> tuple[MarkedHand, Inequa
 
 
 def onto_root_plane(chosen: HandSet, detections: Detections) -> Lifted:
-    """Every detection at the true depth of the root: what one view says that is told of the distance, and no more."""
+    """Every detection at the true depth of the root: what one view says with a known distance, and no more."""
     return _onto_planes(detections, detections.truth[:, chosen.root, 2])
 
 
@@ -200,7 +200,7 @@ def frame_by_frame(chosen: HandSet, detections: Detections) -> Lifted:
 
 
 def filtered(variant: str, *, known_size: bool = False) -> Callable[[HandSet, Detections], Lifted]:
-    """The tracker in one of its variants, started by itself, and told the width of the palm if asked for."""
+    """The tracker in one of its variants, started by itself, and given the width of the palm if asked for."""
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
         times = FRAME_INTERVAL * np.arange(len(detections.pixels))

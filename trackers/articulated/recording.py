@@ -11,6 +11,7 @@ import numpy as np
 from jaxfilters.models.articulated.features import BLOCKS, KEYPOINTS, FeatureSet
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, MOVEMENT_TIME
+from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.recording import check_times
 
@@ -288,3 +289,17 @@ def _block_and_finger(name: str) -> tuple[str, int] | None:
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def camera_of(sequence: FeatureSequence, focal: float) -> Pinhole:
+    """The camera in perspective with this focal length in pixels, and its axis in the middle of the image.
+
+    Raises:
+        ValueError: If the recording has no size of the image, or has a start or true states, which are in pixels.
+    """
+    if sequence.start is not None or sequence.truth is not None:
+        raise ValueError(f"{sequence.name}: a start and true states are in pixels; they cannot be used with focal.")
+    if sequence.image_shape is None:
+        raise ValueError(f"{sequence.name}: focal needs the size of the image, whose middle is on the camera's axis.")
+    rows, columns = sequence.image_shape
+    return Pinhole.from_intrinsics(focal, (0.5 * (columns - 1), 0.5 * (rows - 1)), (rows, columns))

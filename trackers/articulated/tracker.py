@@ -39,7 +39,6 @@ from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
 from jaxfilters.models.articulated.projection import Perspective
-from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import (
@@ -47,6 +46,7 @@ from jaxfilters.trackers.articulated.recording import (
     FeatureFrame,
     FeatureSequence,
     Start,
+    camera_of,
     from_keypoints,
     keypoint_noise,
 )
@@ -129,7 +129,7 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
             true states.
     """
     if sequence.features == KEYPOINTS and sequence.num_fingers == 5:
-        camera = _camera(sequence, config)
+        camera = None if config.focal is None else camera_of(sequence, config.focal)
         layout = five_fingers(2 if camera is None else 3, side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
         per_metre = diagonal / HAND_DIAGONAL if camera is None else 1.0
@@ -146,18 +146,6 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
             f"features other than the 21 keypoints of a hand."
         )
     return articulated_hand(Layout(sequence.num_fingers), features=sequence.features)
-
-
-def _camera(sequence: FeatureSequence, config: ArticulatedConfig) -> Pinhole | None:
-    """The camera in perspective that the configuration asks for."""
-    if config.focal is None:
-        return None
-    if sequence.start is not None or sequence.truth is not None:
-        raise ValueError(f"{sequence.name}: a start and true states are in pixels; they cannot be used with focal.")
-    if sequence.image_shape is None:
-        raise ValueError(f"{sequence.name}: focal needs the size of the image, whose middle is on the camera's axis.")
-    rows, columns = sequence.image_shape
-    return Pinhole.from_intrinsics(config.focal, (0.5 * (columns - 1), 0.5 * (rows - 1)), (rows, columns))
 
 
 def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> Tracker:
