@@ -242,8 +242,8 @@ def reflected(count: int, A: Float[Array, "n m"], *others: Float[Array, "_ m"]) 
         # Later reflections do not change this column.
         done.append([x[:, :1] for x in rest])
         rest = [x[:, 1:] for x in rest]
-    A, *others = map(jnp.hstack, zip(*done, rest, strict=True))
-    return A * scale, *others
+    first, *last = (jnp.hstack(columns) for columns in zip(*done, rest, strict=True))
+    return first * scale, *last
 
 
 def _normal(row):
