@@ -243,8 +243,8 @@ def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detecti
         metrics[f"{name}_scaled_root_relative_mm_{variant}{suffix}"] = Metric(scaled, "mm", "lower")
     reduction = 100 * (1 - plain["recommended"] / plain["backprojection"])
     metrics[f"{name}_reduction_percent{suffix}"] = Metric(reduction, "%", "higher")
-    untold = 100 * (1 - plain["recommended"] / plain["backprojection_estimated_depth"])
-    metrics[f"{name}_reduction_estimated_depth_percent{suffix}"] = Metric(untold, "%", "higher")
+    unaided = 100 * (1 - plain["recommended"] / plain["backprojection_estimated_depth"])
+    metrics[f"{name}_reduction_estimated_depth_percent{suffix}"] = Metric(unaided, "%", "higher")
     metrics[f"{name}_tracked_share{suffix}"] = Metric(lifted.tracked, "", "higher")
     metrics[f"{name}_frames_per_second{suffix}"] = Metric(len(lifted.points) / lifted.seconds, "frames/s", "higher")
     return metrics

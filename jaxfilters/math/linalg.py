@@ -199,7 +199,7 @@ def tria_of_many_with_zeros(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
 
 
 def tria_of_many(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """As `tria`, for many matrices at once under `vmap`: up to 8 rows by Householder reflections written as algebra.
+    """As `tria`, without the order in which it takes rows, for many matrices at once under `vmap`.
 
     A row of zeros leads to a row of zeros; its column need not be zero. Derivatives are those of `tria`.
 
@@ -210,9 +210,7 @@ def tria_of_many(A: Float[Array, "n m"]) -> Float[Array, "n n"]:
         >>> print(jax.vmap(linalg.tria_of_many)(many).ravel())
         [ 5. 10.]
     """
-    n, m = A.shape
-    A = jnp.pad(A, ((0, 0), (0, max(0, n - m))))
-    return _small_tria(A) if n <= LARGEST else _tria(A)
+    return _wide_tria(A)
 
 
 def reflected(count: int, A: Float[Array, "n m"], *others: Float[Array, "_ m"]) -> tuple[Float[Array, "_ m"], ...]:
@@ -253,39 +251,64 @@ def _normal(row):
     return jnp.hstack([first + jnp.where(first < 0, -length, length), row[:, 1:]])
 
 
+def with_positive_diagonal(L: Float[Array, "n n"], *others: Float[Array, "_ n"]) -> tuple[Float[Array, "_ n"], ...]:
+    """A lower triangular matrix and others, with the sign of those columns changed where its diagonal is negative.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> L, Q = linalg.with_positive_diagonal(jnp.array([[-5.0]]), jnp.array([[-0.6], [-0.8]]))
+        >>> print(L, Q.ravel())
+        [[5.]] [0.6 0.8]
+    """
+    sign = jnp.where(jnp.diagonal(L) < 0, -1.0, 1.0).astype(L.dtype)
+    return jnp.tril(L * sign), *(x * sign for x in others)
+
+
+def _lower_of_one(A):
+    return with_positive_diagonal(jnp.linalg.qr(A.T, mode="r").T)[0]
+
+
+def _lower_of_few_rows(A):
+    n = len(A)
+    return with_positive_diagonal(reflected(n, A)[0][:, :n])[0]
+
+
 def _factors_of_one(A):
     Q, R = jnp.linalg.qr(A.T)
-    sign = jnp.where(jnp.diagonal(R) < 0, -1.0, 1.0).astype(A.dtype)
-    return jnp.tril(R.T * sign), Q * sign
+    return with_positive_diagonal(R.T, Q)
 
 
-def _small_factors(A):
+def _factors_of_few_rows(A):
     n, m = A.shape
     L, Q = reflected(n, A, jnp.eye(m, dtype=A.dtype))
-    sign = jnp.where(jnp.diagonal(L) < 0, -1.0, 1.0).astype(A.dtype)
-    return jnp.tril(L[:, :n] * sign), Q[:, :n] * sign
+    return with_positive_diagonal(L[:, :n], Q[:, :n])
 
 
-def _factors_of_many(A):
-    small = A.shape[2] <= LARGEST_WIDTH
-    return jax.vmap(batch_last(_small_factors))(A) if small else jax.lax.map(_factors, A)
+def is_small(rows: int, columns: int) -> bool:
+    """Whether a batch of matrices of this size is factored by `reflected`, and one after the other by LAPACK if not."""
+    return rows <= LARGEST and columns <= LARGEST_WIDTH
 
 
-_factors = one_or_many(_factors_of_one, _factors_of_many)
-"""L and Q of A = L Q^T with a nonnegative diagonal of L, for A with no fewer columns than rows."""
+def _of_many(of_few_rows, of_one):
+    def of_many(A):
+        return jax.vmap(batch_last(of_few_rows))(A) if is_small(*A.shape[1:]) else jax.lax.map(of_one(), A)
+
+    return of_many
+
+
+_lower: Callable[[Array], Array] = one_or_many(_lower_of_one, _of_many(_lower_of_few_rows, lambda: _lower))
+_factors: Callable[[Array], tuple[Array, Array]] = one_or_many(
+    _factors_of_one, _of_many(_factors_of_few_rows, lambda: _factors)
+)
+"""L and Q of A = L Q^T with a nonnegative diagonal of L, for A with no fewer columns than rows; L alone before."""
 
 
 @jax.custom_jvp
 def _tria(A):
-    return _factors(A)[0]
+    return _lower(A)
 
 
-@jax.custom_jvp
-def _small_tria(A):
-    return _small_factors(A)[0]
-
-
-@_small_tria.defjvp
 @_tria.defjvp
 def _tria_jvp(primals, tangents):
     # A = L Q^T. For every skew-symmetric W, dL = dA Q + L W satisfies d(L L^T) = d(A A^T), at any rank. The W for which

@@ -165,9 +165,7 @@ def _conditioned(measured, noise, state):
         noise = linalg.tria(noise)
     state = jnp.pad(state, ((0, 0), (0, max(0, n - state.shape[1]))))
     measured = jnp.pad(measured, ((0, 0), (0, state.shape[1] - measured.shape[1])))
-    V, G = jnp.hstack([measured, noise]), jnp.pad(state, ((0, 0), (0, m)))
-
-    return _triangular(V, G)
+    return _triangular(jnp.hstack([measured, noise]), jnp.pad(state, ((0, 0), (0, m))))
 
 
 def _triangular_one(V, G):
@@ -182,7 +180,6 @@ def _triangular_many(V, G):
     # Most batches have no deficient element, and `vmap` of a condition computes both sides.
     found = jax.vmap(_reflected)(V, G)[:3]
     independent = jax.vmap(batch_last(_independent))(found[0])
-
     return jax.lax.cond(jnp.all(independent), _sound, jax.vmap(_repaired), V, G, *found)
 
 
@@ -213,26 +210,21 @@ def _reflected_one(V, G):
     m, width = V.shape
     packed, scales = jnp.linalg.qr(V.T, mode="raw")
     packed = packed.T
-    turned = jax.lax.linalg.ormqr(packed, scales, G.T, transpose=True)
+    turned = jax.lax.linalg.ormqr(packed, scales, G.T, transpose=True).T
     rest = jax.lax.linalg.ormqr(packed, scales, jnp.eye(width, dtype=V.dtype)[:, m:])
-    return _signed(packed[:m].T, turned.T, rest)
+    return *linalg.with_positive_diagonal(packed[:m].T, turned[:, :m]), turned[:, m:], rest
 
 
 def _reflected_small(V, G):
     m, width = V.shape
     L, turned, Q = linalg.reflected(m, V, G, jnp.eye(width, dtype=V.dtype))
-    return _signed(L[:, :m], turned, Q[:, m:])
+    return *linalg.with_positive_diagonal(L[:, :m], turned[:, :m]), turned[:, m:], Q[:, m:]
 
 
 def _reflected_many(V, G):
-    small = V.shape[2] <= linalg.LARGEST_WIDTH
-    return jax.vmap(batch_last(_reflected_small))(V, G) if small else jax.lax.map(lambda one: _reflect(*one), (V, G))
-
-
-def _signed(L, turned, rest):
-    m = len(L)
-    sign = jnp.where(jnp.diagonal(L) < 0, -1.0, 1.0).astype(L.dtype)
-    return jnp.tril(L * sign), turned[:, :m] * sign, turned[:, m:], rest
+    if linalg.is_small(*V.shape[1:]):
+        return jax.vmap(batch_last(_reflected_small))(V, G)
+    return jax.lax.map(lambda one: _reflect(*one), (V, G))
 
 
 _reflect = one_or_many(_reflected_one, _reflected_many)
