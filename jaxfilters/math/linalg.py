@@ -286,7 +286,12 @@ def _factors_of_few_rows(A):
 
 
 def is_small(rows: int, columns: int) -> bool:
-    """Whether a batch of matrices of this size is factored by `reflected`, and one after the other by LAPACK if not."""
+    """Whether a batch of matrices of this size is factored by `reflected`, and one after the other by LAPACK if not.
+
+    >>> from jaxfilters.math import linalg
+    >>> linalg.is_small(4, 8), linalg.is_small(100, 200)
+    (True, False)
+    """
     return rows <= LARGEST and columns <= LARGEST_WIDTH
 
 
