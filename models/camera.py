@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -54,12 +55,14 @@ class Pinhole:
             raise ValueError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}.")
         return cls.from_intrinsics(K[[0, 1], [0, 1]], K[:2, 2], shape)
 
+    @jax.jit
     def matrix(self) -> Float[Array, "3 3"]:
         """Calibration matrix."""
         (fx, fy), (cx, cy) = self.focal, self.center
         zero, one = jnp.zeros_like(fx), jnp.ones_like(fx)
         return jnp.stack([jnp.stack([fx, zero, cx]), jnp.stack([zero, fy, cy]), jnp.stack([zero, zero, one])])
 
+    @jax.jit
     def project(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
         """Pixels (u, v) of points in metres in the camera frame; meaningless where z <= 0, finite except at z = 0."""
         return points[..., :2] / points[..., 2:] * self.focal + self.center

@@ -72,8 +72,12 @@ def start(
     check_positive("scale", scale)
     check_positive("strength", strength)
     size = scale.shape[0]
-    coefficients = jnp.concatenate([slope * jnp.eye(size, dtype=float), jnp.full((1, size), offset, dtype=float)])
-    covariance = jnp.eye(size + 1, dtype=float) / strength
+    # NumPy makes the constants: each would otherwise be a program of its own.
+    last = np.zeros((size + 1, size))
+    last[-1] = 1.0
+    coefficients = slope * np.eye(size + 1, size) + offset * last
+    covariance = np.eye(size + 1) / strength
+    coefficients, covariance = (jnp.asarray(each, dtype=float) for each in (coefficients, covariance))
     return DiffusionFit(coefficients, covariance, scale, jnp.asarray(strength, dtype=float))
 
 

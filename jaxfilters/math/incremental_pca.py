@@ -142,6 +142,7 @@ def principal_components(pca: IncrementalPCA) -> PrincipalComponents:
     return PrincipalComponents(jnp.where(is_component, basis, 0.0), jnp.where(is_component, variances, 0.0))
 
 
+@jax.jit
 def explained_variance_ratio(pca: IncrementalPCA) -> Float[Array, ""]:
     """The fraction of the mean squared deviation that the components explain, from 0 to 1; 0 without a sample.
 

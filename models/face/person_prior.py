@@ -70,6 +70,7 @@ def nothing_past(face: MultilinearFace) -> SquareRootPrior:
     return past.nothing(face.num_identities + face.mean.size, face.mean.dtype)
 
 
+@jax.jit
 def eyes_apart(face: MultilinearFace, person: Person) -> Float[Array, ""]:
     """Millimetres between the middles of the corners of either eye."""
     corners = posed_shape(face, person, face.expression_mean)[jnp.asarray(EYES)]
@@ -91,6 +92,7 @@ def log_size(
     return 0.5 * jnp.log(jnp.sum(jnp.square(across - jnp.mean(across, axis=0))))
 
 
+@jax.jit
 def seen_size(
     face: MultilinearFace, identity: Float[Array, " S"], expressions: Float[Array, "n A"]
 ) -> Float[Array, ""]:
@@ -137,6 +139,7 @@ def residuals(
     return jnp.concatenate([identity, offset.ravel(), size[None], before])
 
 
+@jax.jit
 def own_offset(person: Person, prior: Prior) -> Float[Array, "K 3"]:
     """The part of the offset that is the face's, without what the detector misplaced, millimetres."""
     if prior.misplaced is None:

@@ -15,6 +15,7 @@ brings a tip towards the palm side (-z), positive spread towards the thumb side.
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -85,6 +86,7 @@ class HandKinematics:
     """The 19 capsules in the order of `PART_NAMES`."""
 
 
+@jax.jit
 def hand_geometry() -> HandGeometry:
     """The average adult right hand: 190 mm from the wrist to the middle fingertip."""
     millimetre = 1e-3
@@ -104,6 +106,7 @@ def hand_geometry() -> HandGeometry:
     )
 
 
+@jax.jit
 def anatomical_hand() -> HandGeometry:
     """The average adult right hand with bones of measured lengths, whose tips are on the skin.
 
@@ -157,6 +160,7 @@ def check_pose(pose: Float[Array, "..."]) -> None:
         raise ValueError(f"pose[3:7] must be a quaternion (w, x, y, z) of unit norm; got {pose[3:7]}.")
 
 
+@jax.jit
 def open_palm(position: Float[Array, " 3"]) -> Float[Array, " 22"]:
     """The pose (22,) with the palm to the camera, fingers up and straight, wrist at `position` (metres)."""
     quaternion_and_angles = jnp.zeros(POSE_SIZE - 3, dtype=position.dtype).at[0].set(1.0)
@@ -173,6 +177,7 @@ def local(pose: Float[Array, " 22"], other: Float[Array, " 22"]) -> Float[Array,
     return jnp.concatenate([other[:3] - pose[:3], so3_local(pose[3:7], other[3:7]), other[7:] - pose[7:]])
 
 
+@jax.jit
 def hand_center(pose: Float[Array, " 22"], scale: float | Float[Array, ""] = 1.0) -> Float[Array, " 3"]:
     """A point (metres, camera frame) in the middle of the open hand, 90 mm from the wrist: where to look for the hand.
 

@@ -70,6 +70,7 @@ def upright_depth(camera: FloorCamera, xy: Float[Array, " 2"]) -> Float[Array, "
     return jnp.where(towards > 0, away @ away / jnp.where(towards > 0, towards, 1.0), jnp.inf)
 
 
+@jax.jit
 def walkable(polygon: Float[Array, "n 2"], xy: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
     """Which floor points lie inside a polygon (even-odd rule)."""
     a, b = polygon, jnp.roll(polygon, -1, axis=0)

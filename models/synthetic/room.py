@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix
+from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.rendering.depth import render_ellipsoids
@@ -44,7 +44,7 @@ class RoomCamera:
 def floor_camera(pinhole: Pinhole, T_camera_world: RigidTransform) -> FloorCamera:
     """The projection matrix of a pinhole camera."""
     K = np.asarray(pinhole.matrix(), float)
-    rotation = np.asarray(jax.vmap(T_camera_world.apply)(jnp.eye(3)) - T_camera_world.translation).T
+    rotation = np.asarray(jax.jit(quaternion_to_matrix)(T_camera_world.rotation))
     return FloorCamera.from_matrix(K @ np.column_stack([rotation, T_camera_world.translation]), pinhole.shape)
 
 
@@ -55,26 +55,30 @@ def looking(position: tuple[float, float, float], heading_deg: float, pitch_deg:
     right = np.array([math.sin(a), -math.cos(a), 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
     return RigidTransform(
-        jnp.asarray(quaternion_from_matrix(jnp.asarray(rotation, jnp.float32))),
+        jax.jit(quaternion_from_matrix)(jnp.asarray(rotation, jnp.float32)),
         jnp.asarray(-rotation @ np.asarray(position), jnp.float32),
     )
 
 
 def room_camera(key: AnyKey, pinhole: Pinhole, T_camera_world: RigidTransform, furniture: Array) -> RoomCamera:
     """A camera before the empty room: tiles with a random pattern, furniture shaded by its slope."""
-    camera = floor_camera(pinhole, T_camera_world)
-    v, u = jnp.meshgrid(*[jnp.arange(n, dtype=float) for n in pinhole.shape], indexing="ij")
+    empty = _empty_room(key, floor_camera(pinhole, T_camera_world), furniture)
+    return RoomCamera(pinhole, T_camera_world, jnp.asarray(furniture), empty, pinhole.shape)
+
+
+@jax.jit
+def _empty_room(key: AnyKey, camera: FloorCamera, furniture: Array) -> Float[Array, "rows cols 3"]:
+    v, u = jnp.meshgrid(*[jnp.arange(n, dtype=float) for n in camera.shape], indexing="ij")
     xy, depth = camera.floor_points(jnp.stack([u, v], axis=-1))
     tile = jnp.floor(xy / TILE_M).astype(jnp.int32)
     checks = (tile[..., 0] + tile[..., 1]) % 2
-    grain = 18.0 * jax.random.uniform(key, pinhole.shape) - 9
+    grain = 18.0 * jax.random.uniform(key, camera.shape) - 9
     floor = jnp.array([128.0, 140.0, 150.0]) + 22.0 * checks[..., None] + grain[..., None]
     wall = jnp.array([176.0, 170.0, 160.0]) + grain[..., None]
     background = jnp.where(((depth > 0) & (depth < 40))[..., None], floor, wall)
     slope = jnp.abs(jnp.asarray(jnp.gradient(jnp.where(jnp.isfinite(furniture), furniture, 0.0), axis=0)))
     wood = jnp.array([60.0, 95.0, 140.0]) + 40 * jnp.clip(60 * slope, 0, 1)[..., None] + grain[..., None] / 2
-    empty = jnp.where((furniture < jnp.where(depth > 0, depth, jnp.inf))[..., None], wood, background)
-    return RoomCamera(pinhole, T_camera_world, jnp.asarray(furniture), empty, pinhole.shape)
+    return jnp.where((furniture < jnp.where(depth > 0, depth, jnp.inf))[..., None], wood, background)
 
 
 @jax.jit

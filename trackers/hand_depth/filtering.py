@@ -173,6 +173,7 @@ def _look(geometry: HandGeometry, particles: Array, log_weights: Array, image: H
     return Guidance(found.pose, found.information)
 
 
+@jax.jit
 def pose_moments(
     particles: Float[Array, "22 n"], log_weights: Float[Array, " n"]
 ) -> tuple[Float[Array, " 22"], Float[Array, "21 21"]]:
@@ -183,6 +184,7 @@ def pose_moments(
     return mean, weights.covariance(offsets, log_weights)
 
 
+@jax.jit
 def filled(frame: Array, missing_is_background: Array) -> Array:
     """The frame with pixels without a reading as background, if that is what they are."""
     return jnp.where(jnp.isnan(frame) & missing_is_background, jnp.inf, frame)

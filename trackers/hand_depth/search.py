@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxfilters.models.camera import Pinhole
@@ -118,13 +119,11 @@ def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]
 
 def _distance(average: HandGeometry, one: Start, other: Start) -> float:
     """Between the joints of two hands, metres, in the mean."""
-    joints = [
-        _joints(jnp.asarray(each.pose), replace(average.scaled(each.scale), side=jnp.asarray(each.side, dtype=float)))
-        for each in (one, other)
-    ]
-    return float(jnp.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+    joints = [np.asarray(_joints(np.asarray(each.pose), average, each.scale, each.side)) for each in (one, other)]
+    return float(np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
 
 
 @jax.jit
-def _joints(pose: Array, geometry: HandGeometry) -> Array:
+def _joints(pose: Array, average: HandGeometry, scale: ArrayLike, side: ArrayLike) -> Array:
+    geometry = replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype))
     return forward_kinematics(pose, geometry).joints

@@ -1,6 +1,7 @@
 """The scene of the people tracker, its state from frame to frame, and its report."""
 
 from dataclasses import field
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -137,7 +138,11 @@ class Report(NamedTuple):
 
 def nobody(config: PeopleConfig, cameras: int = 1) -> People:
     """The state before anybody has come."""
-    n = config.capacity
+    return _empty(config.capacity, cameras)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _empty(n: int, cameras: int) -> People:
     return People(
         Gaussian(jnp.zeros((n, STATE)), jnp.broadcast_to(jnp.eye(STATE), (n, STATE, STATE))),
         jnp.full(n, FREE, jnp.int32),

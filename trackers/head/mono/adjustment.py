@@ -227,6 +227,7 @@ def _average(state: MonoState) -> Array:
     return jnp.sum(jnp.where(used[:, None], state.identities, 0.0), axis=0) / jnp.sum(used)
 
 
+@jax.jit
 def known(face: MultilinearFace, prior: Prior, person: Person) -> Float[Array, "d d"]:
     """Information about identity and offset beside the window's, in standard deviations, at a person."""
     both = prior_information(face, person, prior)
@@ -236,6 +237,7 @@ def known(face: MultilinearFace, prior: Prior, person: Person) -> Float[Array, "
     return both + unit[:, None] * prior.past.information * unit
 
 
+@jax.jit
 def prior_information(face: MultilinearFace, person: Person, prior: Prior) -> Float[Array, "d d"]:
     """Prior information about identity and offset, in standard deviations.
 

@@ -38,11 +38,13 @@ class People(NamedTuple):
     log_prior: Float[Array, " n"]
 
 
+@jax.jit
 def one_of(people: People, who: Int[ArrayLike, ""]) -> MultilinearFace:
     """The face of one of them, 0 for an unknown person."""
     return jax.tree.map(lambda leaf: leaf[who], people.faces)
 
 
+@jax.jit
 def people(face: MultilinearFace, remembered: Remembered | None) -> People:
     """An unknown person, and everybody who is remembered."""
     if remembered is None or not len(remembered.identity):
@@ -119,6 +121,7 @@ def weighed(
     return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
 
 
+@jax.jit
 def as_remembered(unknown: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
     """The person who is followed, as one to remember: identity with what is not known of it, and offset.
 

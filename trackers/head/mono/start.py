@@ -82,12 +82,16 @@ def initialise(
         prior: What holds the face.
         detected_px: Standard deviation of each coordinate of the points, perhaps for each landmark.
     """
-    n = len(points)
+    return _fitted(face, rig, points, _ahead(face, rig, points, prior), prior, WIDE, detected_px)
+
+
+@jax.jit
+def _ahead(face, rig, points, prior) -> Bundle:
+    """The mean person, who looks into the camera in all frames."""
     person = Person(face.identity_mean, prior.offset_mean * jnp.ones_like(face.mean))
-    expressions = jnp.tile(face.expression_mean, (n, 1))
+    expressions = jnp.tile(face.expression_mean, (len(points), 1))
     mean = posed_shape(face, person, face.expression_mean)
-    poses = jax.vmap(lambda uv: _facing(rig, mean, uv))(points)
-    return _fitted(face, rig, points, Bundle(poses, expressions, person), prior, WIDE, detected_px)
+    return Bundle(jax.vmap(lambda uv: _facing(rig, mean, uv))(points), expressions, person)
 
 
 def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
@@ -101,6 +105,7 @@ def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
     return Start(found, info, projected(face, rig, found))
 
 
+@jax.jit
 def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, "*K"]) -> Views:
     """Landmarks as detected, with the standard deviation of each coordinate, perhaps for each landmark."""
     variance = jnp.broadcast_to(jnp.square(std_px), points.shape[:2])
