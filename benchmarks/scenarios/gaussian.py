@@ -1,6 +1,7 @@
 """Extended Kalman filters against dynamax, cuthbert and filterpy: time of a sequence, of its gradient, of many.
 
-One sequence of 500 readings, 30 states and 20 sensors; and 1000 sequences of 100 readings, 6 states and 3 sensors. All
+One sequence of 500 readings, 30 states and 20 sensors; 1000 sequences of 100 readings, 6 states and 3 sensors; and
+50,000 readings of 4 states by an unscented filter, beside that of filterpy. All
 libraries compute the log evidence of the same readings in float32 (filterpy in float64), compiled by the caller, and
 have to agree before anything is timed. They take turns in every round, and a ratio is the median over the rounds.
 `first_call_s_*` is what compilation costs; `repeat_call_ratio` compares a call of this library as it is used, without
@@ -22,11 +23,13 @@ from jaxtyping import Array
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _gaussian_peers as peers
+from jaxfilters.benchmarks.scenarios import _gaussian_unscented as unscented
 from jaxfilters.benchmarks.scenarios._gaussian_models import Problem, build, coupled, ranging
 from jaxfilters.filter import log_evidence as log_evidence_of
 from jaxfilters.gaussian import arithmetic as arithmetics
 
 NUM_STEPS, NUM_SHORT_STEPS = 500, 100
+NUM_LONG_STEPS, QUICK_LONG_STEPS = 50_000, 2_000
 BATCHES = (64, 1000)
 ROUNDS, QUICK_ROUNDS = 25, 5
 SLOW_ROUNDS = 5
@@ -45,7 +48,23 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     metrics = _one_sequence(coupled(seed, num_steps=NUM_STEPS), present, rounds)
     for count in BATCHES[:1] if quick else BATCHES:
         metrics |= _many_sequences(ranging(seed, count, NUM_SHORT_STEPS), present, min(rounds, 2 * SLOW_ROUNDS + 1))
-    return metrics
+    return metrics | _long_sequence(seed, QUICK_LONG_STEPS if quick else NUM_LONG_STEPS, "filterpy" in present)
+
+
+def _long_sequence(seed: int, num_steps: int, has_filterpy: bool) -> dict[str, Metric]:
+    problem = unscented.walk(seed, num_steps)
+    calls: Calls = {"ours": unscented.ours(problem)}
+    if has_filterpy:
+        short = unscented.walk(seed, NUM_STEPS)
+        by_filterpy = unscented.filterpy(short, with_evidence=True)()
+        check_agreement({"ours": unscented.ours(short)(), "filterpy": by_filterpy}, tolerance=1e-4)
+        calls["filterpy"] = unscented.filterpy(problem, with_evidence=False)
+    calls["ours"]()
+    times = rounds_of(calls, SLOW_ROUNDS)
+    metrics = {
+        f"unscented_step_us_{name}": Metric(1e6 * _median(times[name]) / num_steps, "us", "lower") for name in calls
+    }
+    return metrics | ({"ratio_unscented_to_filterpy": ratio(times, "ours", "filterpy")} if has_filterpy else {})
 
 
 def _one_sequence(problem: Problem, present: list[str], rounds: int) -> dict[str, Metric]:
