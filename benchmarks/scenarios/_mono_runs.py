@@ -51,9 +51,9 @@ class MonoRun(NamedTuple):
         return np.isin(self.track.status, TRACKED)
 
     @property
-    def who(self) -> Int[np.ndarray, " t"]:
+    def person_index(self) -> Int[np.ndarray, " t"]:
         """Whom of those who are remembered the face is taken for; -1 for an unknown person."""
-        return np.asarray(self.track.who)
+        return np.asarray(self.track.person_index)
 
     @property
     def means(self) -> Float[np.ndarray, " 6"]:

@@ -148,10 +148,10 @@ def experiment_metrics(users: range, num_frames: int, seed: int, quick: bool, ke
             nearer = [one.means[2] < other.means[2] for one, other in zip(runs[name], runs[without], strict=True)]
             metrics[f"users_better_adjusted_{name}"] = Metric(100 * float(np.mean(nearer)), "%", "higher")
     if "a" in runs:
-        right = [np.mean(one.who == user) for user, one in enumerate(runs["a"])]
+        right = [np.mean(one.person_index == user) for user, one in enumerate(runs["a"])]
         metrics["recognised_share"] = Metric(100 * float(np.mean(right)), "%", "higher")
     if "b_ten" in runs:
-        wrong = [np.mean(one.who >= 0) for one in runs["b_ten"]]
+        wrong = [np.mean(one.person_index >= 0) for one in runs["b_ten"]]
         metrics["mistaken_share"] = Metric(100 * float(np.mean(wrong)), "%", "lower")
     return metrics
 

@@ -93,10 +93,10 @@ def frame_information(
     def residuals(person: Array, own: Array) -> Array:
         offset = person[count:].reshape(frame.person.offset.shape)
         offset = frame.person.offset + prior.offset_deviations * offset
-        who = Person(frame.person.identity + s_std * person[:count], offset)
+        other = Person(frame.person.identity + s_std * person[:count], offset)
         pose, expression = frame.poses + units[:6] * own[:6], frame.expressions + units[6:] * own[6:]
         # What is known of the person beforehand must not count once for every frame.
-        return frame_residuals(face, rig, view, Bundle(pose, expression, who), prior.weight)
+        return frame_residuals(face, rig, view, Bundle(pose, expression, other), prior.weight)
 
     of_person, own = jnp.zeros(count + frame.person.offset.size), jnp.zeros_like(units)
     information, by_person, gradient = reduced(residuals, of_person, own)

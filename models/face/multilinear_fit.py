@@ -98,9 +98,9 @@ def likeliest(
 
     J = jax.jacfwd(residuals)(flat)
     inverse = jnp.linalg.inv(_product(J.T, J))[: found.identity.size, : found.identity.size]
-    who, _ = _roots(model)
+    root, _ = _roots(model)
     fit = _parameters(model, found)
-    return fit, _product(_product(who, inverse), who.T), jnp.mean(shapes - _faces(model, fit), axis=0)
+    return fit, _product(_product(root, inverse), root.T), jnp.mean(shapes - _faces(model, fit), axis=0)
 
 
 def _roots(model):
@@ -110,10 +110,10 @@ def _roots(model):
 
 def _parameters(model, x):
     """Of numbers that have a standard normal distribution."""
-    who, how = _roots(model)
+    identity_root, expression_root = _roots(model)
     return Fit(
-        model.identity_mean + _product(who, x.identity),
-        model.expression_mean + _product(x.expressions, how.T),
+        model.identity_mean + _product(identity_root, x.identity),
+        model.expression_mean + _product(x.expressions, expression_root.T),
         x.log_size,
     )
 

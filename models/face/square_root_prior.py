@@ -54,11 +54,11 @@ def of_energy(
     """
     values, vectors = jnp.linalg.eigh((information + information.T) / 2)
     rounding = values.size * jnp.finfo(values.dtype).eps * values[-1]
-    is_told = values > rounding
-    deviation = jnp.sqrt(jnp.where(is_told, values, 1.0))
+    is_known = values > rounding
+    deviation = jnp.sqrt(jnp.where(is_known, values, 1.0))
     inverse = jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
-    root = jnp.where(is_told[:, None], deviation[:, None] * vectors.T, 0.0) * inverse
-    downhill = jnp.where(is_told, _product(vectors.T, gradient) / deviation, 0.0)
+    root = jnp.where(is_known[:, None], deviation[:, None] * vectors.T, 0.0) * inverse
+    downhill = jnp.where(is_known, _product(vectors.T, gradient) / deviation, 0.0)
     return SquareRootPrior(root, _product(root, at) - downhill)
 
 

@@ -154,8 +154,8 @@ def face_sequence(
         gain: Factor of the light; 1 if none.
     """
     rig = nominal() if rig is None else rig
-    who, looks, noise = jax.random.split(key, 3)
-    identity, num_frames = make_identity(who), len(poses)
+    identity_key, looks, noise = jax.random.split(key, 3)
+    identity, num_frames = make_identity(identity_key), len(poses)
     expressions = np.zeros((num_frames, 2)) if expressions is None else expressions
     shapes, uv = _truth(identity, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
     return FaceSequence(

@@ -108,12 +108,12 @@ def ict_shapes(
     Raises:
         ValueError: if the model lacks one of the expressions.
     """
-    who, gains, noise = jax.random.split(key, 3)
+    identity_key, gains, noise = jax.random.split(key, 3)
     points = model.landmarks
     neutral, identity, expression = (part[..., points, :] for part in (model.neutral, model.identity, model.expression))
     weights = jnp.asarray(expression_weights(model.names), neutral.dtype)
     strength = jnp.exp(gain_log_std * jax.random.normal(gains, (num_people, len(weights), 1), neutral.dtype))
-    people = jax.random.normal(who, (num_people, len(identity)), neutral.dtype)
+    people = jax.random.normal(identity_key, (num_people, len(identity)), neutral.dtype)
     shapes = additive_shapes(neutral, identity, expression, people, strength * weights)
     # Expressions are listed with the neutral face first.
     center = jnp.mean(shapes[:, :1, np.array(FROM_68)], axis=2, keepdims=True)

@@ -96,8 +96,8 @@ def ict_sequence(
         gain: Factor of the light; 1 if none.
     """
     rig = nominal() if rig is None else rig
-    who, looks, walls, noise = jax.random.split(key, 4)
-    person, num_frames = make_ict_person(who, model), len(poses)
+    identity_key, looks, walls, noise = jax.random.split(key, 4)
+    person, num_frames = make_ict_person(identity_key, model), len(poses)
     expressions = np.zeros((num_frames, len(model.names))) if expressions is None else expressions
     shapes, uv68 = _truth(model, person, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
     return IctSequence(

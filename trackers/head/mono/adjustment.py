@@ -251,8 +251,8 @@ def prior_information(face: MultilinearFace, person: Person, prior: Prior) -> Fl
 
     def residuals(y: Array) -> Array:
         offset = person.offset + prior.offset_deviations * y[count:].reshape(person.offset.shape)
-        who = Person(person.identity + std * y[:count], offset)
-        return person_prior.residuals(face, who, face.expression_mean[None], prior)
+        other = Person(person.identity + std * y[:count], offset)
+        return person_prior.residuals(face, other, face.expression_mean[None], prior)
 
     J = jax.jacfwd(residuals)(jnp.zeros(count + face.mean.size, std.dtype))
     # Without a weight the box of two deviations to either side is all that is known: as much as its variance of 4 / 3.

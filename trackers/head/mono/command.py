@@ -149,9 +149,9 @@ def _in_words(focal: dict[str, Any]) -> str:
 
 def _taken_for(run: StreamRun, known: People | None) -> dict[str, int]:
     """In how many frames each of those who are known was before the camera; nobody without frames."""
-    who = np.asarray(run.writer.results.who)
+    index = np.asarray(run.writer.results.person_index)
     names = () if known is None else known.names
-    return {name: int(np.sum(who == i)) for i, name in enumerate(names) if np.any(who == i)}
+    return {name: int(np.sum(index == i)) for i, name in enumerate(names) if np.any(index == i)}
 
 
 def _learned(session: MonoSession) -> dict[str, np.ndarray]:

@@ -148,8 +148,8 @@ def information_of_ten(
         view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
 
         def residuals(y: Array, own: Array) -> Array:
-            who, a = split.person(y, misplaced), expression + units[6:] * own[6:]
-            observed = frame_residuals(face, rig, view, Bundle(pose + units[:6] * own[:6], a, who), prior.weight)
+            person, a = split.person(y, misplaced), expression + units[6:] * own[6:]
+            observed = frame_residuals(face, rig, view, Bundle(pose + units[:6] * own[:6], a, person), prior.weight)
             # Offsets are held once, in proportion to the size that the face has in all frames.
             return jnp.concatenate([observed, *(part / np.sqrt(len(views.uv)) for part in held(y, a[0]))])
 

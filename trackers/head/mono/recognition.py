@@ -39,9 +39,9 @@ class People(NamedTuple):
 
 
 @jax.jit
-def one_of(people: People, who: Int[ArrayLike, ""]) -> MultilinearFace:
+def one_of(people: People, index: Int[ArrayLike, ""]) -> MultilinearFace:
     """The face of one of them, 0 for an unknown person."""
-    return jax.tree.map(lambda leaf: leaf[who], people.faces)
+    return jax.tree.map(lambda leaf: leaf[index], people.faces)
 
 
 @jax.jit
@@ -66,17 +66,17 @@ def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoCo
     """
     bundles, log_evidence = tried(people, rig, state, options)
     log_posterior = jnp.where(jnp.isfinite(log_evidence), log_evidence, -jnp.inf) + people.log_prior
-    who = jnp.argmax(log_posterior)
-    face, bundle = one_of(people, who), jax.tree.map(lambda leaf: leaf[who], bundles)
+    index = jnp.argmax(log_posterior)
+    face, bundle = one_of(people, index), jax.tree.map(lambda leaf: leaf[index], bundles)
     # The last frame of the window may lie back a little: what changes there changes in the frame at hand.
     window, place, x = state.window, jnp.argmin(state.window.ages), state.belief.mean
     pose = x[:POSE] + bundle.poses[place] - window.poses[place]
-    expression = state.modes.expression(one_of(people, state.who), x[POSE:])
+    expression = state.modes.expression(one_of(people, state.person_index), x[POSE:])
     expression = expression + bundle.expressions[place] - window.expressions[place]
-    state_of = state._replace(who=who.astype(state.who.dtype))
+    state_of = state._replace(person_index=index.astype(state.person_index.dtype))
     anew = settled(face, rig, state_of, bundle, pose, expression, options)
     sound = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((anew.person, anew.belief, anew.model))]
-    changes = jnp.isfinite(log_posterior[who]) & (who != state.who) & jnp.all(jnp.stack(sound))
+    changes = jnp.isfinite(log_posterior[index]) & (index != state.person_index) & jnp.all(jnp.stack(sound))
     return jax.tree.map(lambda a, b: jnp.where(changes, a, b), anew, state)
 
 
@@ -85,7 +85,7 @@ def tried(people: People, rig: CameraRig, state: MonoState, options: MonoConfig)
 
     Arguments are those of `recognised`.
     """
-    now = one_of(people, state.who)
+    now = one_of(people, state.person_index)
     one = lambda face: weighed(one_of(people, 0), face, rig, state, _start(face, now, state), options)
     # One by one: batches of factorisations can stand still on two cores.
     return jax.lax.map(one, people.faces)
@@ -142,7 +142,7 @@ def _start(face: MultilinearFace, now: MultilinearFace, state: MonoState) -> Bun
     most = 2 * face.identity_std
     identity = jnp.clip(state.person.identity, face.identity_mean - most, face.identity_mean + most)
     person = Person(identity, state.person.offset + now.mean - face.mean)
-    size = lambda face, who: jnp.sqrt(jnp.sum(jnp.square(posed_shape(face, who, face.expression_mean))))
+    size = lambda face, person: jnp.sqrt(jnp.sum(jnp.square(posed_shape(face, person, face.expression_mean))))
     ratio = size(face, person) / size(now, state.person)
     return Bundle(state.window.poses.at[:, :3].multiply(ratio), state.window.expressions, person)
 

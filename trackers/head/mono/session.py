@@ -206,7 +206,7 @@ class _MonoTracker:
         self._remembered = remembered
         self._people = people(face, remembered)
         self._system = System(face, face, rig, search_of(rig, options))
-        self._num_told = 0
+        self._num_at_recognition = 0
         """Adjustments when it was last asked who it is."""
         self._detector = detector
         self._collector = Collector(detector)
@@ -259,20 +259,20 @@ class _MonoTracker:
             options=self._compiled,
             prior=found.prior,
         )
-        self._num_told, self._system = 0, self._system._replace(face=self._face)
+        self._num_at_recognition, self._system = 0, self._system._replace(face=self._face)
         state = self._recognised(state)
         if self._pool is not None and self._ready is None:
             self._ready = self._pool.submit(self._asked_who, self._system, state)
-        what = "registered, a face that is known" if int(state.who) else "registered"
+        what = "registered, a face that is known" if int(state.person_index) else "registered"
         return Beginning(state, detections.time, what)
 
     def saved(self) -> dict[str, Any]:
-        return {"people": self._people, "num_told": self._num_told}
+        return {"people": self._people, "num_at_recognition": self._num_at_recognition}
 
     def restore(self, saved: dict[str, Any], state: MonoState) -> None:
         # Landmarks which a person gave, or which were found otherwise, are of the first images.
         self._points = self._detections = None
-        self._people, self._num_told = saved["people"], saved["num_told"]
+        self._people, self._num_at_recognition = saved["people"], saved["num_at_recognition"]
         self._system = self._system._replace(face=self._followed(state))
 
     def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
@@ -287,15 +287,15 @@ class _MonoTracker:
 
     def _recognised(self, state: MonoState) -> MonoState:
         """Asked again whenever the face has been adjusted twice as often: the estimate improves ever slower."""
-        if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_told:
-            self._num_told = int(state.num_adjusted)
+        if len(self._people.log_prior) > 1 and int(state.num_adjusted) >= 2 * self._num_at_recognition:
+            self._num_at_recognition = int(state.num_adjusted)
             state = recognised(self._people, self.rig, state, self._compiled)
             self._system = self._system._replace(face=self._followed(state))
         return state
 
     def _followed(self, state: MonoState) -> MultilinearFace:
         """The face of whom the state is about."""
-        return one_of(self._people, int(state.who)) if int(state.who) else self._face
+        return one_of(self._people, int(state.person_index)) if int(state.person_index) else self._face
 
     def _remember(self, old: MonoState) -> None:
         """Who was followed may come back, beside those who were remembered from the first."""
@@ -322,7 +322,7 @@ class _MonoTracker:
             effective_sample_size=np.zeros(count, np.float32),
             identity=nothing(self._face.num_identities),
             offset=nothing(NUM_LANDMARKS, 3),
-            who=np.full(count, -1, np.int32),
+            person_index=np.full(count, -1, np.int32),
             is_adjusted=np.zeros(count, bool),
             status=np.full(count, INITIALISING, np.int32),
         )

@@ -82,8 +82,8 @@ class MonoState(NamedTuple):
     """Particles of pose and mode coefficients."""
     belief: Gaussian
     """Of the last estimate, for the person as believed."""
-    who: Int[Array, ""]
-    """0 for an unknown person, else one of those who are remembered."""
+    person_index: Int[Array, ""]
+    """0 for an unknown person, else 1 + the index of one who is remembered."""
     person: Person
     """About that face."""
     prior: Prior
@@ -143,8 +143,8 @@ class MonoTrack(NamedTuple):
     """In standard deviations of the training set's about their mean."""
     offset: Float[Array | np.ndarray, "b K 3"]
     """What the model lacks of this face, millimetres."""
-    who: Int[Array | np.ndarray, " b"]
-    """Whom of the people who are remembered this is taken for, from 0 on; -1 for an unknown person."""
+    person_index: Int[Array | np.ndarray, " b"]
+    """Index of the recognised person among those who are remembered, or -1 for an unknown person."""
     is_adjusted: Bool[Array | np.ndarray, " b"]
     """Whether the face was adjusted in this frame."""
     status: Int[Array | np.ndarray, " b"]

@@ -35,7 +35,7 @@ class TimedMonoTrack(NamedTuple):
     """(frames, S) in standard deviations of the training set's."""
     offset: np.ndarray
     """(frames, 10, 3) what the model lacks of this face, metres."""
-    who: np.ndarray
+    person_index: np.ndarray
     """(frames,) index of the recognised person, -1 for an unknown one."""
     is_adjusted: np.ndarray
     """(frames,) 1 where the face was adjusted."""
@@ -53,7 +53,7 @@ def mono_table(face: MultilinearFace) -> TrackTable:
         Columns(expressions, attrgetter("deformation")),
         Columns(identities, attrgetter("identity")),
         Columns(("is_deformable",), is_deformable),
-        *(Columns((name,), attrgetter(name)) for name in ("who", "is_adjusted", "score")),
+        *(Columns((name,), attrgetter(name)) for name in ("person_index", "is_adjusted", "score")),
     )
     return TrackTable(TimedMonoTrack, columns, TABLE_STATUS)
 
@@ -82,7 +82,7 @@ def empty_mono_rows(face: MultilinearFace, frames: int) -> TimedMonoTrack:
         effective_sample_size=zeros(),
         identity=zeros(face.num_identities),
         offset=zeros(NUM_LANDMARKS, 3),
-        who=zeros() - 1,
+        person_index=zeros() - 1,
         is_adjusted=zeros(),
         status=np.zeros(frames, np.int32),
     )

@@ -49,7 +49,7 @@ def made_track(means, times, status, face):
         effective_sample_size=np.full(b, 100.0),
         identity=np.full((b, face.num_identities), 1.5),
         offset=np.zeros((b, 10, 3)),
-        who=np.where(np.arange(b) < b // 2, -1, 0),
+        person_index=np.where(np.arange(b) < b // 2, -1, 0),
         is_adjusted=np.arange(b) % 2 == 0,
         status=status,
     )
@@ -141,7 +141,7 @@ def test_whom_one_run_followed_the_next_may_know(pictures, fake, tmp_path, capsy
     assert reports[1]["taken_for"] == {"ann": FRAMES // 2}
     assert reports[1]["options"]["known"] == [str(tmp_path / "ann" / "person.npz")]
     with (tmp_path / "again" / "track.csv").open(newline="") as file:
-        assert [float(row["who"]) for row in csv.DictReader(file)][3:5] == [-1, 0]
+        assert [float(row["person_index"]) for row in csv.DictReader(file)][3:5] == [-1, 0]
     file = default_face_model()
     other = dataclasses.replace(file.model, mean=1.01 * file.model.mean)
     save_face_model(tmp_path / "other.npz", file._replace(model=other))

@@ -40,9 +40,9 @@ def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, 
     made, images = talking
     session = MonoSession(rig, face, detections=detected, remembered=remember(face, shapes[:10]))
     track = process(session, images, made.times)
-    assert set(track.who[START:]) <= {-1, 3}
-    assert np.all(track.who[-20:] == 3)
-    assert np.all(track.who[:START] == -1)
+    assert set(track.person_index[START:]) <= {-1, 3}
+    assert np.all(track.person_index[-20:] == 3)
+    assert np.all(track.person_index[:START] == -1)
     errors = track.pose[-20:] - made.poses[-20:]
     # A hundredth of 650 mm, where a unknown's size is known to 3 %.
     assert np.abs(errors[:, 2]).mean() < 6.5
@@ -61,7 +61,7 @@ def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     face = learn(others, identities=IDENTITIES)
     session = MonoSession(rig, face, detections=detected, remembered=remember(face, others))
     track = process(session, images, made.times)
-    assert np.all(track.who == -1)
+    assert np.all(track.person_index == -1)
     assert session.remembered is not None
 
 
@@ -74,7 +74,7 @@ def test_somebody_who_was_followed_is_recognised_by_a_later_session(rig, face, t
     known = first.remembered
     second = MonoSession(rig, face, detections=detected, remembered=known)
     after = process(second, images, made.times)
-    assert after.who[-1] == 0
+    assert after.person_index[-1] == 0
     assert np.abs(after.pose[-1, 2] - before.pose[-1, 2]) < 3.0
     assert after.pose_std[-1, 2] < 1.1 * before.pose_std[-1, 2]
     np.testing.assert_allclose(known.offset[0], before.offset[-1], atol=1e-5)
