@@ -40,7 +40,7 @@ PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
 LEAST_CURVATURE = 0.1
 """Inverse square metres: below it a direction counts as not observed at all. A single silhouette tells the distance of
-somebody 40 m from a low camera with a standard deviation of one or two metres, which many of them make useful."""
+a person 40 m from a low camera with a standard deviation of one or two metres, which many of them make useful."""
 MOST_SHIFT_M = 0.2
 """A reading along a direction in which the score is flat is no farther than this from where the search ended."""
 PASSES = 2

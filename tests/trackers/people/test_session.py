@@ -83,6 +83,7 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
     }
 
 
+@pytest.mark.system
 def test_what_the_floor_mirrors_is_found_from_people_who_are_taken_out_of_the_background(scene, monkeypatch):
     room = np.random.default_rng(0).integers(150, 190, (120, 160, 3)).astype(np.uint8)
     images = [room.copy() for _ in range(20)]
