@@ -1,7 +1,11 @@
 """Differences from a background image as probabilities, in 8-bit arithmetic that keeps up with full HD."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
+
+from jaxfilters.trackers.background.reflection import reflected_share, strongest_above
 
 NOISE_STEPS = 16
 """Steps of the noise to one level of brightness."""
@@ -14,6 +18,8 @@ SHADOW_BRIGHTNESS = (0.5, 0.95)
 """How bright the background may remain within a shadow."""
 SHADOW_CHROMATICITY = 0.02
 """Largest change of red / (red + green + blue), or of green or blue, within a shadow."""
+_REFLECTIONS, _MOST_MIRRORED = 2.0, 0.5
+"""Median reflections that are no foreground, and what is more than a reflection in any case."""
 _SHADOW_COLS = 640
 """Columns in which shadows are looked for, at least: in larger images they are larger as well."""
 _SHADOW_SIDE = 5
@@ -33,6 +39,8 @@ class Difference:
         """(rows, cols[, 3]) uint8."""
         self.noise = np.zeros((0, 0), np.uint8)
         """(rows, cols): median absolute deviation in steps of 1 / `NOISE_STEPS` of a level."""
+        self.reflection = 0.0
+        """Share of a difference that the floor mirrors below it; `estimate_reflection` finds it."""
         self._table = logistic_table()
 
     def set_background(self, background: np.ndarray, noise: np.ndarray) -> None:
@@ -44,6 +52,11 @@ class Difference:
         self._largest, self._smooth, self._ratio = (np.empty((rows, cols), np.uint8) for _ in range(3))
         self._set_threshold()
 
+    @property
+    def mirrors(self) -> bool:
+        """Whether reflections of what differs most would be foreground."""
+        return 255 * _REFLECTIONS * self.reflection > self._least
+
     def probability(self, image: np.ndarray) -> np.ndarray:
         """(rows, cols) float32, one half where the largest difference among the channels is at the threshold.
 
@@ -51,19 +64,20 @@ class Difference:
             ValueError: an image of another shape or type than the background.
         """
         background = self._checked(image)
-        cv2.absdiff(image, background, dst=self._absolute)
-        if image.ndim == 2:
-            largest = self._absolute
-        else:
-            cv2.split(self._absolute, self._channels)
-            largest = cv2.max(self._channels[0], self._channels[1], dst=self._largest)
-            largest = cv2.max(largest, self._channels[2], dst=self._largest)
-        cv2.medianBlur(largest, 3, dst=self._smooth)
-        cv2.divide(self._smooth, self._threshold, dst=self._ratio, scale=_AT_THRESHOLD)
+        self._compare(image, background)
+        cv2.divide(self._smooth, self._raised_threshold(), dst=self._ratio, scale=_AT_THRESHOLD)
         probability = cv2.LUT(self._ratio, self._table)
         if self._shadow_probability < 1:
             self._weaken_shadows(image, probability)
         return probability
+
+    def estimate_reflection(self, images: Sequence[np.ndarray]) -> None:
+        """From images in which people stand or walk, in the light of the background."""
+        differences = []
+        for image in images:
+            self._compare(image, self._checked(image))
+            differences.append(self._smooth.copy())
+        self.reflection = reflected_share(differences, self._least)
 
     def follow(self, image: np.ndarray, probability: np.ndarray | None, keep: np.ndarray | None) -> None:
         """Move the background and its noise by a step towards `image`.
@@ -86,6 +100,24 @@ class Difference:
     def noise_of(self, deviations: np.ndarray) -> np.ndarray:
         """Noise as stored, of median absolute deviations in levels, smoothed over neighbours."""
         return cv2.blur(cv2.convertScaleAbs(deviations, alpha=NOISE_STEPS), (5, 5))
+
+    def _compare(self, image: np.ndarray, background: np.ndarray) -> None:
+        """Leaves the largest difference among the channels, after a median of nine, in `_smooth`."""
+        cv2.absdiff(image, background, dst=self._absolute)
+        if image.ndim == 2:
+            largest = self._absolute
+        else:
+            cv2.split(self._absolute, self._channels)
+            largest = cv2.max(self._channels[0], self._channels[1], dst=self._largest)
+            largest = cv2.max(largest, self._channels[2], dst=self._largest)
+        cv2.medianBlur(largest, 3, dst=self._smooth)
+
+    def _raised_threshold(self) -> np.ndarray:
+        """(rows, cols): where the floor mirrors, more than the reflection of what is above."""
+        if not self.mirrors:
+            return self._threshold
+        share = min(_REFLECTIONS * self.reflection, _MOST_MIRRORED)
+        return cv2.max(self._threshold, cv2.convertScaleAbs(strongest_above(self._smooth), alpha=share))
 
     def _set_threshold(self) -> None:
         levels = cv2.convertScaleAbs(self.noise, alpha=self._spread * _MAD_TO_STD / NOISE_STEPS)

@@ -1,6 +1,6 @@
 """A running median as the background of a fixed camera, and thresholds from how much each pixel flickers."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -71,10 +71,20 @@ class MedianBackground:
         """The background as it is now, uint8; None before the first image."""
         return self._difference.background
 
+    @property
+    def reflection(self) -> float:
+        """Share of a difference that the floor mirrors; 0 where it mirrors too little to matter."""
+        return self._difference.reflection if self._difference.mirrors else 0.0
+
     def prime(self, images: Iterable[np.ndarray]) -> None:
         """Take the median of up to `SAMPLES` of the images, evenly spread, as the background."""
         self._learn_from(evenly(images))
         self._samples, self._sure = [], 1.0
+
+    def estimate_reflection(self, images: Sequence[np.ndarray]) -> None:
+        """How much of people the floor mirrors, from images that show them; `prime` does it with its own."""
+        if self.image is not None:
+            self._difference.estimate_reflection([self._in_same_light(image) for image in images])
 
     def compare(self, image: np.ndarray) -> np.ndarray:
         """Probability of foreground as `apply`, without learning anything."""
@@ -100,13 +110,20 @@ class MedianBackground:
         if self.image is None:
             return {}
         counts = np.array([self._frames, self._sure, self._covered, self.restarts])
-        return {"background": self.image.copy(), "noise": self._difference.noise.copy(), "counts": counts}
+        found = self._difference
+        return {
+            "background": self.image.copy(),
+            "noise": found.noise.copy(),
+            "counts": counts,
+            "reflection": np.array(found.reflection),
+        }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """As `Background.restore`."""
         if not state:
             return
         self._difference.set_background(state["background"].copy(), state["noise"].copy())
+        self._difference.reflection = float(state["reflection"])
         frames, self._sure, covered, restarts = map(float, state["counts"])
         self._frames, self._covered, self.restarts = int(frames), int(covered), int(restarts)
 
@@ -140,6 +157,7 @@ class MedianBackground:
         background = temporal_median(images)
         deviations = temporal_median([_largest(cv2.absdiff(image, background)) for image in images])
         self._difference.set_background(background, self._difference.noise_of(deviations))
+        self._difference.estimate_reflection(images)
 
 
 def evenly(images: Iterable[np.ndarray]) -> list[np.ndarray]:

@@ -33,10 +33,14 @@ LEAST_STEP_M, MOST_STEP_M = 0.045, 0.08
 """Bounds on what these pixels come to in metres."""
 STEP_SHARES = (2.0, 1.0, 1.0, 0.9)
 """Steps away from the camera, sideways, in height and in width, in steps sideways."""
+FOOT_PX, REACH_FOOT_PX = 1.0, 4.0
+"""Pixels by which the step away from the camera moves the feet, at least, and the farthest candidate, at most: under a
+small angle a pixel is a large part of a metre of floor."""
 PROFILE_M = 0.3
 """Distance along the line of sight at which the score is compared with its maximum (section 4, E2)."""
-LEAST_CURVATURE = 1.0
-"""Inverse square metres: below it a direction counts as not observed at all."""
+LEAST_CURVATURE = 0.1
+"""Inverse square metres: below it a direction counts as not observed at all. A single silhouette tells the distance of
+a person 40 m from a low camera with a standard deviation of one or two metres, which many of them make useful."""
 MOST_SHIFT_M = 0.2
 """A reading along a direction in which the score is flat is no farther than this from where the search ended."""
 PASSES = 2
@@ -99,7 +103,7 @@ def fit_people(
     covariance = _observed_covariance(scene, predicted)
     prior = jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
-    reach = _reach(covariance, axes)
+    reach = _reach(scene, start, covariance, axes)
     views = jax.vmap(views_of, in_axes=(None, None, 0, 0, 0))(scene, frames, start, axes, reach)
     if has_shifts(scene):
         views = jax.vmap(weighted, in_axes=(None, 0, 0))(scene, start, views)
@@ -261,12 +265,26 @@ def _axes(scene, place):
 def _steps(scene, places):
     """From the size of a pixel of the camera that sees each person finest."""
     finest = jnp.min(jnp.stack([pixel_m(camera, places[:, :2]) for camera in scene.cameras]), axis=0)
-    return jnp.clip(CURVATURE_PX * finest, LEAST_STEP_M, MOST_STEP_M)[:, None] * jnp.array(STEP_SHARES)
+    steps = jnp.clip(CURVATURE_PX * finest, LEAST_STEP_M, MOST_STEP_M)[:, None] * jnp.array(STEP_SHARES)
+    return steps.at[:, 0].max(FOOT_PX * _foot_pixel_m(scene, places))
 
 
-def _reach(covariance, axes):
+def _foot_pixel_m(scene, places):
+    """Metres along the line of sight that move feet by a pixel, in the camera that tells distances best."""
+
+    def in_camera(camera):
+        center = camera.position()
+        height = jnp.maximum(center[2], LEAST_STEP_M)
+        distance = jnp.linalg.norm(places[:, :2] - center[:2], axis=-1)
+        return pixel_m(camera, places[:, :2]) * jnp.hypot(distance, height) / height
+
+    return jnp.min(jnp.stack([in_camera(camera) for camera in scene.cameras]), axis=0)
+
+
+def _reach(scene, places, covariance, axes):
     along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], covariance[:, :2, :2], axes[:, :2, :2])
-    return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, MOST_REACH_M)
+    most = jnp.full((len(places), 2), MOST_REACH_M).at[:, 0].max(REACH_FOOT_PX * _foot_pixel_m(scene, places))
+    return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, most)
 
 
 def _nearest_first(scene, views, places, active) -> Int32[Array, " slots"]:

@@ -7,9 +7,10 @@ from jaxtyping import Array, Bool, Float
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.scene import nearest_on_border, walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity
-from jaxfilters.trackers.people.births import Birth
+from jaxfilters.trackers.people.births import Birth, stride
 from jaxfilters.trackers.people.exchange import is_meeting
 from jaxfilters.trackers.people.fit import Fit
+from jaxfilters.trackers.people.silhouette_bias import edge_covariance
 from jaxfilters.trackers.people.state import (
     DORMANT,
     FREE,
@@ -20,7 +21,6 @@ from jaxfilters.trackers.people.state import (
     TRACKED,
     WIDTH,
     People,
-    PeopleConfig,
     PeopleScene,
     chosen,
 )
@@ -38,12 +38,17 @@ AWAY_SD = 2.0
 """Standard deviations beyond the border of the floor from which on a person has left it."""
 LOST_SD_M = 1.2
 """A place known no better than this is no place."""
+LOST_NEWCOMER_SDS = 2.0
+"""Where cameras tell distances worse than that, the same in standard deviations of a birth."""
 LIKENESS = 0.3
 """Dissimilarity up to which a person who comes is a person who left."""
 WALKING_M_PER_S = 2.0
 LEARNING_RATE = 0.1
 """Share of a new appearance in the remembered one."""
 NEWCOMER_SD_M = 0.3
+"""Of the place of a birth, from the distance between cells."""
+_LEAST_INFORMATION = 0.01
+"""Inverse square metres: a place that no silhouette fixes is still somewhere on the floor."""
 
 
 def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], looked: Bool[Array, ""]) -> People:
@@ -58,14 +63,21 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
     log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
     unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)
-    sd = jnp.sqrt(jnp.max(jnp.diagonal(people.belief.covariance, axis1=1, axis2=2)[:, :2], axis=-1))
+    sd = _largest_sd(people.belief.covariance[:, :2, :2])
+    newcomers = jax.vmap(newcomer_covariance, in_axes=(None, 0))(scene, people.belief.mean[:, :2])
+    lost = sd > jnp.maximum(LOST_SD_M, LOST_NEWCOMER_SDS * _largest_sd(newcomers))
     away = _is_away(scene, people.belief)
-    gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | (sd > LOST_SD_M) | away)
+    gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | lost | away)
     gone |= (people.mode == TENTATIVE) & (unseen > 0.5)
     mode = jnp.where(gone, jnp.where(people.mode == TRACKED, DORMANT, FREE), people.mode)
     mode = jnp.where((mode == DORMANT) & (unseen > config.memory_s + config.hidden_s), FREE, mode)
     mode = jnp.where((mode == TENTATIVE) & (log_odds > config.confirmed), TRACKED, mode)
     return people._replace(log_odds=log_odds, unseen_s=unseen, mode=mode)
+
+
+def _largest_sd(covariance: Float[Array, "slots 2 2"]) -> Float[Array, " slots"]:
+    """Of X and Y."""
+    return jnp.sqrt(jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2), axis=-1))
 
 
 def _is_away(scene: PeopleScene, belief: Gaussian) -> Bool[Array, " slots"]:
@@ -117,15 +129,17 @@ def named(people: People) -> People:
     return people._replace(identity=jnp.where(people.mode == FREE, -1, people.identity))
 
 
-def confirm(config: PeopleConfig, people: People, found: Birth) -> People:
+def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
     """With the birth in a free slot; without a free one, nobody is added."""
-    free = people.mode == FREE
+    config, free = scene.config, people.mode == FREE
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
     n = len(free)
     mean = jnp.zeros(STATE).at[:2].set(found.xy).at[HEIGHT].set(config.height_m).at[WIDTH].set(config.width_m)
-    position, speed = [NEWCOMER_SD_M] * 2, [config.speed_sd] * 2
-    sd = jnp.array([*position, *speed, config.height_sd_m, config.width_sd_m, *[1.0] * NUM_BIASES])
-    fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(jnp.diag(sd**2), (n, STATE, STATE)))
+    sd = jnp.array(
+        [0.0, 0.0, *[config.speed_sd] * 2, config.height_sd_m, config.width_sd_m, *[1.0] * NUM_BIASES],
+    )
+    covariance = jnp.diag(sd**2).at[:2, :2].set(newcomer_covariance(scene, found.xy))
+    fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(covariance, (n, STATE, STATE)))
     return people._replace(
         belief=chosen(slot, fresh, people.belief),
         mode=jnp.where(slot, TENTATIVE, people.mode),
@@ -135,3 +149,16 @@ def confirm(config: PeopleConfig, people: People, found: Birth) -> People:
         appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
         shift=jnp.where(slot[:, None, None], 0.0, people.shift),
     )
+
+
+def newcomer_covariance(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+    """Of the place of a birth, square metres: that of the grid of cells, and of edges in the reduced image.
+
+    An edge that is a pixel of the reduced image too low moves a person who is looked at under a small angle by metres.
+    A belief that is surer than that keeps the error for seconds, as a bias of the silhouette.
+    """
+    config = scene.config
+    edges_px = [float(stride(camera.shape)) for camera in scene.cameras]
+    known = jnp.zeros((3, 3)).at[2, 2].set(1 / config.height_sd_m**2) + _LEAST_INFORMATION * jnp.eye(3)
+    covariance = edge_covariance(scene, xy, jnp.asarray(config.height_m), edges_px, known)
+    return covariance[:2, :2] + NEWCOMER_SD_M**2 * jnp.eye(2)

@@ -166,7 +166,11 @@ class PeopleSession:
             if images and self._registrations:
                 straight, blank = self._registrations[camera].prime(evenly(images))
                 scene = self.tracks.scene
-                model.prime(emptied(scene.cameras[camera], np.asarray(scene.floor), straight, blank))
+                empty = emptied(scene.cameras[camera], np.asarray(scene.floor), straight, blank)
+                model.prime(empty)
+                if isinstance(model, MedianBackground):
+                    parts = zip(empty, blank, straight, strict=True)
+                    model.estimate_reflection([cv2.copyTo(room, unknown, one.copy()) for room, unknown, one in parts])
                 self._renew_reference(camera)
             elif images:
                 model.prime(images)
@@ -212,7 +216,12 @@ class PeopleSession:
             for camera, model in enumerate(self._backgrounds)
             if isinstance(model, MedianBackground) and model.restarts
         ]
-        return moved + lost
+        mirrored = [
+            f"camera {camera}: the floor mirrors {model.reflection:.0%} of people; reflections count as background"
+            for camera, model in enumerate(self._backgrounds)
+            if isinstance(model, MedianBackground) and model.reflection
+        ]
+        return moved + lost + mirrored
 
     def state(self) -> dict[str, Any]:
         """What the next images need, but for the tracks: arrays by name."""

@@ -7,6 +7,8 @@ normalised coordinates b with unit variance when nothing is known, and the covar
 follows from the geometry of the cameras.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -25,27 +27,48 @@ def pixel_m(camera: FloorCamera, xy: Float[Array, "*batch 2"]) -> Float[Array, "
     return jnp.where(depth > 0, depth, jnp.inf) / focal
 
 
-def bias_factor(scene: PeopleScene, mean: Float[Array, " state"]) -> Float[Array, "4 biases"]:
-    """The matrix L of the displacement of X, Y, height and width by the normalised biases, metres.
+def edge_covariance(
+    scene: PeopleScene,
+    xy: Float[Array, " 2"],
+    height: Float[Array, ""],
+    edges_px: Sequence[float],
+    information: Float[Array, "3 3"],
+) -> Float[Array, "3 3"]:
+    """Covariance of X, Y and height by errors of the edges of a silhouette, square metres.
 
     Every camera that has the middle of the person in its image measures the sides, the feet and the head, each at right
-    angles to its line of sight and off by `silhouette_bias_m` and `silhouette_bias_px`. A foot that is off by s moves
-    the person by s / sin(a) along a line of sight that falls by the angle a. The information of all cameras adds up.
+    angles to its line of sight and off by `silhouette_bias_m` and by some pixels. A foot that is off by s moves the
+    person by s / sin(a) along a line of sight that falls by the angle a. The information of all cameras adds up.
+
+    Args:
+        scene: Cameras and constants.
+        xy: Where the person stands, metres.
+        height: Metres.
+        edges_px: By how many pixels edges are off in each camera, one standard deviation.
+        information: What is known of X, Y and height without the silhouette, inverse square metres.
+    """
+    height = jnp.maximum(height, 0.5)
+    sees = jnp.stack([_has_middle(camera, xy, height) for camera in scene.cameras])
+    sees = jnp.where(jnp.any(sees), sees, True)
+    for camera, counts, edge_px in zip(scene.cameras, sees, edges_px, strict=True):
+        jacobian = _silhouette_jacobian(camera.position(), xy, height)
+        spread = edge_px * jnp.where(counts, pixel_m(camera, xy), 0.0)
+        variance = scene.config.silhouette_bias_m**2 + spread**2
+        information += counts * jacobian.T @ jacobian / variance
+    return jnp.linalg.inv(information)
+
+
+def bias_factor(scene: PeopleScene, mean: Float[Array, " state"]) -> Float[Array, "4 biases"]:
+    """The matrix L of the displacement of X, Y, height and width by the normalised biases, metres.
 
     Args:
         scene: Cameras and constants.
         mean: Of a state.
     """
-    xy, height = mean[:2], jnp.maximum(mean[HEIGHT], 0.5)
-    sees = jnp.stack([_has_middle(camera, xy, height) for camera in scene.cameras])
-    sees = jnp.where(jnp.any(sees), sees, True)
+    edges_px = [scene.config.silhouette_bias_px] * len(scene.cameras)
     information = jnp.eye(NUM_BIASES) / _MOST_BIAS_M**2
-    for camera, counts in zip(scene.cameras, sees, strict=True):
-        jacobian = _silhouette_jacobian(camera.position(), xy, height)
-        spread = scene.config.silhouette_bias_px * jnp.where(counts, pixel_m(camera, xy), 0.0)
-        variance = scene.config.silhouette_bias_m**2 + spread**2
-        information += counts * jacobian.T @ jacobian / variance
-    return jnp.pad(jnp.linalg.cholesky(jnp.linalg.inv(information)), ((0, 1), (0, 0)))
+    covariance = edge_covariance(scene, mean[:2], mean[HEIGHT], edges_px, information)
+    return jnp.pad(jnp.linalg.cholesky(covariance), ((0, 1), (0, 0)))
 
 
 def displacement(scene: PeopleScene, mean: Float[Array, " state"]) -> Float[Array, " 4"]:

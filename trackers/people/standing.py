@@ -3,8 +3,9 @@
 A temporal median takes whoever stands still for half of a recording for the room. A detector of upright people
 (N. Dalal, B. Triggs, "Histograms of oriented gradients for human detection", 2005, as trained by OpenCV) finds them in
 the sampled images. It also answers to railings and doors; only boxes count that have the size of a person who stands on
-the floor there. Where a person covers a pixel in all images, the room behind is interpolated from its surroundings (A.
-Telea 2004), unless nothing moves there at all: then it is a thing.
+the floor there. Where boxes cover a pixel in most images, the room behind is guessed from its surroundings (A. Telea
+2004), unless nothing moves there at all: then it is a thing. Boxes are wider than people, and people sway, so that the
+room is often observed there all the same: of the colours that some images share, the one nearest to the guess.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,12 @@ _MOVES_LEVELS, _MOVES_SHARE = 40, 0.15
 _PERCENTILES = (10, 90)
 """Between which a pixel changes: who passes by does not count."""
 _INPAINT_RADIUS_PX = 5.0
+_RINGS, _RING_PX = 7, 4
+"""Rings of a covered part, from its border inwards, each settled before the next is guessed; and their width."""
+_SAME_LEVELS, _LEAST_SHARED = 12, 3
+"""Largest difference of pixels that show the same thing, and images that must show it."""
+_NEAR_GUESS_LEVELS = 40
+"""Between the room and its guess, at most: people whose clothes are nearer to it are taken for the room."""
 _NEAR_BOX_PX = 2
 
 
@@ -62,7 +69,7 @@ def emptied(
     covered = np.zeros(somewhere.shape, bool)
     covered[somewhere] = free < _LEAST_FREE
     covered = _changing(covered, lit)
-    empty = cv2.inpaint(empty, covered.astype(np.uint8), _INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
+    empty = _completed(empty, covered, lit)
     usable = covered.copy()
     usable[somewhere] |= free >= _LEAST_FREE
     return [np.where((mask & usable)[..., None], empty, image) for image, mask in zip(lit, masks, strict=True)]
@@ -120,6 +127,34 @@ def _free_median(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     ordered = np.sort(np.where(hidden[..., None], np.int16(1000), values), axis=0)
     middle = ((~hidden).sum(axis=0) - 1) // 2
     return np.take_along_axis(ordered, middle[None, :, None], axis=0)[0].astype(np.uint8)
+
+
+def _completed(empty: np.ndarray, covered: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:
+    """The room where it is `covered` (rows, cols): of what the images show there, what is nearest to a guess."""
+    found, covered = empty.copy(), covered.copy()
+    kernel = np.ones((2 * _RING_PX + 1, 2 * _RING_PX + 1), np.uint8)
+    for ring in range(_RINGS + 1):
+        unknown = covered.astype(np.uint8)
+        found = cv2.inpaint(found, unknown, _INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
+        outer = covered if ring == _RINGS else covered & (cv2.erode(unknown, kernel) == 0)
+        if not outer.any():
+            break
+        room, is_known = _nearest_shared(np.stack([image[outer] for image in images]).astype(np.int16), found[outer])
+        known = outer.copy()
+        known[outer] = is_known
+        found[known] = room[is_known]
+        covered &= ~known
+    return found
+
+
+def _nearest_shared(values: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(pixels, 3) the colour that some images (images, pixels, 3) share nearest to a guess, and where there is one."""
+    apart = np.abs(values - guess.astype(np.int16)).max(axis=-1)
+    shared = np.stack([(np.abs(values - one).max(axis=-1) <= _SAME_LEVELS).sum(axis=0) for one in values])
+    apart = np.where(shared >= _LEAST_SHARED, apart, np.int16(1000))
+    nearest = np.take_along_axis(values, apart.argmin(axis=0)[None, :, None], axis=0)
+    others = np.abs(values - nearest).max(axis=-1) > _SAME_LEVELS
+    return _free_median(values, others), apart.min(axis=0) < _NEAR_GUESS_LEVELS
 
 
 def _changing(covered: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:

@@ -111,7 +111,7 @@ def step(
     good &= fit.share_seen > CLEAR
     people = identity_switch_correction(people, histograms, good, dt)
     people = lifecycle.named(lifecycle.remembered(people, histograms, good))
-    people = lifecycle.confirm(scene.config, people, birth(scene, places, active, frames))
+    people = lifecycle.confirm(scene, people, birth(scene, places, active, frames))
     return people, _report(scene, people, fit, nis)
 
 

@@ -46,6 +46,13 @@ def camera():
 
 
 @pytest.fixture(scope="session")
+def low_camera():
+    """At 4 m, with people 40 m away around the origin, where a pixel is a quarter of a metre of floor."""
+    zoom = np.array([[10, 0, -9 * 79.5], [0, 10, -9 * 59.5], [0, 0, 1.0]])
+    return FloorCamera.from_matrix(zoom @ np.asarray(made_camera((0.0, -40.0, 4.0), 4.5).P, float), SHAPE)
+
+
+@pytest.fixture(scope="session")
 def draw():
     return drawn_people
 

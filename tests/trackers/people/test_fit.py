@@ -62,6 +62,17 @@ def test_shape_and_gait_add_to_every_reading():
 
 
 @pytest.mark.usefixtures("x64")
+def test_a_vague_reading_counts():
+    """A standard deviation of 1.4 m: what one silhouette tells of somebody far from a low camera."""
+    fit, *_ = parabolas(2, 1)
+    curvature = jnp.diag(jnp.array([0.5, 500.0, 300.0, 200.0]))[None, None]
+    fit = fit._replace(quadratic=Quadratic(jnp.zeros((1, 1)), jnp.zeros((1, 1, 4)), curvature))
+    *_, R, observed = (np.asarray(leaf)[0, 0] for leaf in as_measurement(fit, 0.0))
+    assert observed.all()
+    np.testing.assert_allclose(np.diag(R).max(), 2.0, rtol=1e-6)
+
+
+@pytest.mark.usefixtures("x64")
 def test_a_direction_without_curvature_says_nothing_and_a_slope_without_bottom_moves_nobody_far():
     fit, *_ = parabolas(2, 1)
     curvature = jnp.diag(jnp.array([0.0, 500.0, -20.0, 2.0]))[None, None]
@@ -152,3 +163,20 @@ def test_people_are_searched_for_from_the_camera_that_sees_them_outwards():
     views = SimpleNamespace(visible=observed[..., None] * jnp.array([0.0, 1.0]))
     order = _nearest_first(scene, views, places, jnp.array([True, True, True, True, False]))
     assert order.tolist() == [2, 0, 1, 3, 4]
+
+
+def test_the_score_is_compared_over_pixels_of_the_feet(low_camera, draw):
+    """Along the line of sight, where a few centimetres of floor are less than the image tells apart."""
+    floor = [(-4, -10), (4, -10), (4, 10), (-4, 10)]
+    scene = people_scene([low_camera], floor, config=PeopleConfig(capacity=1, spread_px=0.0))
+    mask, _ = draw(low_camera, [(0.0, 0.0, 1.72, 0.45)])
+    mean = jnp.array([[0.0, -1.5, 0, 0, 1.72, 0.45, 0, 0, 0]])
+    sd = jnp.array([1.0, 1.0, 0.5, 0.5, 0.08, 0.06, 0.1, 0.1, 0.1])
+    frame = CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True))
+    belief = Gaussian(mean, jnp.diag(sd**2)[None])
+    no_shift, active, seniority = jnp.zeros((1, 1, 2)), jnp.ones(1, bool), jnp.zeros(1)
+    fit = jax.jit(fit_people)(scene, belief, no_shift, active, seniority, (frame,))
+    x, y = fit.place[0, :2]
+    feet, beyond = (low_camera.project(jnp.array([x, y + d, 0.0]))[0] for d in (0.0, fit.steps[0, 0]))
+    assert 0.8 < np.linalg.norm(beyond - feet) < 1.3
+    assert abs(y) < 0.6, "1.5 m too near at first, farther than people are searched for in a small room"

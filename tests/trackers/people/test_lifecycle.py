@@ -8,7 +8,7 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
-from jaxfilters.trackers.people.births import Birth
+from jaxfilters.trackers.people.births import Birth, stride
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, PeopleConfig, nobody
 from jaxfilters.trackers.people.tracker import people_scene
@@ -16,7 +16,7 @@ from jaxfilters.trackers.people.tracker import people_scene
 SLOTS = 4
 CONFIG = PeopleConfig(capacity=SLOTS, cell_m=2.0)
 RED, BLUE = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3))
-judge, name = jax.jit(lifecycle.existence), jax.jit(lifecycle.named)
+judge, name, confirm = (jax.jit(one) for one in (lifecycle.existence, lifecycle.named, lifecycle.confirm))
 
 
 @pytest.fixture(scope="module")
@@ -171,21 +171,39 @@ def test_clothes_are_taken_at_first_and_then_followed_slowly():
     np.testing.assert_array_equal(during.appearance[0], RED)
 
 
-def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it():
+def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it(scene):
     people = people_of(TRACKED, FREE, TRACKED, FREE, identity=[4, -1, 5, -1], log_odds=[8.0, 3.0, 8.0, 0.0])
     people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
     found = Birth(jnp.array([1.5, 2.5]), jnp.array(True))
-    after = lifecycle.confirm(CONFIG, people, found)
+    after = confirm(scene, people, found)
     assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
     np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m, 0, 0, 0])
     assert after.log_odds.tolist() == [8, 0, 8, 0]
     np.testing.assert_allclose(after.appearance[1], 1 / 8)
     np.testing.assert_array_equal(after.belief.mean[2], people.belief.mean[2])
-    unchanged = lifecycle.confirm(CONFIG, people, found._replace(found=jnp.array(False)))
+    unchanged = confirm(scene, people, found._replace(found=jnp.array(False)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(unchanged), jax.tree.leaves(people), strict=True))
 
 
-def test_a_full_house_admits_nobody():
+def test_a_full_house_admits_nobody(scene):
     full = people_of(TRACKED, TENTATIVE, DORMANT, TRACKED)
-    after = lifecycle.confirm(CONFIG, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
+    after = confirm(scene, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))
+
+
+def test_a_newcomer_is_as_uncertain_as_edges_of_the_reduced_image(low_camera):
+    """By rows of feet and head that are off by so many pixels, differentiated numerically, and the grid of cells."""
+    config = PeopleConfig(capacity=SLOTS, cell_m=2.0, silhouette_bias_m=1e-3)
+    far = people_scene([low_camera], [(-4, -10), (4, -10), (4, 10), (-4, 10)], config=config)
+
+    def rows(y, height):
+        return np.array([float(low_camera.project(jnp.array([0.0, y, z]))[0][1]) for z in (0.0, height)])
+
+    slopes = [(rows(d[0], 1.72 + d[1]) - rows(-d[0], 1.72 - d[1])) / 1.0 for d in np.diag([0.5, 0.5])]
+    information = slopes @ np.transpose(slopes) / stride(low_camera.shape) ** 2 + np.diag([0.0, 0.08**-2])
+    variance = np.linalg.inv(information)[0, 0] + lifecycle.NEWCOMER_SD_M**2
+    found = np.asarray(lifecycle.newcomer_covariance(far, jnp.zeros(2)))
+    np.testing.assert_allclose(found[1, 1], variance, rtol=0.1)
+    assert found[0, 0] < 0.11
+    born = confirm(far, nobody(config), Birth(jnp.zeros(2), jnp.bool_(True)))
+    np.testing.assert_allclose(born.belief.covariance[0, :2, :2], found, rtol=1e-5)

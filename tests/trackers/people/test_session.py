@@ -81,3 +81,19 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
     assert {who: len(track) for who, track in restored.tracks.recorder.tracks.items()} == {
         who: len(track) for who, track in primed.tracks.recorder.tracks.items()
     }
+
+
+@pytest.mark.system
+def test_what_the_floor_mirrors_is_found_from_people_who_are_taken_out_of_the_background(scene, monkeypatch):
+    room = np.random.default_rng(0).integers(150, 190, (120, 160, 3)).astype(np.uint8)
+    images = [room.copy() for _ in range(20)]
+    for i, image in enumerate(images):
+        image[40:80, 10 + 6 * i : 22 + 6 * i] -= 120
+        image[80:115, 10 + 6 * i : 22 + 6 * i] -= 36
+    monkeypatch.setattr(session, "emptied", lambda camera, floor, images, blank: [room] * len(images))
+    of_people = session.PeopleSession(scene)
+    of_people.prime([images])
+    assert of_people.trouble() == ["camera 0: the floor mirrors 30% of people; reflections count as background"]
+    nobody = session.PeopleSession(scene)
+    nobody.prime([[room] * 20])
+    assert not nobody.trouble()

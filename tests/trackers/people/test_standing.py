@@ -60,6 +60,22 @@ def test_a_person_who_leaves_late_is_replaced_by_what_was_behind(room, monkeypat
         np.testing.assert_array_equal(image, room)
 
 
+def test_a_room_that_boxes_cover_is_what_images_show_beside_people(room, monkeypatch):
+    """A dark stripe behind somebody who shuffles, in a box of all places: no interpolation knows of it, images do."""
+    room[40:80, 74:82] -= 40
+    box = np.array([box_of(0.0, 0.0)])
+    left, top, right, bottom = np.round(box[0]).astype(int)
+    images, third = [], (right - left) // 3
+    for i in range(24):
+        at = left + third * (i % 3)
+        images.append(with_person(room, [at, top, at + third + 3, bottom], 10 + 60 * (i % 2)))
+    monkeypatch.setattr(standing, "standing_boxes", lambda camera, floor, image: box)
+    guessed = cv2.inpaint(room, standing._mask(SHAPE, box).astype(np.uint8), 5.0, cv2.INPAINT_TELEA)
+    assert np.abs(guessed.astype(int) - room).max() > 30
+    for image in emptied(CAMERA, FLOOR, images, [np.zeros(SHAPE, np.uint8)] * 24):
+        np.testing.assert_allclose(image.astype(int), room, atol=3)
+
+
 def test_a_thing_that_looks_like_a_person_stays(room, monkeypatch):
     box = np.array([box_of(-1.0, 0.0)])
     image = with_person(room, box[0], 40)
