@@ -75,9 +75,8 @@ def start(
     # NumPy makes the constants: each would otherwise be a program of its own.
     last = np.zeros((size + 1, size))
     last[-1] = 1.0
-    coefficients = slope * np.eye(size + 1, size) + offset * last
-    covariance = np.eye(size + 1) / strength
-    coefficients, covariance = (jnp.asarray(each, dtype=float) for each in (coefficients, covariance))
+    coefficients = jnp.asarray(slope * np.eye(size + 1, size) + offset * last, dtype=float)
+    covariance = jnp.asarray(np.eye(size + 1) / strength, dtype=float)
     return DiffusionFit(coefficients, covariance, scale, jnp.asarray(strength, dtype=float))
 
 

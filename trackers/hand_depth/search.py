@@ -124,6 +124,6 @@ def _distance(average: HandGeometry, one: Start, other: Start) -> float:
 
 
 @jax.jit
-def _joints(pose: Array, average: HandGeometry, scale: ArrayLike, side: ArrayLike) -> Array:
+def _joints(pose: Array, average: HandGeometry, scale: Array, side: Array) -> Array:
     geometry = replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype))
     return forward_kinematics(pose, geometry).joints
