@@ -55,6 +55,8 @@ NUM_VARIED = (4, 2)
 """Finalists that are varied, in the first and in the second round."""
 NUM_REGISTERED, NUM_FINALISTS = 56, 6
 """Hypotheses that are registered with the middle one of the sizes, and of these with every size."""
+NUM_REPEATED = 2
+"""Finalists that are registered with every size once more: the first time they start where the middle size has led."""
 REGISTRATION_STRIDE, JUDGING_STRIDE = 4, 2
 """Every how many pixels of the window one is used; coarser pixels mistake the back of a hand for its palm."""
 MAX_ERROR = 0.05
@@ -161,22 +163,29 @@ def find_starts(
     _, costs = _refined(image, tried, ())
     tried = tried.rows(np.argsort(costs)[:num_registered])
     tried, costs = _refined(image, tried, COARSE)
-    finalists = _distinct(tried, costs)
-    if len(scales) > 1:
-        repeats = np.tile(np.asarray(scales, np.float32), len(finalists))
-        tried = tried.rows(np.repeat(finalists, len(scales)))._replace(scales=repeats)
-    else:
-        tried = tried.rows(finalists)
-    tried, costs = _sized(*_refined(image, tried, FINE))
+    finalists = tried.rows(_distinct(tried, costs))
+    tried, costs = _sized(*_refined(image, _of_every_size(finalists, scales), FINE))
+    best = tried.rows(_distinct(tried, costs)[:NUM_REPEATED])
+    tried, costs = _joined((tried, costs), _sized(*_refined(image, _of_every_size(best, scales), FINE)))
     for count in NUM_VARIED[:1] if num_registered < NUM_REGISTERED else NUM_VARIED:
         best = tried.rows(_distinct(tried, costs))
-        varied, varied_costs = _sized(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
-        tried = Hypotheses(*(np.concatenate(leaves) for leaves in zip(tried, varied, strict=True)))
-        costs = np.concatenate([costs, varied_costs])
+        varied = _sized(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
+        tried, costs = _joined((tried, costs), varied)
     return [
         Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
         for i in _distinct(tried, costs)
     ]
+
+
+def _of_every_size(tried: Hypotheses, scales: Sequence[float]) -> Hypotheses:
+    """Every hypothesis with each of the sizes."""
+    sizes = np.tile(np.asarray(scales, np.float32), len(tried.poses))
+    return tried.rows(np.repeat(np.arange(len(tried.poses)), len(scales)))._replace(scales=sizes)
+
+
+def _joined(one: tuple[Hypotheses, np.ndarray], other: tuple[Hypotheses, np.ndarray]) -> tuple[Hypotheses, np.ndarray]:
+    """Hypotheses and their costs, those of `one` first."""
+    return jax.tree.map(lambda first, second: np.concatenate([first, second]), one, other)
 
 
 def _sized(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray]:

@@ -148,4 +148,5 @@ def test_a_real_hand_is_followed(data_dir):
     times = (recording.times_s - recording.times_s[0]).astype(np.float32)
     _, track = tracker.step(tracker.init(jax.random.key(0), depth[0]), depth, times)
     assert np.isin(track.status, (TRACKING, DOUBTFUL)).all()  # a fist is explained as well by the other hand
-    assert joint_errors_mm(track, recording.joints).mean() < 22
+    # Of two seeds 13.8 and 13.8 mm; 15.2 and 16.1 where the best finalists are registered with every size only once.
+    assert joint_errors_mm(track, recording.joints).mean() < 14.5
