@@ -51,7 +51,9 @@ def linear(i):
 def nonlinear(i):
     build = (jf.extended_kalman, jf.unscented_kalman)[i]
     belief = jf.Gaussian(jnp.asarray(MEANS[i]), jnp.eye(2))
-    return build(belief, lambda x: F[i] @ x, jnp.asarray(Q[i]), lambda x: H @ x, jnp.asarray(R))
+    # JAX 0.10 makes a NumPy array that a traced function has used an array of the precision of that time ever after.
+    A, C = F[i].copy(), H.copy()
+    return build(belief, lambda x: A @ x, jnp.asarray(Q[i]), lambda x: C @ x, jnp.asarray(R))
 
 
 def rooted(i):
