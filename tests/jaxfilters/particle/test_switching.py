@@ -43,17 +43,20 @@ LOG_Z = np.logaddexp.reduce(JOINTS)
 POSTERIOR = np.exp(JOINTS - LOG_Z)
 
 
+def fresh(array):
+    """A copy: JAX 0.10 keeps the precision in which a traced function has used a NumPy array, wherever it is next used."""
+    return jnp.asarray(np.array(array))
+
+
 def linear(i):
-    belief = jf.Gaussian(jnp.asarray(MEANS[i]), jnp.eye(2))
-    return jf.kalman(belief, jnp.asarray(F[i]), jnp.asarray(Q[i]), jnp.asarray(H), jnp.asarray(R))
+    belief = jf.Gaussian(fresh(MEANS[i]), jnp.eye(2))
+    return jf.kalman(belief, fresh(F[i]), fresh(Q[i]), fresh(H), fresh(R))
 
 
 def nonlinear(i):
     build = (jf.extended_kalman, jf.unscented_kalman)[i]
     belief = jf.Gaussian(jnp.asarray(MEANS[i]), jnp.eye(2))
-    # JAX 0.10 makes a NumPy array that a traced function has used an array of the precision of that time ever after.
-    A, C = F[i].copy(), H.copy()
-    return build(belief, lambda x: A @ x, jnp.asarray(Q[i]), lambda x: C @ x, jnp.asarray(R))
+    return build(belief, lambda x: F[i] @ x, jnp.asarray(Q[i]), lambda x: H @ x, jnp.asarray(R))
 
 
 def rooted(i):
