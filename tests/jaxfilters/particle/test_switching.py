@@ -44,7 +44,7 @@ POSTERIOR = np.exp(JOINTS - LOG_Z)
 
 
 def fresh(array):
-    """A copy: JAX 0.10 keeps the precision in which a traced function has used a NumPy array, wherever it is next used."""
+    """A copy: JAX 0.10 keeps the precision in which a traced function has used a NumPy array."""
     return jnp.asarray(np.array(array))
 
 
