@@ -117,7 +117,8 @@ def test_a_second_command_finishes_what_a_killed_one_began(tmp_path):
     rows = [{"name": name, "tracker": "fingertips", "options": "--no-video --seconds 4"} for name in "ab"]
     (tmp_path / "manifest.json").write_text(json.dumps(rows))
     out, claims = tmp_path / "out", tmp_path / "out" / ".batch" / "claims"
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    cache = {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
     words = [sys.executable, "-m", "jaxfilters.trackers.app.cli", "batch", tmp_path / "manifest.json", "--out", out]
     first, second = (subprocess.Popen(words, env=os.environ | cache) for _ in range(2))
 
