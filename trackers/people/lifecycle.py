@@ -135,9 +135,8 @@ def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
     slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
     n = len(free)
     mean = jnp.zeros(STATE).at[:2].set(found.xy).at[HEIGHT].set(config.height_m).at[WIDTH].set(config.width_m)
-    sd = jnp.array(
-        [0.0, 0.0, *[config.speed_sd] * 2, config.height_sd_m, config.width_sd_m, *[1.0] * NUM_BIASES],
-    )
+    speed, size = [config.speed_sd] * 2, [config.height_sd_m, config.width_sd_m]
+    sd = jnp.array([0.0, 0.0, *speed, *size, *[1.0] * NUM_BIASES])
     covariance = jnp.diag(sd**2).at[:2, :2].set(newcomer_covariance(scene, found.xy))
     fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(covariance, (n, STATE, STATE)))
     return people._replace(

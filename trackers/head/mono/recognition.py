@@ -71,12 +71,12 @@ def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoCo
     # The last frame of the window may lie back a little: what changes there changes in the frame at hand.
     window, place, x = state.window, jnp.argmin(state.window.ages), state.belief.mean
     pose = x[:POSE] + bundle.poses[place] - window.poses[place]
-    expression = state.modes.expression(one_of(people, state.person_index), x[POSE:])
+    expression = state.modes.expression(one_of(people, state.face_index), x[POSE:])
     expression = expression + bundle.expressions[place] - window.expressions[place]
-    state_of = state._replace(person_index=index.astype(state.person_index.dtype))
+    state_of = state._replace(face_index=index.astype(state.face_index.dtype))
     anew = settled(face, rig, state_of, bundle, pose, expression, options)
     sound = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((anew.person, anew.belief, anew.model))]
-    changes = jnp.isfinite(log_posterior[index]) & (index != state.person_index) & jnp.all(jnp.stack(sound))
+    changes = jnp.isfinite(log_posterior[index]) & (index != state.face_index) & jnp.all(jnp.stack(sound))
     return jax.tree.map(lambda a, b: jnp.where(changes, a, b), anew, state)
 
 
@@ -85,7 +85,7 @@ def tried(people: People, rig: CameraRig, state: MonoState, options: MonoConfig)
 
     Arguments are those of `recognised`.
     """
-    now = one_of(people, state.person_index)
+    now = one_of(people, state.face_index)
     one = lambda face: weighed(one_of(people, 0), face, rig, state, _start(face, now, state), options)
     # One by one: batches of factorisations can stand still on two cores.
     return jax.lax.map(one, people.faces)

@@ -263,7 +263,7 @@ class _MonoTracker:
         state = self._recognised(state)
         if self._pool is not None and self._ready is None:
             self._ready = self._pool.submit(self._asked_who, self._system, state)
-        what = "registered, a face that is known" if int(state.person_index) else "registered"
+        what = "registered, a face that is known" if int(state.face_index) else "registered"
         return Beginning(state, detections.time, what)
 
     def saved(self) -> dict[str, Any]:
@@ -295,7 +295,7 @@ class _MonoTracker:
 
     def _followed(self, state: MonoState) -> MultilinearFace:
         """The face of whom the state is about."""
-        return one_of(self._people, int(state.person_index)) if int(state.person_index) else self._face
+        return one_of(self._people, int(state.face_index)) if int(state.face_index) else self._face
 
     def _remember(self, old: MonoState) -> None:
         """Who was followed may come back, beside those who were remembered from the first."""

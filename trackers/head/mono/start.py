@@ -152,7 +152,7 @@ def begin(
     return MonoState(
         search=start_search(x, search_options(options)),
         belief=Gaussian(x, jnp.diag(variance).astype(x.dtype)),
-        person_index=jnp.zeros((), jnp.int32),
+        face_index=jnp.zeros((), jnp.int32),
         person=person,
         prior=_held(face, prior, options),
         model=model,

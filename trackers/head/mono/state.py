@@ -82,8 +82,8 @@ class MonoState(NamedTuple):
     """Particles of pose and mode coefficients."""
     belief: Gaussian
     """Of the last estimate, for the person as believed."""
-    person_index: Int[Array, ""]
-    """0 for an unknown person, else 1 + the index of one who is remembered."""
+    face_index: Int[Array, ""]
+    """Of `People.faces`: 0 for an unknown person, else 1 + the index of one who is remembered."""
     person: Person
     """About that face."""
     prior: Prior

@@ -233,7 +233,7 @@ def _track(
         effective_sample_size=ess,
         identity=known((state.person.identity - unknown.identity_mean) / unknown.identity_std),
         offset=known(state.person.offset + face.mean - unknown.mean),
-        person_index=jnp.where(lost, -1, state.person_index - 1).astype(jnp.int32),
+        person_index=jnp.where(lost, -1, state.face_index - 1).astype(jnp.int32),
         is_adjusted=is_adjusted,
         status=jnp.where(lost, LOST, jnp.where(is_sure, DEFORMABLE, DOUBTFUL)).astype(jnp.int32),
     )
