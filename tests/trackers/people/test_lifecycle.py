@@ -191,7 +191,8 @@ def test_a_full_house_admits_nobody(scene):
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))
 
 
-def test_a_newcomer_is_as_uncertain_as_edges_of_the_reduced_image(low_camera):
+@pytest.mark.system
+def test_a_newcomer_is_as_uncertain_as_edges_of_the_reduced_image(low_camera, monkeypatch):
     """By rows of feet and head that are off by so many pixels, differentiated numerically, and the grid of cells."""
     config = PeopleConfig(capacity=SLOTS, cell_m=2.0, silhouette_bias_m=1e-3)
     far = people_scene([low_camera], [(-4, -10), (4, -10), (4, 10), (-4, 10)], config=config)
@@ -207,3 +208,8 @@ def test_a_newcomer_is_as_uncertain_as_edges_of_the_reduced_image(low_camera):
     assert found[0, 0] < 0.11
     born = confirm(far, nobody(config), Birth(jnp.zeros(2), jnp.bool_(True)))
     np.testing.assert_allclose(born.belief.covariance[0, :2, :2], found, rtol=1e-5)
+    # Where that is more than a place may be uncertain elsewhere, a newcomer is kept, and lost when vaguer than it.
+    monkeypatch.setattr(lifecycle, "LOST_SD_M", 0.5 * np.sqrt(variance))
+    vague = born._replace(belief=Gaussian(born.belief.mean, 5.0 * born.belief.covariance))
+    modes = [lifecycle.existence(far, of, fit_of(), jnp.asarray(0.1), jnp.bool_(True)).mode[0] for of in (born, vague)]
+    assert modes == [TENTATIVE, FREE]
