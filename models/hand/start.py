@@ -25,6 +25,7 @@ from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, T
 from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics
 from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.geometry import Capsules
+from jaxfilters.models.rendering.placement import share_poses
 
 PALM_TO_WRIST = 0.055
 """Metres from the middle of the palm to the wrist of an average hand."""
@@ -296,7 +297,12 @@ def _refine_batch(
     num_steps: Int[Array, ""],
 ) -> tuple[Float[Array, "h 22"], Float[Array, " h"]]:
     """Registered poses and their costs; without steps, the costs of the poses as they are."""
-    near = _near(camera, observed, center)
+    shared = (camera, _near(camera, observed, center), geometry, widths, num_steps)
+    return share_poses(_refine_each, batch, shared)
+
+
+def _refine_each(batch: Hypotheses, shared: tuple) -> tuple[Float[Array, "h 22"], Float[Array, " h"]]:
+    camera, near, geometry, widths, num_steps = shared
     coarse_camera, coarse = _every(REGISTRATION_STRIDE, camera, near)
     judging_camera, judged = _every(JUDGING_STRIDE, camera, near)
     root = jnp.diag(per_coordinate(0.06, 0.6, 0.6))

@@ -38,6 +38,22 @@ def map_poses(of_one: Callable, poses: PyTree, shared: PyTree, pixels: int) -> P
     return _map_sharded(of_one, poses, shared, count, Mesh(np.array(devices), (_AXIS,)))
 
 
+def share_poses(of_many: Callable, poses: PyTree, shared: PyTree) -> PyTree:
+    """`of_many(poses, shared)`, whose results have the axis of the poses first, with the poses divided over CPU devices.
+
+    For whole computations about independent poses that end in `map_poses`: where that alone divides the poses, every
+    device repeats all that surrounds the rendering. On an accelerator, or with one device, a plain call.
+    """
+    count = jax.tree.leaves(poses)[0].shape[0]
+    devices = jax.local_devices(backend="cpu") if poses_in_turn() else []
+    if len(devices) < 2 or count % len(devices) or not jax.sharding.get_abstract_mesh().empty:
+        return of_many(poses, shared)
+    mesh = Mesh(np.array(devices), (_AXIS,))
+    return jax.shard_map(of_many, mesh=mesh, in_specs=(P(_AXIS), P()), out_specs=P(_AXIS), check_vma=False)(
+        poses, shared
+    )
+
+
 def _map_sharded(of_one, poses, shared, count, mesh):
     share = -(-count // mesh.size)
     padded = jax.tree.map(
