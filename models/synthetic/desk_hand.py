@@ -146,9 +146,9 @@ def frame_of(
     rows, cols = desk.shape
     if rows * 4 != cols * 3:
         raise ValueError(f"shape must be rows : columns = 3 : 4; got {desk.shape}.")
-    coverage = np.zeros(desk.shape)
+    coverage, of_pose = np.zeros(desk.shape), np.empty(desk.shape)
     for pose in poses:
-        coverage += hand_coverage(pose, desk.shape)
+        coverage += hand_coverage(pose, desk.shape, out=of_pose)
     coverage /= len(poses)
     middle = poses[len(poses) // 2]
     scale = rows / LAYOUT_ROWS
@@ -164,10 +164,13 @@ def frame_of(
     )
 
 
-def hand_coverage(pose: HandPose, shape: tuple[int, int]) -> Float[np.ndarray, "rows cols"]:
-    """Share of each pixel that the hand covers, from 0 to 1."""
+def hand_coverage(
+    pose: HandPose, shape: tuple[int, int], *, out: Float[np.ndarray, "rows cols"] | None = None
+) -> Float[np.ndarray, "rows cols"]:
+    """Share of each pixel that the hand covers, from 0 to 1; written into `out` where that is given."""
     scale = shape[0] / LAYOUT_ROWS
-    coverage = np.zeros(shape)
+    coverage = np.empty(shape) if out is None else out
+    coverage.fill(0.0)
     axis = _direction(pose, 0.0)
     bases, tips = _finger_ends(pose)
     shown = pose.lengths > 0.05
@@ -188,9 +191,9 @@ def _add_capsule(coverage: np.ndarray, start: np.ndarray, end: np.ndarray, radiu
     x, y = np.arange(low[0], high[0])[None] - start[0], np.arange(low[1], high[1])[:, None] - start[1]
     along = end - start
     share = np.clip((x * along[0] + y * along[1]) / max(float(along @ along), 1e-12), 0, 1)
-    distance = np.hypot(x - share * along[0], y - share * along[1])
+    distance = np.sqrt((x - share * along[0]) ** 2 + (y - share * along[1]) ** 2)
     window = coverage[low[1] : high[1], low[0] : high[0]]
-    np.maximum(window, np.clip(radius + 0.5 - distance, 0, 1), out=window)
+    np.maximum(window, np.minimum(radius + 0.5 - distance, 1), out=window)
 
 
 def _finger_ends(pose: HandPose) -> tuple[np.ndarray, np.ndarray]:

@@ -25,8 +25,8 @@ class DemoHand:
         self.name, self.fps, self.image_size = "synthetic hand", DEMO_FPS, (DEMO_SHAPE[1], DEMO_SHAPE[0])
         self._script = script(seed)
         self.frames = len(self._script.fingers)
-        self.truth: list[DeskFrame] = []
-        """Of the frames so far, without their images."""
+        self.truth: DeskFrame | None = None
+        """The last frame, with what is true of it."""
         self._key = jax.random.key(seed)
 
     def sample(self, most: int) -> list[np.ndarray]:
@@ -37,7 +37,7 @@ class DemoHand:
         """An open hand, which then draws, and handles things."""
         fingers, poses, _ = self._script
         for i, frame in enumerate(desk_video(self._key, fingers, shape=DEMO_SHAPE, poses=poses)):
-            self.truth.append(frame)
+            self.truth = frame
             yield i / self.fps, cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR)
 
     def trouble(self) -> str | None:

@@ -53,7 +53,7 @@ class FingertipStream:
         self._report = HandReport(*(field[0] for field in found))
         rows = tip_rows(self.tally.frames, time_s, self._report)
         self._write_events()
-        truth = self._source.truth[-1] if isinstance(self._source, DemoHand) else None
+        truth = self._source.truth if isinstance(self._source, DemoHand) else None
         self.tally = self.tally.add(time_s, self._report, truth)
         return rows
 
