@@ -21,6 +21,9 @@ TEXTURE_RMS, WINDOW_MM = 40.0, 6.0
 """Grey levels before the Gaussian window, and the window's standard deviation."""
 NUM_BACKGROUND_WAVES, BACKGROUND_AMPLITUDE, BACKGROUND_MEAN = 40, 5.0, 95.0
 BACKGROUND_WAVELENGTHS_PX = (12.0, 120.0)
+_COSINE = (0.999999989, -19.7392045, 64.9391159, -85.4501134, 60.1674298, -25.9668846, 6.52770596)
+"""The cosine of an angle as a polynomial in the square of its turns from -1/2 to 1/2: Chebyshev's interpolation, whose
+error is 1.1e-8."""
 _RMS_REACH_MM = 3 * WINDOW_MM
 _RIGHT = (0, 1, 4, 6, 8)
 _SOURCE = np.array([_RIGHT.index(k if k in _RIGHT else MIRROR[k]) for k in range(len(MIRROR))])
@@ -128,4 +131,14 @@ def patch(
 
 def _waves(wave, phase, x, y):
     # Written out so that XLA makes one loop over the places of it.
-    return sum(jnp.cos(wave[j, 0] * x + wave[j, 1] * y + phase[j]) for j in range(wave.shape[0]))
+    return sum(_cosine(wave[j, 0] * x + wave[j, 1] * y + phase[j]) for j in range(wave.shape[0]))
+
+
+def _cosine(angle: Float[Array, "*places"]) -> Float[Array, "*places"]:
+    """As `jnp.cos`, which is not vectorised on a CPU, in a sixth of its time; to the rounding of `angle` and 1e-6."""
+    turns = angle * (0.5 / math.pi)
+    squared = (turns - jnp.round(turns)) ** 2
+    result = jnp.full_like(squared, _COSINE[-1])
+    for coefficient in _COSINE[-2::-1]:
+        result = result * squared + coefficient
+    return result

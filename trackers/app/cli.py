@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import image_size, seed
 from jaxfilters.trackers.app.compiled import keep_compiled_programs
-from jaxfilters.trackers.app.devices import use_all_cores
+from jaxfilters.trackers.app.devices import keep_freed_memory, use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
 from jaxfilters.trackers.app.options import add_picture_options
 from jaxfilters.trackers.app.output_folder import check_free
@@ -27,9 +27,13 @@ FAILURE, UNFORESEEN, INTERRUPTED, TERMINATED = 2, 70, 130, 143
 
 
 def command() -> int:
-    """The console script: `main`, with compiled programs kept for the next run, except where speed is measured."""
+    """The console script: `main`, with compiled programs kept for the next run, except where speed is measured.
+
+    Settings of the whole process are made here and not in `main`, which may be called from another program.
+    """
     if sys.argv[1:2] != ["bench"] and (trouble := keep_compiled_programs()):
         print(f"jaxfilters: {trouble}.", file=sys.stderr)
+    keep_freed_memory()
     return main()
 
 

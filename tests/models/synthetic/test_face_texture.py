@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.landmarks import MIRROR
-from jaxfilters.models.synthetic.face_texture import AXES, NORMALS, make_background, make_scene, make_texture, patch
+from jaxfilters.models.synthetic.face_texture import (
+    AXES,
+    NORMALS,
+    _cosine,
+    make_background,
+    make_scene,
+    make_texture,
+    patch,
+)
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +75,9 @@ def test_every_camera_has_a_background_of_its_own():
     scene = make_scene(jax.random.key(3), (48, 64), num_cameras=3)
     assert scene.background.shape == (3, 48, 64)
     assert np.abs(np.diff(scene.background, axis=0)).mean() > 10
+
+
+def test_the_fast_cosine_is_the_cosine() -> None:
+    angles = np.linspace(-350, 350, 100_001).astype(np.float32)
+    error = np.abs(_cosine(jnp.asarray(angles)) - np.cos(angles.astype(float)))
+    assert np.all(error < 1e-6 + 2 * np.spacing(np.abs(angles)))
