@@ -39,7 +39,7 @@ def map_poses(of_one: Callable, poses: PyTree, shared: PyTree, pixels: int) -> P
 
 
 def share_poses(of_many: Callable, poses: PyTree, shared: PyTree) -> PyTree:
-    """`of_many(poses, shared)`, whose results have the axis of the poses first, with the poses divided over CPU devices.
+    """`of_many(poses, shared)`, whose results have the axis of the poses first, divided over the CPU devices.
 
     For whole computations about independent poses that end in `map_poses`: where that alone divides the poses, every
     device repeats all that surrounds the rendering. On an accelerator, or with one device, a plain call.

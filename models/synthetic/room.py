@@ -118,7 +118,12 @@ def _light(camera, rays, origin, people, here):
     """`SHADOW` on the floor beside people, 1 elsewhere."""
     down = jnp.where(rays[..., 2] < -1e-6, rays[..., 2], -1e-6)
     depth = -origin[2] / down
-    floor = origin[:2] + depth[..., None] * rays[..., :2]
-    away = floor - (people.xy + jnp.array(SHADOW_AWAY_M))[:, None, None]
-    dark = jnp.any((jnp.sum((away / jnp.array(SHADOW_AXES_M)) ** 2, axis=-1) < 1) & here[:, None, None], axis=0)
+    # By components: a last axis of two leaves most of a vector register empty.
+    x, y = (origin[axis] + depth * rays[..., axis] for axis in (0, 1))
+
+    def darkened(middle: Array, is_here: Array) -> Array:
+        across, along = (x - middle[0]) / SHADOW_AXES_M[0], (y - middle[1]) / SHADOW_AXES_M[1]
+        return (across**2 + along**2 < 1) & is_here
+
+    dark = jnp.any(jax.vmap(darkened)(people.xy + jnp.array(SHADOW_AWAY_M), here), axis=0)
     return jnp.where(dark & (depth < camera.furniture), SHADOW, 1.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 _FLAG = "--xla_force_host_platform_device_count"
 _MALLOC = {-3: 32 << 20, -1: 512 << 20, -2: 16 << 20}
-"""Of glibc's `mallopt`, bytes: from what size on an array is mapped on its own (the largest allowed), how much free memory
-is kept at the end of the heap, and by how much more than is needed the heap grows."""
+"""Of glibc's `mallopt`, bytes: from what size on an array is mapped on its own (the largest allowed), how much free
+memory is kept at the end of the heap, and by how much more than is needed the heap grows."""
 
 
 def use_all_cores() -> None:
@@ -25,9 +25,8 @@ def use_all_cores() -> None:
 def keep_freed_memory() -> None:
     """Let the C library use the memory of one image for the next.
 
-    Otherwise every image of a few megabytes is mapped and unmapped, and the kernel clears each of its pages anew: 3 of 19
-    processor seconds of synthetic fingertips. Only
-    glibc has these settings; elsewhere nothing changes.
+    Otherwise every image of a few megabytes is mapped and unmapped, and the kernel clears each of its pages anew: 3 of
+    19 processor seconds of synthetic fingertips. Only glibc has these settings; elsewhere nothing changes.
     """
     if platform.libc_ver()[0] == "glibc":
         mallopt = ctypes.CDLL(None).mallopt
