@@ -84,6 +84,7 @@ def test_machines_that_cannot_run_each_others_programs_have_folders_of_their_own
 @pytest.mark.parametrize(("arguments", "kept"), [(["demo"], True), (["bench", "render"], False)])
 def test_the_command_keeps_programs_but_where_speed_is_measured(arguments, kept, monkeypatch, capsys):
     monkeypatch.setattr(cli, "keep_compiled_programs", lambda: "no room")
+    monkeypatch.setattr(cli, "keep_freed_memory", lambda: None)
     monkeypatch.setattr(cli, "main", lambda: 7)
     monkeypatch.setattr(sys, "argv", ["jaxfilters", *arguments])
     assert cli.command() == 7

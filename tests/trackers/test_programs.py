@@ -1,0 +1,41 @@
+"""How many programs the command compiles or loads until a system has tracked its synthetic recording."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxfilters.trackers.registry import SYSTEMS
+
+MOST_PROGRAMS = {
+    "hand-depth": 45,
+    "articulated": 36,
+    "people": 49,
+    "head-stereo": 59,
+    "head-mono": 62,
+    "fingertips": 51,
+}
+"""Two more than there are now. Every program is traced, lowered and loaded at every start, 20 ms for the smallest."""
+COUNTED = """
+import atexit, sys, jax.monitoring
+from jaxfilters.trackers.app.cli import main
+programs = []
+def count(name, seconds, **more):
+    if name.endswith("/backend_compile_duration"):
+        programs.append(more.get("fun_name"))
+jax.monitoring.register_event_duration_secs_listener(count)
+code = main(sys.argv[1:])
+print(len(programs), *sorted(map(str, programs)), sep="\\n")
+sys.exit(code)
+"""
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", [system.name for system in SYSTEMS])
+def test_a_start_takes_few_programs(name: str, tmp_path: Path) -> None:
+    short = [] if name in ("hand-depth", "articulated") else ["--seconds", "2"]
+    command = [sys.executable, "-c", COUNTED, "track", name, *short, "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    count, *names = done.stdout.splitlines()[2:]
+    assert int(count) <= MOST_PROGRAMS[name], names
