@@ -17,6 +17,7 @@ _FAR, _IMPOSSIBLE = 1e3, 1e4
 """Squared gates: a hand that was observed takes the nearest component, one that was not what is left."""
 
 
+@partial(jax.jit, static_argnames=("config", "num_hands", "method"))  # one program in place of thirty
 def start_hands(config: FingertipConfig, angles: ThumbAngles, num_hands: int, *, method: Method = MODERN) -> HandState:
     """Hands of which nothing was observed yet, hands first."""
     return repeated(tracker.start(config, angles, method=method), num_hands)

@@ -66,7 +66,7 @@ class FingertipSession:
         self.events: list[Event] = []
         """All so far, in their order."""
         self._angles, self._method, self._recogniser = angles, method, recogniser
-        self._sides = handedness * jnp.asarray([1.0, -1.0] * num_hands)[:num_hands]
+        self._sides = jnp.asarray(handedness * np.array([1.0, -1.0] * num_hands, np.float32)[:num_hands], float)
         self._state = start_hands(self.config, angles, num_hands, method=method)
         zoom, slow = height / 480.0, 30.0 / fps
         self._still = STILL_PX * zoom * slow
