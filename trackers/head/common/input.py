@@ -1,7 +1,9 @@
 """What the head trackers watch: two cameras of a rig, one camera, or a synthetic face."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from functools import lru_cache
+from itertools import combinations, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,11 +24,13 @@ from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.landmarks import read_landmarks
 from jaxfilters.trackers.io.rigs import open_rig
 from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.io.video_input import VideoSource, open_video
+from jaxfilters.trackers.io.video_input import LiveCamera, VideoSource, open_video
 
 FOCAL_WIDTHS = 1.2
 """Assumed focal length of a single camera, image widths: a horizontal field of view of 45 degrees."""
 _SYNTHETIC_FRAMES, _MOTION = 600, "mix"
+_COMPARED = 3
+"""First images by which two recordings are recognised as the same."""
 _SYNTHETIC_FOCAL = 800.0
 """Pixels, of the one camera before a synthetic face."""
 
@@ -87,6 +91,7 @@ def setup_of(sources: Sequence[str], places: Places, seed: int) -> Setup:
     videos = [open_video(source, fps=places.fps) for source in sources]
     for video, camera in zip(videos, described.cameras, strict=True):
         _check_size(video, camera.image_size, f"{places.rig}: {camera.name}")
+    _check_distinct(videos)
     points = _points(places.points, described.undistortions[0])
     return Setup(described.rig, described.undistortions, videos, points, None, None)
 
@@ -179,6 +184,27 @@ def _points(file: Path | None, undistortion: Undistortion) -> np.ndarray | None:
     if undistortion.K is None or undistortion.is_identity:
         return pixels
     return Calibration(undistortion.K, undistortion.distortion, np.eye(3), np.zeros(3), 0.0).undistort(pixels)
+
+
+def _check_distinct(recordings: Sequence[VideoSource]) -> None:
+    """Raise `InputError` where two cameras deliver the same images: both are at one place, which shows no depth."""
+    beginnings = [_beginning(one) for one in recordings]
+    for (i, one), (j, other) in combinations(enumerate(recordings), 2):
+        is_same = one.name == other.name or (len(beginnings[i]) and np.array_equal(beginnings[i], beginnings[j]))
+        if is_same:
+            raise InputError(
+                f"{one.name} and {other.name}: sources {i + 1} and {j + 1} have the same images, so that both cameras "
+                "are at one place and show no depth; expected a recording of its own from each camera of the rig."
+            )
+
+
+def _beginning(recording: VideoSource) -> np.ndarray:
+    """The first images (frames, rows, cols, 3); none of a live camera, nor where all are of one colour."""
+    if isinstance(recording, LiveCamera):
+        return np.zeros(0)
+    with closing(recording.images()) as images:  # type: ignore[type-var]
+        first = [image for _, image in islice(images, _COMPARED) if image is not None]
+    return np.stack(first) if any(image.std() > 0 for image in first) else np.zeros(0)
 
 
 def _check_size(source: VideoSource, size: tuple[int, int], described_by: str) -> None:

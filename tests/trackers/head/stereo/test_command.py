@@ -59,6 +59,19 @@ def stereo(tmp_path):
     return left, right, "--rig", rig_file(tmp_path / "rig.json")
 
 
+def test_the_same_images_from_both_cameras_are_an_error(fake_head, tmp_path, capsys):
+    """The same folder twice, or a copy of it."""
+    rig, grey = rig_file(tmp_path / "rig.json"), np.random.default_rng(0).integers(0, 255, (ROWS, COLS, 3))
+    for name in ("left", "copy", "right"):
+        folder(tmp_path / name, [100] * 4)
+        for i in range(4):
+            cv2.imwrite(str(tmp_path / name / f"{i:03d}.png"), np.roll(grey, 3 if name == "right" else 0, axis=1))
+    for other in ("left", "copy"):
+        assert run(tmp_path / "left", tmp_path / other, "--rig", rig, "--out", tmp_path / "out") == 2
+        assert "sources 1 and 2 have the same images" in capsys.readouterr().err
+    assert run(tmp_path / "left", tmp_path / "right", "--rig", rig, "--out", tmp_path / "out") == 0
+
+
 def rows_of(out):
     with (out / "track.csv").open(newline="") as file:
         return list(csv.DictReader(file))
