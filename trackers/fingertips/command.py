@@ -7,15 +7,18 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from jaxfilters.models.gesture import coded
+from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.results import finite, versions
 from jaxfilters.trackers.app.stream import RunResult, StreamRun, StreamSpec, check_unused
+from jaxfilters.trackers.fingertips.config import RunConfig
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
 from jaxfilters.trackers.fingertips.files import EventFile
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
@@ -25,7 +28,7 @@ from jaxfilters.trackers.fingertips.session import VARIANTS, FingertipSession
 from jaxfilters.trackers.fingertips.summary import write_summary
 from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
 from jaxfilters.trackers.io.video_input import FrameSet
 
@@ -39,24 +42,25 @@ def track(options: argparse.Namespace) -> str:
         KeyboardInterrupt: with what is kept as its text; what was tracked before is written.
     """
     check_unused(options)
+    run_config = as_input_error(partial(config_from_args, RunConfig(), options))
     symbols = _symbols(options.gestures)
     source = open_hands(
         options.video_source,
-        options.mask,
+        run_config.mask,
         fps=options.fps,
-        seed=options.seed,
+        seed=run_config.seed,
         keypoints=options.keypoints,
         image_size=options.image_size,
     )
-    user = _user(source, options.mask)
+    user = _user(source, run_config.mask)
     if not user.has_open_hand:
         usual = "no open hand in the first images; thumbs are recognised by the usual angles"
-        warn(f"{source.name}: {usual}{_advice(options)}")
+        warn(f"{source.name}: {usual}{_advice(run_config, options)}")
     config, method = VARIANTS[options.variant]
     session = FingertipSession(
         angles_of(user),
         handedness=user.parameters.handedness,
-        num_hands=options.hands,
+        num_hands=run_config.hands,
         height=float(source.image_size[1]),
         fps=source.fps,
         config=dataclasses.replace(config, posture=user.posture),
@@ -64,14 +68,14 @@ def track(options: argparse.Namespace) -> str:
         recogniser=recogniser_of(symbols),
     )
     with closing(EventFile(options.out / "events.jsonl")) as events:
-        stream = FingertipStream(source, lambda image: hands_in(image, user, options.hands), session, events)
+        stream = FingertipStream(source, lambda image: hands_in(image, user, run_config.hands), session, events)
         total = getattr(source, "frames", 0) or None
         spec = StreamSpec(
             *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
-            *(TIP_TABLE, _identity(source, options), total),
+            *(TIP_TABLE, _identity(source, run_config, options), total),
         )
         with closing(StreamRun(options, spec)) as run:
-            return _tracked(source, user, session, stream, run, options)
+            return _tracked(source, user, session, stream, run, run_config, options)
 
 
 def _tracked(
@@ -80,12 +84,13 @@ def _tracked(
     session: FingertipSession,
     stream: FingertipStream,
     run: StreamRun,
+    config: RunConfig,
     options: argparse.Namespace,
 ) -> str:
     began = time.perf_counter()
     result = run.follow()
     stream.finish()
-    report = _report(source, user, session, stream.tally, result, options, time.perf_counter() - began)
+    report = _report(source, user, session, stream.tally, result, config, options, time.perf_counter() - began)
     run.writer.finish(report, status_names=np.asarray(STATUS))
     write_summary(options.out / "summary.png", run.writer.results, stream.tally, session.events, source.image_size)
     return run.conclude(result, format_report(report, options))
@@ -107,8 +112,8 @@ def recogniser_of(file: SymbolsFile) -> Recogniser:
     return recognise
 
 
-def _advice(options: argparse.Namespace) -> str:
-    brightest = options.mask == "infrared" and options.keypoints is None
+def _advice(config: RunConfig, options: argparse.Namespace) -> str:
+    brightest = config.mask == "infrared" and options.keypoints is None
     return "; where hands are not the brightest of all, --mask colour may find them" if brightest else ""
 
 
@@ -127,9 +132,10 @@ def _user(source: Any, mask: str) -> User:
         raise InputError(f"{source.name}: {error}") from None
 
 
-def _identity(source: Any, options: argparse.Namespace) -> dict[str, Any]:
+def _identity(source: Any, config: RunConfig, options: argparse.Namespace) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
-    given = {name: str(getattr(options, name)) for name in ("mask", "hands", "gestures", "seed", "variant")}
+    given = {name: str(value) for name, value in dataclasses.asdict(config).items()}
+    given |= {"gestures": str(options.gestures), "variant": options.variant}
     size, rate = list(source.image_size), source.fps
     return {"input": source.name, "image_size": size, "fps": rate, "version": version("jaxfilters"), **given}
 
@@ -151,6 +157,7 @@ def _report(
     session: FingertipSession,
     tally: Tally,
     result: RunResult,
+    config: RunConfig,
     options: argparse.Namespace,
     seconds: float,
 ) -> dict[str, Any]:
@@ -170,7 +177,7 @@ def _report(
         "trouble": result.trouble,
         "open_hand": user.has_open_hand,
         "hand": dataclasses.asdict(user.parameters),
-        "mask": None if options.keypoints else options.mask,
+        "mask": None if options.keypoints else config.mask,
         "gestures": str(options.gestures),
         "config": dataclasses.asdict(session.config) | {"posture": session.config.posture._asdict()},
         "versions": versions(),

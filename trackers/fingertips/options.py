@@ -5,12 +5,14 @@ from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import image_size
 from jaxfilters.trackers.app.options import (
+    add_config,
     add_results_options,
     add_resume,
     add_seed,
     add_variant,
     add_video_options,
 )
+from jaxfilters.trackers.fingertips.config import RunConfig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -22,13 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="video file, folder of images or number of a live camera, which show an open hand at some time early on; "
         "without it, a synthetic hand",
     )
-    parser.add_argument(
-        "--mask",
-        choices=("infrared", "depth", "colour"),
-        default="infrared",
-        help="how hands differ from the desk: they are the brightest (infrared, or a dark desk; default), they lie "
-        "above it (depth: 16-bit PNGs with camera.json, or .npz), or they have the colour of skin",
-    )
+    add_config(parser, RunConfig, "mask", "hands")
     parser.add_argument(
         "--keypoints",
         type=Path,
@@ -42,7 +38,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="WIDTHxHEIGHT",
         help="of the images that keypoints without VIDEO are of",
     )
-    parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="how many at most (default: %(default)s)")
     parser.add_argument(
         "--gestures",
         default="default",
@@ -50,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="the symbols; `jaxfilters fit gestures` makes such a file (default: twelve shapes)",
     )
     add_variant(parser, ("recommended", "published"))
-    add_seed(parser, default=0)
+    add_seed(parser)
     add_video_options(parser)
     add_resume(parser)
     add_results_options(parser)

@@ -240,3 +240,8 @@ def test_strokes_are_named_by_the_model_of_a_file():
     ]
     assert np.mean([one.label == label for one, label in zip(found, strokes.labels[:8], strict=True)]) >= 0.8
     assert all(0 < one.confidence <= 1 for one in found)
+
+
+def test_more_hands_than_a_person_has_are_refused(tmp_path, capsys):
+    assert main(["track", "fingertips", "--hands", "3", "--out", str(tmp_path / "out")]) == 2
+    assert "hands must be 1 or 2; got 3" in capsys.readouterr().err
