@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.models.face.gallery import Gallery, remember
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.models.face.multilinear import MultilinearFace, learn
-from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.synthetic.face import Identity
 from jaxfilters.models.synthetic.face_motion import MONOCULAR_PLACE_MM, motion, speech_schedule
@@ -52,7 +52,7 @@ class MonoRun(NamedTuple):
 
     @property
     def person_index(self) -> Int[np.ndarray, " t"]:
-        """Whom of those who are remembered the face is taken for; -1 for an unknown person."""
+        """Whom of those of the gallery the face is taken for; -1 for an unknown person."""
         return np.asarray(self.track.person_index)
 
     @property
@@ -94,7 +94,7 @@ class Contender(NamedTuple):
 
     face: MultilinearFace
     options: MonoConfig
-    remembered: Remembered | None = None
+    gallery: Gallery | None = None
     """Whom it may recognise."""
 
 
@@ -102,7 +102,7 @@ class Learnt(NamedTuple):
     """From the training faces of some people."""
 
     face: MultilinearFace
-    people: Remembered
+    people: Gallery
     """The same people."""
 
 
@@ -130,7 +130,7 @@ def follow_all(made: FaceSequence | IctSequence, contenders: Mapping[str, Conten
     """Runs of all trackers over one sequence, which is rendered once; they start from landmarks with noise."""
     found = _detections(made, seed)
     sessions = {
-        name: MonoSession(made.rig, one.face, one.options, detections=found, remembered=one.remembered)
+        name: MonoSession(made.rig, one.face, one.options, detections=found, gallery=one.gallery)
         for name, one in contenders.items()
     }
     tracks: dict[str, list[MonoTrack]] = {name: [] for name in contenders}

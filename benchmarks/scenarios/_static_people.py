@@ -174,14 +174,14 @@ def simulate(
         start_offset_m: `(key, shape) -> offsets` of where the trackers start.
         with_desk: Whether there is a desk before the first of them.
     """
-    seen_by = sight_of(calibration)
+    sight = sight_of(calibration)
     desks = [np.asarray(desk(jnp.asarray(run[0, 0]))) for run in truth] if with_desk else None
     starts, masks = [], []
     for number, run in enumerate(truth):
         start_key, mask_key = jax.random.split(jax.random.fold_in(key, number))
-        before = seen_by
+        before = sight
         if desks is not None:
-            before = seen_by._replace(furniture=patch_depth(seen_by.camera, jnp.asarray(desks[number])))
+            before = sight._replace(furniture=patch_depth(sight.camera, jnp.asarray(desks[number])))
         starts.append(run[0] + np.asarray(start_offset_m(start_key, run[0].shape)))
         sizes = jnp.asarray(sizes_m) * jnp.array([look.taller, 1.0])
         switches = (look.is_ellipsoid, look.with_shadow, look.with_blob)
@@ -190,7 +190,7 @@ def simulate(
 
 
 @partial(jax.jit, static_argnums=(5, 6, 7))
-def _masks(key, seen_by, xy, sizes, flaws, is_ellipsoid, with_shadow, with_blob):
+def _masks(key, sight, xy, sizes, flaws, is_ellipsoid, with_shadow, with_blob):
     def body(at, size):
         if not is_ellipsoid:
             return standing_body(at, size[0], size[1])
@@ -198,9 +198,9 @@ def _masks(key, seen_by, xy, sizes, flaws, is_ellipsoid, with_shadow, with_blob)
 
     def frame(key, places):
         flaw_key, blob_key = jax.random.split(key)
-        mask = jnp.any(jax.vmap(lambda at, size: silhouette(seen_by, body(at, size)))(places, sizes), axis=0)
+        mask = jnp.any(jax.vmap(lambda at, size: silhouette(sight, body(at, size)))(places, sizes), axis=0)
         if with_shadow:
-            mask |= jnp.any(jax.vmap(lambda at: shadow(seen_by, at))(places), axis=0)
+            mask |= jnp.any(jax.vmap(lambda at: shadow(sight, at))(places), axis=0)
         if with_blob:
             away = jax.random.randint(blob_key, (2,), jnp.array([4, 6]), jnp.array([12, 24]))
             mask |= jnp.roll(mask, away, axis=(0, 1))

@@ -93,7 +93,7 @@ def log_size(
 
 
 @jax.jit
-def seen_size(
+def observed_size(
     face: MultilinearFace, identity: Float[Array, " S"], expressions: Float[Array, "n A"]
 ) -> Float[Array, ""]:
     """How large a face is in frames with these expressions, their geometric mean, beside the mean person's."""
@@ -115,7 +115,7 @@ def expression_residuals(
         moved = jnp.matmul(expression_basis(face, identity), root, precision="highest")
         return jnp.sqrt(jnp.sum(jnp.square(moved)))
 
-    sizes = jax.vmap(lambda a: seen_size(face, identity, a[None]))(expressions)
+    sizes = jax.vmap(lambda a: observed_size(face, identity, a[None]))(expressions)
     return deviations * strength(identity) / strength(face.identity_mean) / sizes[:, None]
 
 
@@ -130,7 +130,7 @@ def residuals(
         expressions: In the images. They change its size, too: it would shrink by them if they did not count.
         prior: What is known.
     """
-    offset = _of_offset(person, seen_size(face, person.identity, expressions), prior)
+    offset = _of_offset(person, observed_size(face, person.identity, expressions), prior)
     measured = jnp.asarray(prior.eyes_apart_std) > 0
     wrong = eyes_apart(face, person) - prior.eyes_apart
     size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)

@@ -52,7 +52,7 @@ class Refined(NamedTuple):
     """Squared errors of the alignments over what they claim, as this frame has it; 1 in the mean if they are right."""
     misfit_share: Float[Array, ""]
     """How far this frame can tell, 0 to 1: the share of the alignments' errors in what residuals are expected."""
-    num_seen: Float[Array, ""]
+    num_observed: Float[Array, ""]
     """Landmarks that at least one camera sees."""
 
 
@@ -118,7 +118,7 @@ def refine(
         trust=trust,
         residual_scale=residual_scale,
         misfit_share=share,
-        num_seen=jnp.sum(per_landmark > 0).astype(x.dtype),
+        num_observed=jnp.sum(per_landmark > 0).astype(x.dtype),
     )
 
 
@@ -244,8 +244,8 @@ def _solve(S, b):
 def _log_t(distance, size, S, observed):
     """Log density of Student's t over the observed rows; the others have a constant share of the determinant."""
     nu = DEGREES_OF_FREEDOM
-    unseen_rows = 2.0 * jnp.sum(~observed, axis=0)
-    log_det = jnp.linalg.slogdet(S)[1] - unseen_rows * 2 * math.log(UNSEEN)
+    num_unobserved = 2.0 * jnp.sum(~observed, axis=0)
+    log_det = jnp.linalg.slogdet(S)[1] - num_unobserved * 2 * math.log(UNSEEN)
     return (
         gammaln((nu + size) / 2)
         - gammaln(nu / 2)

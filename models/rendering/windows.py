@@ -39,8 +39,8 @@ def plan_windows(box: Float[Array, "*poses k 4"], shape: Window, sides: tuple[Wi
     within = {(min(rows, shape[0]), min(columns, shape[1])) for rows, columns in sides} | {shape}
     sizes = tuple(sorted(within, key=lambda size: (size[0] * size[1], size)))
     last = jnp.asarray(shape, box.dtype) - 1
-    first_seen = jnp.maximum(jnp.ceil(box[..., 1::-1]), 0)
-    extent = jnp.minimum(jnp.floor(box[..., :1:-1]), last) - first_seen + 1
+    first_visible = jnp.maximum(jnp.ceil(box[..., 1::-1]), 0)
+    extent = jnp.minimum(jnp.floor(box[..., :1:-1]), last) - first_visible + 1
     held = jnp.stack([jnp.all(extent <= jnp.asarray(size, box.dtype), axis=-1) for size in sizes], axis=-1)
     smallest = jnp.where(jnp.any(held, axis=-1), jnp.argmax(held, axis=-1), len(sizes) - 1)
     # Written so that bounds of NaN count as visible, and the whole image shows what becomes of them.
@@ -49,7 +49,7 @@ def plan_windows(box: Float[Array, "*poses k 4"], shape: Window, sides: tuple[Wi
     return Plan(
         order=_order(rung),
         bounds=jnp.sum(rung[..., None] < jnp.arange(len(sizes) + 1), axis=-2, dtype=jnp.int32),
-        start=jnp.clip(jnp.minimum(first_seen, last).astype(jnp.int32), 0, limit[rung]),
+        start=jnp.clip(jnp.minimum(first_visible, last).astype(jnp.int32), 0, limit[rung]),
         sizes=sizes,
     )
 

@@ -69,12 +69,12 @@ def render_face(
             f"scene must have a background of shape {(rig.num_cameras, *rig.shape)}; got {scene.background.shape}."
         )
     cameras = range(rig.num_cameras)
-    clean = jnp.stack([_seen_by(c, scene, rig, pose, shape, occluder) for c in cameras])
+    clean = jnp.stack([_camera_image(c, scene, rig, pose, shape, occluder) for c in cameras])
     noise = NOISE_STD * jax.random.normal(key, clean.shape, clean.dtype)
     return jnp.clip(jnp.round(gain * clean + offset + noise), 0, 255).astype(jnp.uint8)
 
 
-def _seen_by(c, scene, rig, pose, shape, occluder):
+def _camera_image(c, scene, rig, pose, shape, occluder):
     """The image of one camera without light and noise."""
     R = rotation(pose[3:])
 

@@ -109,13 +109,13 @@ def render_ict(
     toward = jnp.maximum(toward, 0.0)
     attributes = jnp.concatenate([head.place, (AMBIENT + DIRECT * toward)[:, None]], axis=-1)
     clean = jnp.stack(
-        [_seen_by(c, rig, world, head.faces, attributes, skin, background[c]) for c in range(rig.num_cameras)]
+        [_camera_image(c, rig, world, head.faces, attributes, skin, background[c]) for c in range(rig.num_cameras)]
     )
     noise = NOISE_STD * jax.random.normal(key, clean.shape, clean.dtype)
     return jnp.clip(jnp.round(gain * clean + noise), 0, 255).astype(jnp.uint8)
 
 
-def _seen_by(c, rig, world, faces, attributes, skin, background):
+def _camera_image(c, rig, world, faces, attributes, skin, background):
     vertices = turn(world, rig.rotation[c]) + rig.translation[c]
     camera = Pinhole(rig.focal[c], rig.center[c], rig.shape)
     winner = _winners(camera, vertices, faces)

@@ -77,21 +77,21 @@ def standing_body(xy: Float[Array, " 2"], height: Float[Array, ""], width: Float
     return Ellipsoid(jnp.array(CENTERS_M) * scale + jnp.append(xy, 0.0), jnp.array(SEMI_AXES_M) * scale)
 
 
-def silhouette(seen_by: Sight, body: Ellipsoid) -> Bool[Array, "rows cols"]:
+def silhouette(sight: Sight, body: Ellipsoid) -> Bool[Array, "rows cols"]:
     """Pixels that see one of the parts (parts, 3) of a body and not the furniture before it."""
 
     def part(one):
-        inside = outline_radius(outline(seen_by.camera.P, one), seen_by.uv) <= 1
-        return inside & (near_depth(seen_by.camera.P, one, seen_by.uv) < seen_by.furniture)
+        inside = outline_radius(outline(sight.camera.P, one), sight.uv) <= 1
+        return inside & (near_depth(sight.camera.P, one, sight.uv) < sight.furniture)
 
     return jnp.any(jax.vmap(part)(body), axis=0)
 
 
-def shadow(seen_by: Sight, xy: Float[Array, " 2"]) -> Bool[Array, "rows cols"]:
+def shadow(sight: Sight, xy: Float[Array, " 2"]) -> Bool[Array, "rows cols"]:
     """Pixels that see the shadow of a person at a floor point."""
-    floor, depth = seen_by.camera.floor_points(seen_by.uv)
+    floor, depth = sight.camera.floor_points(sight.uv)
     away = (floor - xy - jnp.array(SHADOW_OFFSET_M)) / jnp.array(SHADOW_SEMI_AXES_M)
-    return (jnp.sum(away**2, axis=-1) <= 1) & (depth > 0) & (depth < seen_by.furniture)
+    return (jnp.sum(away**2, axis=-1) <= 1) & (depth > 0) & (depth < sight.furniture)
 
 
 def flawed(key: AnyKey, mask: Bool[Array, "rows cols"], flaws: Flaws) -> Bool[Array, "rows cols"]:

@@ -85,7 +85,7 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
     made, sessions = Still(), []
 
     class Session:
-        def __init__(self, rig, face, options, *, detections, remembered):
+        def __init__(self, rig, face, options, *, detections, gallery):
             self.detections, self.done = detections, 0
             sessions.append(self)
 

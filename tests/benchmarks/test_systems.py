@@ -22,18 +22,18 @@ def placed(pose):
     return Rotation.from_euler("ZYX", pose[3:]).apply(SHAPE) + pose[:3]
 
 
-def seen_by(points, focal, offset_mm=0.0):
+def sight(points, focal, offset_mm=0.0):
     x = points - [offset_mm, 0, 0]
     return focal * x[:, :2] / x[:, 2:] + [319.5, 239.5]
 
 
 def test_poses_of_exact_points_are_found():
     rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
-    uv = np.stack([seen_by(placed(pose), 800.0) for pose in POSES])
+    uv = np.stack([sight(placed(pose), 800.0) for pose in POSES])
     np.testing.assert_allclose(simplest.pose_by_pnp(SHAPE, uv, rig), POSES, atol=1e-2)
     K = np.array([[800.0, 0, 319.5], [0, 800.0, 239.5], [0, 0, 1]])
     cameras = np.stack([K @ np.c_[np.eye(3), [-offset, 0, 0]] for offset in (0.0, 120.0)])
-    both = np.stack([[seen_by(placed(pose), 800.0, offset) for offset in (0.0, 120.0)] for pose in POSES])
+    both = np.stack([[sight(placed(pose), 800.0, offset) for offset in (0.0, 120.0)] for pose in POSES])
     np.testing.assert_allclose(simplest.pose_by_triangulation(SHAPE, both, cameras), POSES, atol=1e-6)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.math.multilinear import numerical_ranks
-from jaxfilters.models.face import remembered
+from jaxfilters.models.face import gallery
 from jaxfilters.models.face.landmarks import EYES, FROM_68, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs
 from jaxfilters.models.face.multilinear import (
@@ -86,7 +86,7 @@ def fit(options: argparse.Namespace) -> str:
         lines.append(f"model in {options.out}")
         if options.remember is not None:
             names = tuple(f"{examples.source}, {i + 1}" for i in range(len(sets.shapes)))
-            write_people(options.remember, People(names, remembered.of_tensor(model, tensor)), model)
+            write_people(options.remember, People(names, gallery.of_tensor(model, tensor)), model)
             lines.append(f"people in {options.remember}")
         return "\n".join(lines)
 

@@ -1,7 +1,7 @@
 """People of a model of the face on disk, so that later videos of them know their size.
 
 An `.npz` with the arrays `identity` (P, S), `covariance` (P, S, S) and `offset` (P, K, 3) in millimetres
-(`jaxfilters.models.face.remembered.Remembered`), and `header`, a text in JSON:
+(`jaxfilters.models.face.gallery.Gallery`), and `header`, a text in JSON:
 
     {"format": "jaxfilters people", "version": 1, "units": "mm", "names": [P names],
      "model": "the first 16 hexadecimal digits of a hash of the model's mean face and tensor"}
@@ -18,8 +18,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters.models.face.gallery import Gallery, joined
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.trackers.io.checkpoint import write_npz
 from jaxfilters.trackers.io.errors import InputError, OutputError, shown
 from jaxfilters.trackers.io.input_files import LARGEST, are_finite
@@ -36,7 +36,7 @@ class People(NamedTuple):
     """P people of one model of the face."""
 
     names: tuple[str, ...]
-    remembered: Remembered
+    gallery: Gallery
 
 
 def write_people(path: Path, people: People, face: MultilinearFace) -> None:
@@ -52,7 +52,7 @@ def write_people(path: Path, people: People, face: MultilinearFace) -> None:
         "names": list(people.names),
         "model": fingerprint(face),
     }
-    arrays = {name: np.asarray(value) for name, value in people.remembered._asdict().items()}
+    arrays = {name: np.asarray(value) for name, value in people.gallery._asdict().items()}
     arrays["covariance"] = _symmetric(arrays["covariance"])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ def read_people(paths: Sequence[Path], face: MultilinearFace) -> People:
             are not finite, or covariances that are none.
     """
     found = [_read(path, face) for path in paths]
-    return People(tuple(name for one in found for name in one.names), joined(*(one.remembered for one in found)))
+    return People(tuple(name for one in found for name in one.names), joined(*(one.gallery for one in found)))
 
 
 def fingerprint(face: MultilinearFace) -> str:
@@ -86,7 +86,7 @@ def fingerprint(face: MultilinearFace) -> str:
 
 def _read(path: Path, face: MultilinearFace) -> People:
     arrays = read_npz(path, _WANTED)
-    if missing := [name for name in (*Remembered._fields, "header") if name not in arrays]:
+    if missing := [name for name in (*Gallery._fields, "header") if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED}.")
     header = read_header(arrays, path, _WANTED, FORMAT, VERSION, "mm")
     if header.get("model") != fingerprint(face):
@@ -96,11 +96,11 @@ def _read(path: Path, face: MultilinearFace) -> People:
         raise InputError(f"{path}: names must be of one person or more; got {shown(names)}.")
     count, num_identities = len(names), face.num_identities
     shapes = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
-    for name, shape in zip(Remembered._fields, shapes, strict=True):
+    for name, shape in zip(Gallery._fields, shapes, strict=True):
         _check(arrays[name], name, shape, path)
     arrays["covariance"] = _covariances(arrays["covariance"].astype(float), path)
-    remembered = Remembered(*(jnp.asarray(arrays[name], float) for name in Remembered._fields))
-    return People(tuple(str(name) for name in names), remembered)
+    gallery = Gallery(*(jnp.asarray(arrays[name], float) for name in Gallery._fields))
+    return People(tuple(str(name) for name in names), gallery)
 
 
 def _covariances(given: np.ndarray, path: Path) -> np.ndarray:

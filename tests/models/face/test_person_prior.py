@@ -10,7 +10,7 @@ import pytest
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, projected
 from jaxfilters.models.face.multilinear import learn, shape
-from jaxfilters.models.face.person_prior import Person, Prior, expression_residuals, log_size, residuals, seen_size
+from jaxfilters.models.face.person_prior import Person, Prior, expression_residuals, log_size, observed_size, residuals
 from jaxfilters.models.face.rig import monocular
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
@@ -89,7 +89,7 @@ def test_the_size_is_as_likely_as_sizes_vary_and_the_rest_counts_in_proportion(x
         residuals(face(), Person(jnp.asarray(identity), jnp.zeros((10, 3))), face().expression_mean[None], PRIOR)
     )[:12]
     larger = face().identity_mean + 2 * covariance @ slope / std
-    log_ratio = float(jnp.log(seen_size(face(), larger, face().expression_mean[None])))
+    log_ratio = float(jnp.log(observed_size(face(), larger, face().expression_mean[None])))
     assert log_ratio == pytest.approx(2 * std, rel=0.05)
     assert np.linalg.norm(of(larger)) == pytest.approx(log_ratio / std, rel=1e-9)
     # Somebody of that size, and the same deviation beside it as of somebody of the mean size.

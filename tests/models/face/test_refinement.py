@@ -167,7 +167,7 @@ def test_the_evidence_is_that_of_student_and_laplace(face):
     evidence += sum(multivariate_t.logpdf(r, shape=C, df=NU) for r, C in zip(off, S, strict=True) if r.size)
     evidence += 4 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
     assert float(found.log_evidence) == pytest.approx(evidence, abs=1e-4)
-    assert float(found.num_seen) == 9
+    assert float(found.num_observed) == 9
 
 
 def test_the_covariance_is_inverse_expected_information_and_a_bias_of_whole_images(face):
@@ -319,7 +319,7 @@ def test_without_landmarks_the_prior_is_left(face):
     found = face.refine(face.found(jnp.zeros((2, 10, 2)), jnp.zeros((2, 10), bool)))
     np.testing.assert_allclose(found.belief.mean, face.prior.mean, atol=1e-9)
     np.testing.assert_allclose(found.belief.covariance, face.prior.covariance, rtol=1e-4, atol=1e-8)
-    assert float(found.num_seen) == 0
+    assert float(found.num_observed) == 0
 
 
 def test_displaced_landmarks_are_where_their_pixels_meet(face):

@@ -2,11 +2,11 @@ import jax
 import numpy as np
 import pytest
 
+from jaxfilters.models.face.gallery import remember
 from jaxfilters.models.face.landmarks import EYES, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS
 from jaxfilters.models.face.multilinear import learn, shape_tensor
 from jaxfilters.models.face.people_alignment import aligned_people
-from jaxfilters.models.face.remembered import remember
 from jaxfilters.models.synthetic.face_training import NOISE_MM, generator_shapes, people_of
 from jaxfilters.trackers.app.cli import FAILURE, main
 from jaxfilters.trackers.io.enrolled_people import read_people
@@ -76,8 +76,8 @@ def test_people_are_remembered_for_the_tracker(tmp_path, capsys, shapes):
     assert known.names == tuple(f"landmark sets faces.npz, {i}" for i in range(1, 6))
     expected = remember(model, jax.numpy.asarray(shapes, float))
     # Written from double precision, and compared with single.
-    np.testing.assert_allclose(known.remembered.identity, expected.identity, atol=2e-3)
-    np.testing.assert_allclose(known.remembered.offset, expected.offset, atol=2e-2)
+    np.testing.assert_allclose(known.gallery.identity, expected.identity, atol=2e-3)
+    np.testing.assert_allclose(known.gallery.offset, expected.offset, atol=2e-2)
 
 
 def test_a_folder_of_people_is_the_same_as_a_file(tmp_path, shapes):

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.models.face.gallery import remember
 from jaxfilters.models.face.multilinear import learn
-from jaxfilters.models.face.remembered import remember
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.io.enrolled_people import People, fingerprint, read_people, write_people
 from jaxfilters.trackers.io.errors import InputError, OutputError
@@ -36,7 +36,7 @@ def test_what_is_written_is_read_from_several_files(saved, taught, tmp_path):
     read = read_people([saved, tmp_path / "one.npz"], face)
     assert read.names == ("Ann", "Ben", "Ben again")
     symmetric = 0.5 * (known.covariance + known.covariance.swapaxes(1, 2))
-    for leaf, expected in zip(read.remembered, known._replace(covariance=symmetric), strict=True):
+    for leaf, expected in zip(read.gallery, known._replace(covariance=symmetric), strict=True):
         np.testing.assert_array_equal(leaf, expected[np.array([0, 1, 1])])
         assert leaf.dtype == jnp.zeros(()).dtype
     with pytest.raises(OutputError, match="cannot write"):
@@ -61,7 +61,7 @@ def test_a_covariance_may_be_as_asymmetric_as_single_precision_makes_it(saved, t
     with np.load(saved) as content:
         np.savez(saved, **{**content, "covariance": rounded})
     read = read_people([saved], face)
-    covariance = np.asarray(read.remembered.covariance)
+    covariance = np.asarray(read.gallery.covariance)
     np.testing.assert_array_equal(covariance, covariance.swapaxes(1, 2))
     scale = np.abs(exact).max()
     np.testing.assert_allclose(covariance, exact, atol=1e-4 * scale)

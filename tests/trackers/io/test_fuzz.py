@@ -190,11 +190,11 @@ MEDIAPIPE = [
 
 
 def people_file(folder: Path) -> list[Path]:
-    from jaxfilters.models.face.remembered import Remembered
+    from jaxfilters.models.face.gallery import Gallery
 
     face = default_face_model().model
     size = face.num_identities
-    shapes = Remembered(np.zeros((1, size)), 0.1 * np.eye(size)[None], np.zeros((1, *face.mean.shape)))
+    shapes = Gallery(np.zeros((1, size)), 0.1 * np.eye(size)[None], np.zeros((1, *face.mean.shape)))
     write_people(folder / "a.npz", People(("one",), shapes), face)
     return [folder / "a.npz"]
 
@@ -355,7 +355,7 @@ FORMATS = {
         may_lack=True,
     ),
     "face model": Format(copied(FACE_MODEL), lambda path: load_face_model(path).model),
-    "people": Format(people_file, lambda path: read_people([path], default_face_model().model).remembered),
+    "people": Format(people_file, lambda path: read_people([path], default_face_model().model).gallery),
     "symbols": Format(copied(SYMBOLS), lambda path: read_symbols(path).symbols.models.emission),
     "boxes.txt": Format(text_file("a.txt", BOXES), box_numbers),
     "boxes.json": Format(json_file("a.json", COCO), box_numbers),

@@ -25,7 +25,7 @@ from jaxfilters.trackers.head.common import recent
 from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, HeadState, Recent
 
-FEWEST_SEEN = 4
+FEWEST_OBSERVED = 4
 """Landmarks without which there is no fit."""
 RESTING_STD = 0.012
 """Millimetres: of each landmark of a face at rest about its registered place, beyond the registration's own error."""
@@ -121,11 +121,11 @@ def refined(
     wide = MEASURED_STD**2 * jnp.tile(jnp.eye(3), (len(M), 1, 1))
     measured = displaced(free.mean, found, state.slopes, model, wide, rig)
     sound = jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
-    is_found = sound & (rest.num_seen >= FEWEST_SEEN)
+    is_found = sound & (rest.num_observed >= FEWEST_OBSERVED)
     lacking = lambda fit: fit.misfit_share * (fit.residual_scale - 1)
     residual_scale = resting * lacking(rest) + (1 - resting) * average(lacking(fits))
     drift = recent.drifted(state.recent, is_followed)
-    observed = recent.as_seen(found, anchored, M, belief.mean[:POSE], images, rig, drift)
+    observed = recent.as_observed(found, anchored, M, belief.mean[:POSE], images, rig, drift)
     return Estimate(
         belief,
         doubt,

@@ -138,7 +138,7 @@ def _refuse_unused(places: Places) -> None:
 
 
 def _rendered(made: FaceSequence) -> Setup:
-    image = _remembered(made)
+    image = _cached_images(made)
     sources: list[VideoSource] = [_SyntheticSource(made, camera, image) for camera in range(made.rig.num_cameras)]
     truth = HeadTruth(pose_in_metres(made.poses), made.uv)
     undistortions = [Undistortion(made.rig.shape) for _ in sources]
@@ -166,7 +166,7 @@ class _SyntheticSource:
         return None
 
 
-def _remembered(made: FaceSequence):
+def _cached_images(made: FaceSequence):
     """`index -> images` in colour of all cameras, which are rendered together and asked for one after the other."""
 
     @lru_cache(maxsize=4)

@@ -30,7 +30,7 @@ def without_weighted_motion(change: Float[Array, "K 3"], mean: Float[Array, "K 3
     return remove_rigid(change, mean, jnp.asarray(RIGID_WEIGHTS, change.dtype))
 
 
-def nothing_learnt(shape: Float[Array, "K 3"], windows: Float[Array, "C K T T"]) -> Learner:
+def empty_learner(shape: Float[Array, "K 3"], windows: Float[Array, "C K T T"]) -> Learner:
     """The learner at registration: the registered shape is the first."""
     return Learner(
         incremental_pca.start(shape.size, NUM_MODES), jnp.ones((), jnp.int32), shape, windows, jnp.zeros((), bool)

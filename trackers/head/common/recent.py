@@ -94,7 +94,7 @@ def is_anchored(found: Alignment) -> Bool[Array, "C K"]:
     return found.observed & (found.score > ANCHORED_SCORE)
 
 
-def as_seen(
+def as_observed(
     found: Alignment,
     anchored: Bool[Array, "C K"],
     shape: Float[Array, "K 3"],

@@ -115,7 +115,7 @@ def adjusted(
 
     Args:
         unknown: The model, which is the face of an unknown person.
-        face: Whom the state is about: the same, or a person who is remembered.
+        face: Whom the state is about: the same, or an enrolled person.
         rig: One camera.
         state: Before.
         frame: The new one.

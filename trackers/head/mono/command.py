@@ -55,10 +55,10 @@ def track(options: argparse.Namespace) -> str:
     place = setup_of_one(options.video_source, places, options.seed or 0)
     if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
-    remembered = None if known is None else known.remembered
+    gallery = None if known is None else known.gallery
     detected_by, detector = _detector(options)
     session = as_input_error(
-        lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, remembered=remembered)
+        lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, gallery=gallery)
     )
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
     stream = HeadStream(place, session, rows, settings.chunk)
@@ -99,8 +99,8 @@ def _tracked(
     focal = _focal(session, place.rig) if options.estimate_focal else None
     report |= {"focal_length_estimate": focal}
     run.writer.finish(report, **_learned(session))
-    if session.remembered is not None:
-        write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.remembered), face)
+    if session.gallery is not None:
+        write_people(options.out / PERSON_FILE, People((options.out.resolve().name,), session.gallery), face)
     truth = None if place.truth is None else place.truth.poses
     write_summary(options.out / "summary.png", run.writer.results, session.model, truth, LABELS)
     lines = format_report(report, options.out, has_video=options.video)

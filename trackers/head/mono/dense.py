@@ -17,7 +17,7 @@ from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adju
 from jaxfilters.models.face.frame_selection import reduced
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, restricted
-from jaxfilters.models.face.person_prior import Person, Prior, parameters, seen_size
+from jaxfilters.models.face.person_prior import Person, Prior, observed_size, parameters
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.square_root_prior import SquareRootPrior, of_energy
 from jaxfilters.trackers.head.mono.adjustment import UNKNOWN
@@ -140,7 +140,7 @@ def information_of_ten(
     def held(y: Array, expression: Array) -> tuple[Array, Array]:
         """The offsets of the ten, and all others, in standard deviations."""
         own, rest, beside = split.offsets(y)
-        size = seen_size(face, split.identity(y), expression[None])
+        size = observed_size(face, split.identity(y), expression[None])
         in_std = lambda value, std: jnp.where(std > 0, value / jnp.where(std > 0, std, 1.0), 0.0) / size
         return in_std(own, of_face), jnp.concatenate([in_std(rest, std[0]), beside / size])
 

@@ -17,7 +17,7 @@ from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common import recent
-from jaxfilters.trackers.head.common.estimate import FEWEST_SEEN, MEMORY, MODEL_VARIANCE, RESIDUAL_SCALE
+from jaxfilters.trackers.head.common.estimate import FEWEST_OBSERVED, MEMORY, MODEL_VARIANCE, RESIDUAL_SCALE
 from jaxfilters.trackers.head.common.near_mode import anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.common.state import POSE, Recent
 from jaxfilters.trackers.head.mono.state import MonoState
@@ -93,7 +93,7 @@ def aligned(
     M, pose = shape(state.model, fit.belief.mean[POSE:]), fit.belief.mean[:POSE]
     sound = jnp.all(jnp.isfinite(fit.belief.mean)) & jnp.all(jnp.isfinite(fit.belief.covariance))
     drifted = recent.drifted(state.recent, is_followed, drift)
-    observed = recent.as_seen(found, anchored, M, pose, images, rig, drifted)
+    observed = recent.as_observed(found, anchored, M, pose, images, rig, drifted)
     by_shape = jnp.where(found.observed[..., None, None], jacobian(rig, M, pose)[0], 0.0)
     by_slope = jnp.einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
     variance = state.model_variance + UNMODELLED_MM**2
@@ -103,7 +103,7 @@ def aligned(
         fit.belief,
         # What is followed from the last frame is some other point of the skin, and says nothing of the person.
         Views(found.uv, covariance, found.observed & (found.score > LEAST_SCORE) & ~is_followed),
-        sound & (fit.num_seen >= FEWEST_SEEN),
+        sound & (fit.num_observed >= FEWEST_OBSERVED),
         jnp.sum(jnp.any(~observed.has_changed, axis=0)).astype(x.dtype),
         observed,
         state.windows,

@@ -51,7 +51,7 @@ def focal_length(
 
     Args:
         unknown: The model, which is the face of an unknown person.
-        face: Whom the state is about: the same, or a person who is remembered.
+        face: Whom the state is about: the same, or an enrolled person.
         rig: One camera, with the assumed focal length.
         state: Its window holds heads turned several ways; what they tell of the focal length grows with that.
         options: Constants.

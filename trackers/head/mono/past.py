@@ -27,7 +27,7 @@ def marginalize_frame(
 
     Args:
         unknown: The model, which is the face of an unknown person.
-        face: Whom the window is about: the same, or a person who is remembered.
+        face: Whom the window is about: the same, or an enrolled person.
         window: Informed of the person.
         person: About that face.
         place: Of the frame.

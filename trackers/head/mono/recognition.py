@@ -1,6 +1,6 @@
-"""Who is before the camera: an unknown person, or one of the people who are remembered.
+"""Who is before the camera: an unknown person, or one of the people of the gallery.
 
-Each is a model of the face of its own (`jaxfilters.models.face.remembered`). The window is adjusted to each, and the
+Each is a model of the face of its own (`jaxfilters.models.face.gallery`). The window is adjusted to each, and the
 one of most evidence is believed: the density of the window's landmarks with everything else integrated out, by
 Laplace's approximation about each adjustment.
 """
@@ -14,9 +14,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxfilters.models.face.bundle import Bundle
+from jaxfilters.models.face.gallery import Gallery, hypotheses
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior, own_offset, posed_shape
-from jaxfilters.models.face.remembered import Remembered, hypotheses
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.adjustment import fitted, informed, known, prior_information, settled
@@ -27,7 +27,7 @@ from jaxfilters.trackers.head.mono.state import MonoState
 STEPS = (10, 20)
 """Of both stages of an adjustment: from one person's face to another's is farther than from frame to frame."""
 FAMILIAR = 0.5
-"""Prior probability that a face is one of those who are remembered."""
+"""Prior probability that a face is one of those of the gallery."""
 
 
 class People(NamedTuple):
@@ -45,13 +45,13 @@ def one_of(people: People, index: Int[ArrayLike, ""]) -> MultilinearFace:
 
 
 @jax.jit
-def people(face: MultilinearFace, remembered: Remembered | None) -> People:
-    """An unknown person, and everybody who is remembered."""
-    if remembered is None or not len(remembered.identity):
+def people(face: MultilinearFace, gallery: Gallery | None) -> People:
+    """An unknown person, and everybody of the gallery."""
+    if gallery is None or not len(gallery.identity):
         return People(jax.tree.map(lambda leaf: leaf[None], face), jnp.zeros(1, face.mean.dtype))
-    count = len(remembered.identity)
+    count = len(gallery.identity)
     shares = jnp.array([1 - FAMILIAR] + [FAMILIAR / count] * count, face.mean.dtype)
-    return People(hypotheses(face, remembered), jnp.log(shares))
+    return People(hypotheses(face, gallery), jnp.log(shares))
 
 
 @partial(jax.jit, static_argnames="options")
@@ -106,7 +106,7 @@ def weighed(
 
     Args:
         unknown: The model, which is the face of an unknown person.
-        face: The same, or a person who is remembered.
+        face: The same, or an enrolled person.
         rig: One camera.
         state: With the window.
         start: Of all frames.
@@ -122,19 +122,19 @@ def weighed(
 
 
 @jax.jit
-def as_remembered(unknown: MultilinearFace, face: MultilinearFace, state: MonoState) -> Remembered:
+def as_gallery(unknown: MultilinearFace, face: MultilinearFace, state: MonoState) -> Gallery:
     """The person who is followed, as one to remember: identity with what is not known of it, and offset.
 
     Args:
         unknown: The model, which is the face of an unknown person.
-        face: Whom the state is about: the same, or a person who is remembered.
+        face: Whom the state is about: the same, or an enrolled person.
         state: With a window that has been informed of that person.
     """
     total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
     unit, count = units(face, state.prior), face.num_identities
     covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
     offset = own_offset(state.person, state.prior) + face.mean - unknown.mean
-    return Remembered(state.person.identity[None], covariance[None], offset[None])
+    return Gallery(state.person.identity[None], covariance[None], offset[None])
 
 
 def _start(face: MultilinearFace, now: MultilinearFace, state: MonoState) -> Bundle:

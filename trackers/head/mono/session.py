@@ -12,11 +12,11 @@ from jaxtyping import Float, UInt8
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Views
+from jaxfilters.models.face.gallery import Gallery, joined
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
 from jaxfilters.models.face.misplacement import misplacement
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
-from jaxfilters.models.face.remembered import Remembered, joined
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import Beginning, Following
@@ -27,7 +27,7 @@ from jaxfilters.trackers.head.mono.detections import Collector, Detections
 from jaxfilters.trackers.head.mono.detectors import Detector
 from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
-from jaxfilters.trackers.head.mono.recognition import People, as_remembered, one_of, people, recognised
+from jaxfilters.trackers.head.mono.recognition import People, as_gallery, one_of, people, recognised
 from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, search_of
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack, prior_of
 from jaxfilters.trackers.head.mono.tracking import System, advance
@@ -71,7 +71,7 @@ class MonoSession:
         *,
         detections: Detections | None = None,
         detector: Detector | None = None,
-        remembered: Remembered | None = None,
+        gallery: Gallery | None = None,
     ) -> None:
         """A session before its first frame.
 
@@ -84,11 +84,11 @@ class MonoSession:
                 given.
             detections: Landmarks that were found otherwise in several images, the last of which is still to come.
             detector: What finds landmarks; OpenCV's cascades if none.
-            remembered: People of the same model who may be before the camera, beside unknown people.
+            gallery: People of the same model who may be before the camera, beside unknown people.
 
         Raises:
             ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
-                `points` are not ten or 68 finite pixels, or `remembered` is not of the model or for the tracker of the
+                `points` are not ten or 68 finite pixels, or `gallery` is not of the model or for the tracker of the
                 thesis, which knows nobody.
         """
         if rig.num_cameras != 1:
@@ -100,8 +100,8 @@ class MonoSession:
         else:
             check_points(np.asarray(points)[list(FROM_68)])
         options = options or MonoConfig()
-        _check_remembered(remembered, tracked(face), options)
-        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, remembered)
+        _check_gallery(gallery, tracked(face), options)
+        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, gallery)
         self._following = Following(self._tracker)
 
     @property
@@ -120,9 +120,9 @@ class MonoSession:
         return None if self._following.state is None else self._following.state.person
 
     @property
-    def remembered(self) -> Remembered | None:
+    def gallery(self) -> Gallery | None:
         """The person who is followed, for later sessions with the same model; `None` before there was a face."""
-        return None if self._following.state is None else self._tracker.remembered(self._following.state)
+        return None if self._following.state is None else self._tracker.gallery(self._following.state)
 
     def focal_length(self) -> FocalLength | None:
         """What the frames that the face is adjusted to say of the focal length; `None` before there was a face."""
@@ -170,7 +170,7 @@ def track(
         config: Constants.
         face: Model of ten landmarks, or of the 68 of iBUG; by default the general one of
             `jaxfilters.trackers.io.face_models.people_face_model`, as for videos by the command.
-        known: `points`, `detections`, `detector` and `remembered` of `MonoSession`.
+        known: `points`, `detections`, `detector` and `gallery` of `MonoSession`.
 
     Returns:
         The track: millimetres and radians, NaN where the head is not tracked.
@@ -195,7 +195,7 @@ class _MonoTracker:
         points: np.ndarray | None,
         detections: Detections | None,
         detector: Detector | None,
-        remembered: Remembered | None,
+        gallery: Gallery | None,
     ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
         self._whole, face = face, tracked(face)
@@ -203,8 +203,8 @@ class _MonoTracker:
         self._face, self._options, self._points, self._detections = face, options, points, detections
         # What is compiled knows its options, but need not be compiled anew for other numbers.
         self._compiled = replace(MonoConfig(), **{name: getattr(options, name) for name in _STATIC})
-        self._remembered = remembered
-        self._people = people(face, remembered)
+        self._gallery = gallery
+        self._people = people(face, gallery)
         self._system = System(face, face, rig, search_of(rig, options))
         self._num_at_recognition = 0
         """Adjustments when it was last asked who it is."""
@@ -279,8 +279,8 @@ class _MonoTracker:
         state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
         return self._recognised(state), track
 
-    def remembered(self, state: MonoState) -> Remembered:
-        return as_remembered(self._system.unknown, self._system.face, state)
+    def gallery(self, state: MonoState) -> Gallery:
+        return as_gallery(self._system.unknown, self._system.face, state)
 
     def focal_length(self, state: MonoState) -> FocalLength:
         return focal_length(self._system.unknown, self._system.face, self.rig, state, self._compiled)
@@ -303,8 +303,8 @@ class _MonoTracker:
             self._people = self._people_with(self._system, old)
 
     def _people_with(self, system: System, state: MonoState) -> People:
-        last = as_remembered(system.unknown, system.face, state)
-        return people(self._face, last if self._remembered is None else joined(self._remembered, last))
+        last = as_gallery(system.unknown, system.face, state)
+        return people(self._face, last if self._gallery is None else joined(self._gallery, last))
 
     def _asked_who(self, system: System, state: MonoState) -> MonoState:
         """As when a face comes back. Frames of a camera must not wait while this is compiled for one person more."""
@@ -368,13 +368,13 @@ class _MonoTracker:
         return _Found(detections, start, views, prior._replace(past=past))
 
 
-def _check_remembered(remembered: Remembered | None, face: MultilinearFace, options: MonoConfig) -> None:
-    if remembered is None:
+def _check_gallery(gallery: Gallery | None, face: MultilinearFace, options: MonoConfig) -> None:
+    if gallery is None:
         return
     if options.is_published:
-        raise ValueError('remembered must be None where options.landmarks is not "aligned": that tracker knows nobody.')
-    count, num_identities = len(remembered.identity), face.num_identities
+        raise ValueError('gallery must be None where options.landmarks is not "aligned": that tracker knows nobody.')
+    count, num_identities = len(gallery.identity), face.num_identities
     expected = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
-    shapes = tuple(jnp.shape(leaf) for leaf in remembered)
+    shapes = tuple(jnp.shape(leaf) for leaf in gallery)
     if shapes != expected:
-        raise ValueError(f"remembered must be of the model, with shapes {expected}; got {shapes}.")
+        raise ValueError(f"gallery must be of the model, with shapes {expected}; got {shapes}.")

@@ -83,7 +83,7 @@ class MonoState(NamedTuple):
     belief: Gaussian
     """Of the last estimate, for the person as believed."""
     face_index: Int[Array, ""]
-    """Of `People.faces`: 0 for an unknown person, else 1 + the index of one who is remembered."""
+    """Of `People.faces`: 0 for an unknown person, else 1 + the index of one of the gallery."""
     person: Person
     """About that face."""
     prior: Prior
@@ -144,7 +144,7 @@ class MonoTrack(NamedTuple):
     offset: Float[Array | np.ndarray, "b K 3"]
     """What the model lacks of this face, millimetres."""
     person_index: Int[Array | np.ndarray, " b"]
-    """Index of the recognised person among those who are remembered, or -1 for an unknown person."""
+    """Index of the recognised person among those of the gallery, or -1 for an unknown person."""
     is_adjusted: Bool[Array | np.ndarray, " b"]
     """Whether the face was adjusted in this frame."""
     status: Int[Array | np.ndarray, " b"]

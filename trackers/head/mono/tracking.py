@@ -49,7 +49,7 @@ class System(NamedTuple):
     unknown: MultilinearFace
     """The model."""
     face: MultilinearFace
-    """Whom the state is about: the same, or a person who is remembered."""
+    """Whom the state is about: the same, or an enrolled person."""
     rig: CameraRig
     searches: Searches
 

@@ -53,7 +53,7 @@ def why_unmatched(
             f"{LEAST_SCORE:g}: it shows another moment or another scene, or the face is hidden."
         )
     inverse = np.linspace(-1 / _CLOSEST, 1 / _CLOSEST, 4001)
-    away = np.linalg.norm(epipolar.seen_at(rig, points, inverse, source=0, target=c) - at[:, None], axis=-1)
+    away = np.linalg.norm(epipolar.projected_at(rig, points, inverse, source=0, target=c) - at[:, None], axis=-1)
     away = np.where(np.isnan(away), np.inf, away)
     error = float(np.median(away.min(axis=1)[observed]))
     if error > MOST_ASIDE:

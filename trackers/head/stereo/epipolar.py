@@ -36,7 +36,7 @@ def match(
     line does not mislead. Each match is moved to the vertex of its score.
     """
     inverse = _inverse_depths(rig, points, source, target)
-    line = seen_at(rig, points, inverse, source=source, target=target)
+    line = projected_at(rig, points, inverse, source=source, target=target)
     along = np.gradient(line, axis=1)
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.where(length > 0, length, 1.0)
@@ -52,7 +52,7 @@ def match(
     return _refined(images[target], templates, start)
 
 
-def seen_at(
+def projected_at(
     rig: CameraRig,
     points: Float[np.ndarray, "K 2"],
     inverse_depths: Float[np.ndarray, " n"],
@@ -81,7 +81,7 @@ def windows(image: UInt8[np.ndarray, "rows cols"], points: Float[np.ndarray, "K 
 
 def _inverse_depths(rig: CameraRig, points: np.ndarray, source: int, target: int) -> Float[np.ndarray, " n"]:
     """As many as there are pixels along the longest line, or a few more: few lengths, few compiled programs."""
-    ends = seen_at(rig, points, np.array([1 / FARTHEST, 1 / NEAREST]), source=source, target=target)
+    ends = projected_at(rig, points, np.array([1 / FARTHEST, 1 / NEAREST]), source=source, target=target)
     longest = max(64.0, np.nan_to_num(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)).max())
     return np.linspace(1 / FARTHEST, 1 / NEAREST, 2 ** int(np.clip(np.ceil(np.log2(longest)), 6, 11)))
 

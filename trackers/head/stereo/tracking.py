@@ -96,7 +96,7 @@ def begin(
         slopes=slopes,
         model_variance=jnp.full(len(face.mean), FIRST_MODEL_VARIANCE, x.dtype),
         residual_scale=jnp.ones((), x.dtype),
-        learner=learning.nothing_learnt(face.mean, face.templates),
+        learner=learning.empty_learner(face.mean, face.templates),
         last_good=x,
         misses=jnp.zeros((), jnp.int32),
         num_outliers=jnp.zeros((), jnp.int32),

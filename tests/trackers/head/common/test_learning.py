@@ -38,7 +38,7 @@ def as_it_is(change, mean):
 
 def begin(neutral=NEUTRAL):
     neutral = jnp.asarray(neutral)
-    return learning.nothing_learnt(neutral, WINDOWS), rigid(neutral, WINDOWS, num_modes=NUM_MODES)
+    return learning.empty_learner(neutral, WINDOWS), rigid(neutral, WINDOWS, num_modes=NUM_MODES)
 
 
 def follow_all(shapes, follow=1.0, still=as_it_is):
@@ -201,7 +201,7 @@ def test_shapes_recalculated_on_rendered_frames_are_right():
     before, after = [], []
     for seed in range(6):
         frames = Frames(seed)
-        learner = learning.nothing_learnt(frames.shapes[0], frames.windows)
+        learner = learning.empty_learner(frames.shapes[0], frames.windows)
         images = frames.images[1]
         found, windows = recalculated(learner, frames.shapes[0], images, frames.windows, frames.pose, frames.video.rig)
         before.append(frames.shapes[0] - frames.shapes[1])
@@ -222,7 +222,7 @@ def test_recalculation_goes_on_from_the_frame_before():
     """From windows of the frame before where there are such, else from the registered ones."""
     frames = Frames(1)
     run = partial(recalculated, images=frames.images[1], pose=frames.pose, rig=frames.video.rig)
-    fresh = learning.nothing_learnt(frames.shapes[1], frames.windows)._replace(
+    fresh = learning.empty_learner(frames.shapes[1], frames.windows)._replace(
         windows=recalculation.patches(frames.images[1], frames.shapes[1], frames.pose, frames.video.rig),
         is_fresh=jnp.ones((), bool),
     )
@@ -230,7 +230,7 @@ def test_recalculation_goes_on_from_the_frame_before():
     arguments = {"estimated": frames.shapes[0], "templates": frames.windows}
     error = [np.abs(run(one, **arguments)[0] - frames.shapes[1]).max() for one in (fresh, stale)]
     assert error[0] < error[1]
-    untouched = learning.nothing_learnt(frames.shapes[0], frames.windows)
+    untouched = learning.empty_learner(frames.shapes[0], frames.windows)
     np.testing.assert_array_equal(run(stale, **arguments)[0], run(untouched, **arguments)[0])
 
 

@@ -50,7 +50,7 @@ def test_a_changed_landmark_is_followed_and_the_others_stay_registered(scene):
     np.testing.assert_array_equal(again.uv[:, others], found.uv[:, others])
 
     # What the next frame is told: this landmark has changed, and where it was found beside the model's.
-    observed = recent.as_seen(again, jnp.asarray(anchored), shape, pose, after, rig)
+    observed = recent.as_observed(again, jnp.asarray(anchored), shape, pose, after, rig)
     np.testing.assert_array_equal(np.asarray(observed.has_changed)[0], ~others)
     np.testing.assert_allclose(observed.apart[:, CHANGED], np.tile(MOVED, (2, 1)), atol=0.1)
 
@@ -81,7 +81,7 @@ def test_a_landmark_drifts_with_every_frame_until_it_is_anchored_again(scene):
     variances = []
     for _ in range(3):
         drift = recent.drifted(last, is_followed)
-        last = recent.as_seen(again, anchored, shape, pose, after, rig, drift)
+        last = recent.as_observed(again, anchored, shape, pose, after, rig, drift)
         variances.append(np.asarray(last.drift))
         np.testing.assert_array_equal(drift, last.drift)
     step = recent.DRIFT_PX.each**2
@@ -91,9 +91,9 @@ def test_a_landmark_drifts_with_every_frame_until_it_is_anchored_again(scene):
     np.testing.assert_allclose(recent.drifted(grown, is_followed)[:, CHANGED], recent.MOST_DRIFT_PX**2)
     # Where nothing is found the model alone says where the landmark is; as registered again, it is known.
     hidden = again._replace(score=jnp.zeros_like(again.score))
-    nowhere = recent.as_seen(
+    nowhere = recent.as_observed(
         hidden, jnp.zeros_like(anchored), shape, pose, after, rig, recent.drifted(last, is_followed)
     )
     np.testing.assert_array_equal(nowhere.drift, recent.MOST_DRIFT_PX**2)
-    back = recent.as_seen(again, jnp.ones_like(anchored), shape, pose, after, rig, jnp.zeros_like(last.drift))
+    back = recent.as_observed(again, jnp.ones_like(anchored), shape, pose, after, rig, jnp.zeros_like(last.drift))
     np.testing.assert_array_equal(back.drift, 0.0)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.models.face.gallery import Gallery
 from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.models.face.person_prior import Person
-from jaxfilters.models.face.remembered import Remembered
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.head.common import input as head_input
 from jaxfilters.trackers.head.common.table import SKIPPED, with_gaps
@@ -61,10 +61,10 @@ def fake(monkeypatch):
     made = []
 
     class FakeSession(mono_command.MonoSession):
-        events, model, person, remembered = (), None, None, None
+        events, model, person, gallery = (), None, None, None
 
-        def __init__(self, rig, face, options, points, *, detector, remembered=None):
-            self.known = remembered
+        def __init__(self, rig, face, options, points, *, detector, gallery=None):
+            self.known = gallery
             self.rig, self.face, self.options, self.points, self.frames = rig, face, options, points, 0
             self.events = []
             made.append(self)
@@ -82,7 +82,7 @@ def fake(monkeypatch):
             if self.person is None:
                 self.person = Person(self.face.identity_mean, jnp.zeros((10, 3)))
                 who = (self.face.identity_mean, self.face.identity_covariance, self.person.offset)
-                self.remembered = Remembered(*(leaf[None] for leaf in who))
+                self.gallery = Gallery(*(leaf[None] for leaf in who))
                 self.events.append((2, "registered"))
             return made_track(images.mean(axis=(1, 2, 3)), times, np.where(index < 2, 0, 2).astype(np.int32), self.face)
 

@@ -16,10 +16,10 @@ from jaxfilters.models.face.person_prior import (
     Person,
     Prior,
     log_size,
+    observed_size,
     parameters,
     posed_shape,
     residuals,
-    seen_size,
 )
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.trackers.head.mono.dense import Dense, information_of_ten, start_densely, tracked
@@ -129,7 +129,7 @@ def test_what_the_views_tell_is_the_schur_complement_of_the_whole_normal_matrix(
 
     def held(identity, ours, others, expressions):
         """Offsets of the ten, of the others, and of the detector, in proportion to the size in every frame."""
-        ratio = jnp.stack([seen_size(face, identity, a[None]) for a in expressions])[:, None, None] * np.sqrt(5)
+        ratio = jnp.stack([observed_size(face, identity, a[None]) for a in expressions])[:, None, None] * np.sqrt(5)
         std = jnp.full((68, 1), both).at[chosen].set(misplaced_mm if misplaced_mm else 1e-4)
         return (ours / PRIOR.offset_std / ratio).ravel(), (others / std / ratio).ravel()
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.bundle import Bundle, Reach, Views, adjust, projected
+from jaxfilters.models.face.gallery import hypotheses, remember
 from jaxfilters.models.face.multilinear import learn
 from jaxfilters.models.face.person_prior import Person, Prior
-from jaxfilters.models.face.remembered import hypotheses, remember
 from jaxfilters.models.face.square_root_prior import joined
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head.mono.adjustment import informed
@@ -25,7 +25,7 @@ OPTIONS = MonoConfig(offset_std=0.7, past="marginalised")
 
 @pytest.fixture(scope="module")
 def scene(rig):
-    """Eight frames of somebody, adjusted together to the last bit; a model, and the same for one who is remembered."""
+    """Eight frames of somebody, adjusted together to the last bit; a model, and the same for one of the gallery."""
     with jax.enable_x64(True):
         shapes = generator_shapes(jax.random.key(1), people_of(jax.random.key(0), 11))
         face = learn(shapes)

@@ -1,12 +1,12 @@
-"""Who it is: people who are remembered, strangers, and somebody who comes back."""
+"""Who it is: people of the gallery, strangers, and somebody who comes back."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.models.face.gallery import Gallery, remember
 from jaxfilters.models.face.multilinear import learn
-from jaxfilters.models.face.remembered import Remembered, remember
 from jaxfilters.models.synthetic.face import make_identity
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
@@ -38,7 +38,7 @@ def process(session, images, times, size=16):
 def test_somebody_who_is_remembered_is_recognised_and_as_far_away_as_he_is(rig, taught, talking, detected):
     face, shapes = taught
     made, images = talking
-    session = MonoSession(rig, face, detections=detected, remembered=remember(face, shapes[:10]))
+    session = MonoSession(rig, face, detections=detected, gallery=remember(face, shapes[:10]))
     track = process(session, images, made.times)
     assert set(track.person_index[START:]) <= {-1, 3}
     assert np.all(track.person_index[-20:] == 3)
@@ -59,10 +59,10 @@ def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     made, images = talking
     others = jnp.concatenate([shapes[:3], shapes[4:]])
     face = learn(others, identities=IDENTITIES)
-    session = MonoSession(rig, face, detections=detected, remembered=remember(face, others))
+    session = MonoSession(rig, face, detections=detected, gallery=remember(face, others))
     track = process(session, images, made.times)
     assert np.all(track.person_index == -1)
-    assert session.remembered is not None
+    assert session.gallery is not None
 
 
 @pytest.mark.system
@@ -71,8 +71,8 @@ def test_somebody_who_was_followed_is_recognised_by_a_later_session(rig, face, t
     made, images = talking
     first = MonoSession(rig, face, detections=detected)
     before = process(first, images, made.times)
-    known = first.remembered
-    second = MonoSession(rig, face, detections=detected, remembered=known)
+    known = first.gallery
+    second = MonoSession(rig, face, detections=detected, gallery=known)
     after = process(second, images, made.times)
     assert after.person_index[-1] == 0
     assert np.abs(after.pose[-1, 2] - before.pose[-1, 2]) < 3.0
@@ -120,9 +120,9 @@ def test_shares_of_the_prior(taught):
 @pytest.mark.system
 def test_people_of_another_model_are_refused(rig, face, taught):
     other, _ = taught
-    fewer = Remembered(*(jnp.zeros(shape) for shape in ((1, 10), (1, 10, 10), (1, 10, 3))))
-    with pytest.raises(ValueError, match="remembered must be of the model, with shapes"):
-        MonoSession(rig, face, remembered=fewer)
-    fits = Remembered(*(jnp.zeros(shape) for shape in ((1, 15), (1, 15, 15), (1, 10, 3))))
+    fewer = Gallery(*(jnp.zeros(shape) for shape in ((1, 10), (1, 10, 10), (1, 10, 3))))
+    with pytest.raises(ValueError, match="gallery must be of the model, with shapes"):
+        MonoSession(rig, face, gallery=fewer)
+    fits = Gallery(*(jnp.zeros(shape) for shape in ((1, 15), (1, 15, 15), (1, 10, 3))))
     with pytest.raises(ValueError, match="that tracker knows nobody"):
-        MonoSession(rig, other, PUBLISHED, remembered=fits)
+        MonoSession(rig, other, PUBLISHED, gallery=fits)

@@ -1,7 +1,7 @@
 """People who may come back: each is a model of the face of its own, whose identity is known to within a little.
 
 The training set's people are not a Gaussian: whoever is among them is exactly one of them. A mixture of narrow
-components about those who are remembered and a wide one for unknown people says so.
+components about those of the gallery and a wide one for unknown people says so.
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ from jaxfilters.models.face.multilinear import PEOPLE_MODE, MultilinearFace, sha
 from jaxfilters.models.face.multilinear_fit import likeliest
 
 
-class Remembered(NamedTuple):
+class Gallery(NamedTuple):
     """P people, of whom a model of the face knows who they are."""
 
     identity: Float[Array, "P S"]
@@ -26,7 +26,7 @@ class Remembered(NamedTuple):
     """What the model lacks of each face, millimetres."""
 
 
-def remember(face: MultilinearFace, shapes: Float[Array, "P A K 3"], pairs: Pairs = PAIRS) -> Remembered:
+def remember(face: MultilinearFace, shapes: Float[Array, "P A K 3"], pairs: Pairs = PAIRS) -> Gallery:
     """People by measured shapes of their faces, with any expressions.
 
     A shape is taken as the mean of its two symmetric halves, which is all that the model can form.
@@ -46,21 +46,21 @@ def remember(face: MultilinearFace, shapes: Float[Array, "P A K 3"], pairs: Pair
     return of_tensor(face, shape_tensor(shapes, pairs))
 
 
-def of_tensor(face: MultilinearFace, tensor: Float[Array, "K 3 halves A"]) -> Remembered:
+def of_tensor(face: MultilinearFace, tensor: Float[Array, "K 3 halves A"]) -> Gallery:
     """The people of a data tensor (`jaxfilters.models.face.multilinear.shape_tensor`)."""
     right, left = jnp.split(tensor, 2, axis=PEOPLE_MODE)
     both = jnp.moveaxis((right + left) / 2, (2, 3), (0, 1))
     # One by one: batches of factorisations can stand still on two cores.
     fit, covariance, left_over = jax.lax.map(lambda own: likeliest(face, own), both)
-    return Remembered(fit.identity, covariance, left_over)
+    return Gallery(fit.identity, covariance, left_over)
 
 
-def joined(*people: Remembered) -> Remembered:
+def joined(*people: Gallery) -> Gallery:
     """All of them."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *people)
 
 
-def hypotheses(face: MultilinearFace, people: Remembered) -> MultilinearFace:
+def hypotheses(face: MultilinearFace, people: Gallery) -> MultilinearFace:
     """Models for an unknown person, first, and for each of the people, stacked: leaves (1 + P, ...)."""
 
     def known(identity: Array, covariance: Array, offset: Array) -> MultilinearFace:

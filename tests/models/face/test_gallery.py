@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.models.face.gallery import hypotheses, joined, remember
 from jaxfilters.models.face.multilinear import learn, shape, shape_tensor
 from jaxfilters.models.face.multilinear_fit import MEASURED_MM, likeliest
-from jaxfilters.models.face.remembered import hypotheses, joined, remember
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
 
 NUM_PEOPLE = 30
