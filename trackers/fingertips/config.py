@@ -1,4 +1,4 @@
-"""What a run of the fingertip tracker is told; the constants of the tracker itself are `state.FingertipConfig`."""
+"""Options of a run of the fingertip tracker; the constants of the tracker itself are `state.FingertipConfig`."""
 
 from dataclasses import dataclass
 from typing import Annotated

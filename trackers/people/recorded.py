@@ -12,8 +12,8 @@ import numpy as np
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
-from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.state import STATE, TENTATIVE, TRACKED, People, PeopleConfig, Report
+from jaxfilters.trackers.people.tracker import motion
 
 
 class Sighting(NamedTuple):

@@ -1,4 +1,8 @@
-"""The people tracker: a Kalman filter a person, measured by a joint search in the silhouettes."""
+"""The people tracker: a Kalman filter a person, measured by a joint search in the silhouettes.
+
+People move with a steady velocity and white acceleration; their sizes are constant, and what displaces their
+silhouettes decays.
+"""
 
 from collections.abc import Sequence
 
@@ -9,19 +13,26 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters.gaussian.arithmetic import joseph
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.consider import consider
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
+from jaxfilters.motion.models import constant_velocity
 from jaxfilters.trackers.people import lifecycle
-from jaxfilters.trackers.people.appearance import appearances
-from jaxfilters.trackers.people.births import birth, cells_of, padded
-from jaxfilters.trackers.people.exchange import identity_switch_correction
-from jaxfilters.trackers.people.fit import Fit, fit_people
-from jaxfilters.trackers.people.motion import motion
-from jaxfilters.trackers.people.silhouettes import body_of, observed_place
+from jaxfilters.trackers.people.appearance import appearances, identity_switch_correction
+from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
+from jaxfilters.trackers.people.image_shift import displacement_by_shift, shift_sd
+from jaxfilters.trackers.people.lifecycle import birth, cells_of, padded
+from jaxfilters.trackers.people.silhouette_bias import bias_factor
+from jaxfilters.trackers.people.silhouettes import body_of, observed_place, stature
 from jaxfilters.trackers.people.state import (
+    BIAS,
     HEIGHT,
+    PLACE,
+    STATE,
     TENTATIVE,
     TRACKED,
+    WIDTH,
     CameraFrame,
     People,
     PeopleConfig,
@@ -30,7 +41,6 @@ from jaxfilters.trackers.people.state import (
     chosen,
     nobody,
 )
-from jaxfilters.trackers.people.update import updated
 
 MOST_DT_S = 1.0
 """A longer gap is treated as one of this length: nobody is followed across it anyway."""
@@ -39,6 +49,12 @@ NO_DEPTH = 0.05
 pair of a desk that hides the feet and a border that hides the head gives as much, either alone gives less."""
 CLEAR = 0.5
 """Share of the silhouette from which on clothes are looked at."""
+HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
+"""Metres per root second: posture; arms, stride and which side is visible."""
+WHOLE = 0.9
+"""Share of the silhouette from which on a person's height is measured."""
+_LEAST_HEIGHT_M = 0.5
+LEAST_DT_S = 1e-3
 
 
 def people_scene(
@@ -148,3 +164,53 @@ def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
 def _distance(scene: PeopleScene, xy: Array) -> Array:
     """From whichever camera is nearest, on the floor."""
     return jnp.min(jnp.linalg.norm(xy[:, None] - scene.centers(), axis=-1), axis=1)
+
+
+def motion(config: PeopleConfig, dt: Float[Array, ""]) -> tuple[Float[Array, "9 9"], Float[Array, "9 9"]]:
+    """Transition matrix and noise covariance of `dt` seconds.
+
+    Y. Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section 6.2.2.
+    """
+    walk = constant_velocity(config.acceleration_sd**2, dims=2).discretize(dt)
+    remains = jnp.exp(-dt / config.silhouette_bias_s)
+    bias = jnp.zeros(STATE).at[BIAS].set(1.0)
+    F = jnp.diag(1 - bias + remains * bias).at[:4, :4].set(walk.F)
+    Q = jnp.diag((1 - remains**2) * bias).at[:4, :4].set(walk.Q)
+    return F, Q.at[HEIGHT, HEIGHT].set(HEIGHT_DRIFT**2 * dt).at[WIDTH, WIDTH].set(WIDTH_DRIFT**2 * dt)
+
+
+def updated(
+    scene: PeopleScene, predicted: Gaussian, fit: Fit, dt: Float[Array, ""]
+) -> tuple[Gaussian, Float[Array, " slots"]]:
+    """Beliefs after the readings in turn, and their mean normalised innovation squared.
+
+    Args:
+        scene: Cameras and constants.
+        predicted: Beliefs of all slots.
+        fit: What the images say.
+        dt: Seconds since the frame before.
+    """
+    # What disagrees stays for seconds: as noise, it must be worth one look in two of its time constants.
+    frames = 2 * scene.config.silhouette_bias_s / jnp.clip(dt, LEAST_DT_S, 2 * scene.config.silhouette_bias_s)
+    readings = as_measurement(fit, scene.config.silhouette_sd_m)
+    belief, nis = predicted, jnp.zeros(len(fit.score))
+    for i in range(readings.y.shape[1]):
+        mine = jax.tree.map(lambda leaf, i=i: leaf[:, i], readings)
+        one = jax.vmap(lambda b, r, w, i=i: _of_one(scene, i, b, r, w, frames))
+        belief, one_nis = one(belief, mine, fit.share_seen > WHOLE)
+        nis += one_nis
+    return belief, nis / jnp.maximum(jnp.sum(jnp.any(readings.observed, axis=-1), axis=-1), 1)
+
+
+def _of_one(scene, camera, belief, reading, whole, frames):
+    in_state = jnp.eye(STATE)[jnp.array(PLACE)]
+    H = (reading.H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean))
+    H, R = H.at[:, BIAS].set(reading.H @ bias_factor(scene, belief.mean)), reading.R
+    if camera:
+        height = jnp.maximum(belief.mean[HEIGHT], _LEAST_HEIGHT_M)
+        by_shift = displacement_by_shift(scene.cameras[camera], belief.mean[:2], height)
+        loading = shift_sd(scene)[camera] * reading.H[:, :3] @ by_shift
+        R += frames * loading @ loading.T
+    after, info = joseph.update(belief, reading.y, H, R, mask=reading.observed)
+    size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
+    return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people import births
-from jaxfilters.trackers.people.births import LEAST_CELLS, LEAST_SHARE, birth, cells_of, padded, stride
+from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people.lifecycle import LEAST_CELLS, LEAST_SHARE, birth, cells_of, padded, stride
 from jaxfilters.trackers.people.state import CameraFrame, Cells, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -64,9 +64,9 @@ def test_windows_of_people_cover_what_whole_images_would(camera, floor, monkeypa
     places = jnp.concatenate([at, jnp.tile(jnp.array([1.7, 0.45]), (4, 1))], axis=1)
     frame = CameraFrame(np.full(camera.shape, 200, np.uint8), np.zeros((*camera.shape, 3), np.uint8), np.bool_(True))
     inputs = scene, camera, scene.furniture[0], places, jnp.ones(4, bool), frame
-    found = np.asarray(births._reduced_contrast(*inputs))
-    monkeypatch.setattr(births, "_WINDOW", (1, 1))
-    np.testing.assert_allclose(found, births._reduced_contrast(*inputs), atol=3e-3)
+    found = np.asarray(lifecycle._reduced_contrast(*inputs))
+    monkeypatch.setattr(lifecycle, "_WINDOW", (1, 1))
+    np.testing.assert_allclose(found, lifecycle._reduced_contrast(*inputs), atol=3e-3)
     assert np.ptp(found) > 0.3
 
 

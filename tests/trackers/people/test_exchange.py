@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.exchange import CLOSE_M, LONGEST_S, identity_switch_correction, is_meeting
+from jaxfilters.trackers.people.appearance import CLOSE_M, LONGEST_S, identity_switch_correction, is_meeting
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, WIDTH, PeopleConfig, nobody
 
 DT = jnp.asarray(0.1)

@@ -8,8 +8,8 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
-from jaxfilters.trackers.people.births import Birth, stride
 from jaxfilters.trackers.people.fit import Fit
+from jaxfilters.trackers.people.lifecycle import Birth, stride
 from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, PeopleConfig, nobody
 from jaxfilters.trackers.people.tracker import people_scene
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from jaxfilters.trackers.people.motion import HEIGHT_DRIFT, WIDTH_DRIFT, motion
 from jaxfilters.trackers.people.state import STATE, PeopleConfig
+from jaxfilters.trackers.people.tracker import HEIGHT_DRIFT, WIDTH_DRIFT, motion
 
 
 @pytest.mark.system

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.motion import motion
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed, spreads
 from jaxfilters.trackers.people.state import DORMANT, FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
+from jaxfilters.trackers.people.tracker import motion
 
 CONFIG = PeopleConfig(capacity=2)
 
