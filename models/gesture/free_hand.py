@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxfilters.models.gesture.discriminative import distortions
 from jaxfilters.models.gesture.stroke import Drawn
 
-COPIES = 8
+COPIES = 16
 LONGEST_CUT = 0.1
 """Of a stroke's samples, at either end."""
 TAIL_SHARE, LONGEST_TAIL = 0.3, 0.2
