@@ -19,9 +19,9 @@ from jaxfilters.models.gesture.symbols import SHARPNESS, Symbols, learn, recogni
 EXAMPLES_A_WAY, MOST_WAYS = 40, 20
 """Examples of a symbol for each way to draw it that is looked for, and how many ways at most."""
 NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS = 10, 0.1, 8
-"""Of strokes with several pieces, and of many in space."""
-SPACE_STATES, SPACE_VARIANCE, SPACE_ITERATIONS = 18, 0.07, 4
-"""Of few strokes in space, with their variations: these show how strokes differ, so that variances need a lower floor
+"""Of many strokes."""
+FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS = 18, 0.07, 4
+"""Of few strokes, with their variations: these show how strokes differ, so that variances need a lower floor
 than those of few examples, and few iterations of Baum-Welch suffice."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
@@ -56,11 +56,6 @@ def is_path(strokes: Sequence[Drawn]) -> bool:
     return all(len(pieces) == 1 and np.shape(pieces[0])[1:] == (2,) for pieces, _ in strokes)
 
 
-def is_in_space(strokes: Sequence[Drawn]) -> bool:
-    """Whether the positions have three dimensions."""
-    return any(np.shape(piece)[1:] == (3,) for pieces, _ in strokes for piece in pieces)
-
-
 def ways_of(labels: Sequence[str]) -> int:
     """How many ways to draw a symbol its examples can tell of: one for 40, and at most 20."""
     counts = np.unique(np.asarray(labels), return_counts=True)[1]
@@ -78,7 +73,7 @@ def learn_strokes(
     """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
 
     Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
-    `discriminative.trained_apart`. Few strokes in space are fitted with `free_hand.with_variations`.
+    `discriminative.trained_apart`. Few are fitted with `free_hand.with_variations`.
 
     Args:
         strokes: In two dimensions or in three.
@@ -104,9 +99,9 @@ def learn_strokes(
     are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
     ways = min(ways_of(labels), MOST_WAYS_APART if are_many else MOST_WAYS) if num_variants is None else num_variants
     usual_states, usual_variance, iterations = NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS
-    if not are_many and is_in_space(strokes):
+    if not are_many:
         strokes, labels = with_variations(strokes, labels)
-        usual_states, usual_variance, iterations = SPACE_STATES, SPACE_VARIANCE, SPACE_ITERATIONS
+        usual_states, usual_variance, iterations = FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS
     features = stacked(strokes)
     symbols = learn(
         features,

@@ -43,7 +43,7 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         "--states",
         type=positive_integer,
         metavar="N",
-        help="of each model (default: 10; 16 for paths in a plane, 18 for few strokes in space)",
+        help="of each model (default: 10; 16 for paths in a plane, 18 for few other strokes)",
     )
     gestures.add_argument(
         "--ways",
