@@ -64,8 +64,8 @@ def test_few_strokes_also_stand_for_slanted_ones(dimensions):
     turn = np.eye(dimensions)
     turn[:2, :2] = [[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]
     slanted = to_judge([([piece @ turn.T for piece in strokes[0][0]], 1)], dimensions)
-    few = learning.learn_strokes(strokes, ["i"] * 6)
-    alone = learn(stacked(strokes), ["i"] * 6, num_states=learning.FEW_STATES, min_variance=learning.FEW_VARIANCE)
+    few = learning.learn_strokes(strokes, ["i"] * 6, min_variance=0.01)
+    alone = learn(stacked(strokes), ["i"] * 6, num_states=learning.FEW_STATES, min_variance=0.01)
     assert recognise_all(few, slanted).log_likelihood[0, 0] > recognise_all(alone, slanted).log_likelihood[0, 0] + 0.5
 
 
