@@ -185,20 +185,20 @@ def fingers_by_hull(mask: np.ndarray) -> int:
 
 
 def nearest_by_warping(
-    known: Sequence[Float[np.ndarray, "_ 2"]], labels: Sequence[str], strokes: Sequence[Float[np.ndarray, "_ 2"]]
+    known: Sequence[Float[np.ndarray, "_ d"]], labels: Sequence[str], strokes: Sequence[Float[np.ndarray, "_ d"]]
 ) -> list[str]:
     """Labels of the strokes that are nearest by dynamic time warping, size and place removed."""
     alike = np.stack([_normalised(path) for path in known])
     found = []
     for stroke in strokes:
         apart = np.linalg.norm(_normalised(stroke)[None, :, None] - alike[:, None], axis=-1)
-        total = np.full((len(alike), POINTS + 1, POINTS + 1), np.inf)
-        total[:, 0, 0] = 0.0
-        for i in range(POINTS):
-            for j in range(POINTS):
-                before = np.minimum(np.minimum(total[:, i, j], total[:, i, j + 1]), total[:, i + 1, j])
-                total[:, i + 1, j + 1] = apart[:, i, j] + before
-        found.append(labels[int(np.argmin(total[:, -1, -1]))])
+        along = np.cumsum(apart, axis=2)
+        total = along[:, 0]
+        for i in range(1, POINTS):
+            # A row after the other: into each place from the row before, then on along the row.
+            entered = np.minimum(total, np.pad(total[:, :-1], ((0, 0), (1, 0)), constant_values=np.inf))
+            total = along[:, i] + np.minimum.accumulate(entered - along[:, i] + apart[:, i], axis=1)
+        found.append(labels[int(np.argmin(total[:, -1]))])
     return found
 
 
@@ -207,6 +207,6 @@ def _normalised(path: np.ndarray) -> np.ndarray:
     path = np.asarray(path, float)
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
     even = np.linspace(0.0, along[-1], POINTS)
-    points = np.stack([np.interp(even, along, path[:, k]) for k in range(2)], axis=-1)
+    points = np.stack([np.interp(even, along, path[:, k]) for k in range(path.shape[1])], axis=-1)
     points = points - points.mean(axis=0)
     return points / max(np.ptp(points, axis=0).max(), 1e-9)

@@ -12,6 +12,9 @@ digit of each of the others. Settings are the same for both and were chosen with
 that of the best symbol of all strokes; `accepted` is the share that also beats the threshold model by the margin of the
 symbol, and `accepted_right` the share of these that is right. Margins, and the temperature of the confidences whose
 `calibration_error` is given, are fitted to the strokes of the other people, as `jaxfilters fit gestures` does.
+`calibration_error_by_chance` is the mean of that error where every stroke is right with the probability that its
+confidence says, and `_dtw` is the accuracy of the nearest stroke of the others by dynamic time warping, over every
+twentieth stroke of `unipen_digits`.
 
 `sfinge3d_gestures` holds streams of hands with 13 gestures to spot; `_sfinge.py` says what counts as detected. Settings
 were chosen with these streams.
@@ -21,21 +24,26 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._drawn_symbols import FULL, QUICK, drawn_metrics
 from jaxfilters.benchmarks.scenarios._sfinge import sfinge_metrics
+from jaxfilters.benchmarks.scenarios._simplest import nearest_by_warping
 from jaxfilters.models.gesture.calibration import calibration_error
-from jaxfilters.models.gesture.learning import accuracy, judged, leave_one_out
+from jaxfilters.models.gesture.learning import accuracy, judged, leave_one_out, shown_of_others
 from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.strokes import read_strokes
+from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
 
 RECORDINGS = {
-    "midair_loso": ("midair_leap_gestures", "midair_leap.npz", None),
-    "unipen_unseen_donor": ("unipen_digits", "unipen_1a_digits.npz", 120),
+    "midair_loso": ("midair_leap_gestures", "midair_leap.npz", None, 1),
+    "unipen_unseen_donor": ("unipen_digits", "unipen_1a_digits.npz", 120, 20),
 }
-"""By the names of metrics: folder, file, and most examples of a symbol that are estimated from one person."""
+"""By the names of metrics: folder, file, most examples of a symbol that are estimated from one person, and of how many
+strokes one is compared by time warping."""
+CHANCES = 1000
+"""Draws of what is right, for the calibration error by chance."""
 SFINGE = "sfinge3d_gestures"
 QUICK_PEOPLE, QUICK_SEQUENCES = 1, 3
 
@@ -65,7 +73,7 @@ def recorded_metrics(name: str, *, quick: bool) -> dict[str, Metric]:
     Raises:
         RecordingError: if the recording is not there, or cannot be read.
     """
-    folder, file, most = RECORDINGS[name]
+    folder, file, most, every = RECORDINGS[name]
     path = recording_folder(folder) / file
     try:
         recorded = read_strokes(path)
@@ -83,4 +91,25 @@ def recorded_metrics(name: str, *, quick: bool) -> dict[str, Metric]:
         f"accepted_{name}": Metric(100 * float(accepted.mean()), "%", "higher"),
         f"accepted_right_{name}": Metric(100 * float(right[accepted].mean()), "%", "higher"),
         f"calibration_error_{name}": Metric(calibration_error(confidence, right), "", "lower"),
+        f"calibration_error_by_chance_{name}": Metric(_error_by_chance(confidence), "", "lower"),
+        f"accuracy_{name}_dtw": Metric(_by_warping(recorded, people, most, every), "%", "higher"),
     }
+
+
+def _error_by_chance(confidence: Float[np.ndarray, " n"]) -> float:
+    """The mean calibration error of confidences that are true."""
+    drawn = np.random.default_rng(0).uniform(size=(CHANCES, len(confidence))) < confidence
+    return float(np.mean([calibration_error(confidence, right) for right in drawn]))
+
+
+def _by_warping(recorded: StrokeSet, people: list[str], most: int | None, every: int) -> float:
+    """Percent of the strokes of each person that are as the nearest of the others' by dynamic time warping."""
+    paths = [np.concatenate(pieces) for pieces, _ in recorded.strokes]
+    labels, who = np.array(recorded.labels), np.array(recorded.people)
+    right = []
+    for person in people:
+        known = shown_of_others(labels, who, person, most)
+        own = np.flatnonzero(who == person)[::every]
+        near = nearest_by_warping([paths[i] for i in known], labels[known].tolist(), [paths[i] for i in own])
+        right.append(np.array(near) == labels[own])
+    return 100 * float(np.concatenate(right).mean())

@@ -1,8 +1,8 @@
-"""Random variations of strokes that were drawn in the air, where no contact of a pen marks the ends of a stroke.
+"""Random variations of strokes, for symbols of which there are few examples.
 
 Few examples of a symbol by few people show neither all sizes and slants nor the movements by which other hands come to
-a stroke and leave it. Copies of the strokes do: each goes through a random linear map, loses a part of either end, and
-may have a straight tail at it.
+a stroke and leave it, in the air above all, where no contact of a pen marks its ends. Copies of the strokes do: each
+goes through a random linear map, loses a part of either end, and may have a straight tail at it.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxfilters.models.gesture.discriminative import distortions
 from jaxfilters.models.gesture.stroke import Drawn
 
-COPIES = 8
+COPIES = 16
 LONGEST_CUT = 0.1
 """Of a stroke's samples, at either end."""
 TAIL_SHARE, LONGEST_TAIL = 0.3, 0.2

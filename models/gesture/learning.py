@@ -18,10 +18,11 @@ from jaxfilters.models.gesture.symbols import SHARPNESS, Symbols, learn, recogni
 
 EXAMPLES_A_WAY, MOST_WAYS = 40, 20
 """Examples of a symbol for each way to draw it that is looked for, and how many ways at most."""
-NUM_STATES, MIN_VARIANCE = 10, 0.1
-"""Of strokes with several pieces, and of many in space."""
-SPACE_STATES, SPACE_VARIANCE = 18, 0.15
-"""Of few strokes in space, with their variations."""
+NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS = 10, 0.1, 8
+"""Of many strokes."""
+FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS = 18, 0.07, 4
+"""Of few strokes, with their variations: these show how strokes differ, so that variances need a lower floor
+than those of few examples, and few iterations of Baum-Welch suffice."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
 EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
@@ -55,11 +56,6 @@ def is_path(strokes: Sequence[Drawn]) -> bool:
     return all(len(pieces) == 1 and np.shape(pieces[0])[1:] == (2,) for pieces, _ in strokes)
 
 
-def is_in_space(strokes: Sequence[Drawn]) -> bool:
-    """Whether the positions have three dimensions."""
-    return any(np.shape(piece)[1:] == (3,) for pieces, _ in strokes for piece in pieces)
-
-
 def ways_of(labels: Sequence[str]) -> int:
     """How many ways to draw a symbol its examples can tell of: one for 40, and at most 20."""
     counts = np.unique(np.asarray(labels), return_counts=True)[1]
@@ -77,7 +73,7 @@ def learn_strokes(
     """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
 
     Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
-    `discriminative.trained_apart`. Few strokes in space are fitted with `free_hand.with_variations`.
+    `discriminative.trained_apart`. Few are fitted with `free_hand.with_variations`.
 
     Args:
         strokes: In two dimensions or in three.
@@ -102,16 +98,17 @@ def learn_strokes(
         )
     are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
     ways = min(ways_of(labels), MOST_WAYS_APART if are_many else MOST_WAYS) if num_variants is None else num_variants
-    usual_states, usual_variance = NUM_STATES, MIN_VARIANCE
-    if not are_many and is_in_space(strokes):
+    usual_states, usual_variance, iterations = NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS
+    if not are_many:
         strokes, labels = with_variations(strokes, labels)
-        usual_states, usual_variance = SPACE_STATES, SPACE_VARIANCE
+        usual_states, usual_variance, iterations = FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS
     features = stacked(strokes)
     symbols = learn(
         features,
         labels,
         num_states=num_states or usual_states,
         num_variants=ways,
+        max_iterations=iterations,
         min_variance=usual_variance if min_variance is None else min_variance,
     )
     return trained_apart(symbols, features, labels) if are_many else symbols
@@ -147,10 +144,28 @@ def leave_one_out(
         raise ValueError(f"people must be two or more; got {everybody}.")
     found = []
     for person in everybody if left_out is None else left_out:
-        shown = _shown(named, who, person, most)
+        shown = shown_of_others(named, who, person, most)
         scores = _scores(strokes, named, shown, np.flatnonzero(who == person), num_states, num_variants)
         found.append(LeftOut(person, scores))
     return found
+
+
+def shown_of_others(labels: np.ndarray, who: np.ndarray, person: str, most: int | None) -> np.ndarray:
+    """Indices of the training set where one person is left out.
+
+    Args:
+        labels: The symbol of each stroke.
+        who: Who drew each.
+        person: Who is left out.
+        most: Examples of a symbol that are used of one person, drawn at random but always the same; `None` is all.
+    """
+    rng = np.random.default_rng(0)
+    groups = [
+        rng.permutation(np.flatnonzero((who == other) & (labels == label)))[:most]
+        for other in np.unique(who[who != person])
+        for label in np.unique(labels)
+    ]
+    return np.concatenate(groups)
 
 
 def cross_calibrated(
@@ -257,14 +272,3 @@ def _scores(
     log_likelihood = np.full((len(everything), len(own)), -np.inf)
     log_likelihood[np.searchsorted(everything, symbols.names)] = NUM_POINTS * np.asarray(found.log_likelihood, float)
     return Scores(log_likelihood, np.asarray(found.lead, float), np.searchsorted(everything, labels[own]))
-
-
-def _shown(labels: np.ndarray, who: np.ndarray, person: str, most: int | None) -> np.ndarray:
-    """Indices of the training set where one person is left out."""
-    rng = np.random.default_rng(0)
-    groups = [
-        rng.permutation(np.flatnonzero((who == other) & (labels == label)))[:most]
-        for other in np.unique(who[who != person])
-        for label in np.unique(labels)
-    ]
-    return np.concatenate(groups)

@@ -58,12 +58,18 @@ def test_recorded_people_are_recognised_from_the_others(tmp_path, monkeypatch):
     )
     monkeypatch.setenv("JAXFILTERS_DATA", str(tmp_path))
     metrics = gestures.recorded_metrics("midair_loso", quick=True)
-    assert metrics["accuracy_midair_loso"].value == 100
+    assert metrics["accuracy_midair_loso"].value == metrics["accuracy_midair_loso_dtw"].value == 100
     np.savez(folder / "midair_leap.npz", xyz=np.zeros(3))
     with pytest.raises(RecordingError, match="points"):
         gestures.recorded_metrics("midair_loso", quick=True)
     with pytest.raises(RecordingError, match="unipen_digits"):
         gestures.recorded_metrics("unipen_unseen_donor", quick=True)
+
+
+def test_confidences_that_are_true_have_the_calibration_error_of_binomial_counts():
+    """Of 600 strokes in 15 bins: the mean of |count - np| / n, normal to a few percent."""
+    expected = np.sqrt(2 * 0.8 * 0.2 * 15 / (np.pi * 600))
+    assert gestures._error_by_chance(np.full(600, 0.8)) == pytest.approx(expected, rel=0.05)
 
 
 def test_a_gesture_is_detected_once_by_more_than_half_of_it():

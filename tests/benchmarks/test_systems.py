@@ -70,6 +70,22 @@ def test_a_stroke_is_nearest_to_itself_drawn_larger_and_slower():
     assert simplest.nearest_by_warping(list(known.values()), list(known), [slow]) == ["L"]
 
 
+def test_the_nearest_stroke_by_time_warping_is_that_of_the_recursion_over_all_pairs_of_places():
+    rng = np.random.default_rng(0)
+    known, strokes = (list(rng.normal(size=(num, 32, 3)).cumsum(axis=1)) for num in (30, 12))
+
+    def cost(first, second):
+        apart = np.linalg.norm(simplest._normalised(first)[:, None] - simplest._normalised(second), axis=-1)
+        total = np.full((33, 33), np.inf)
+        total[0, 0] = 0.0
+        for i, j in np.ndindex(32, 32):
+            total[i + 1, j + 1] = apart[i, j] + min(total[i, j + 1], total[i + 1, j], total[i, j])
+        return total[-1, -1]
+
+    expected = [str(np.argmin([cost(stroke, other) for other in known])) for stroke in strokes]
+    assert simplest.nearest_by_warping(known, [str(i) for i in range(30)], strokes) == expected
+
+
 @pytest.mark.system
 def test_the_page_has_a_row_for_what_a_run_measures():
     found = systems.symbol_metrics(True, 0)

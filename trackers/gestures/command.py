@@ -58,7 +58,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
         ways = 1 if options.ways is None and not options.data else options.ways
         if "" in examples.labels:
             raise InputError(f"{source}: stroke {examples.ids[examples.labels.index('')]} has no label.")
-        before = read_symbols(options.add) if options.add else None
+        before = read_symbols(_model(options.add)) if options.add else None
         if before and before.dimensions != examples.dimensions:
             raise InputError(
                 f"--add: {options.add} has models of {_features(before.dimensions)}, DATA are for models of "
@@ -104,7 +104,7 @@ def recognise(options: argparse.Namespace) -> str:
     """
     if options.stream:
         return recognise_streams(options)
-    path = DEFAULT_FILE if str(options.model) == "default" else options.model
+    path = _model(options.model)
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
@@ -123,6 +123,11 @@ def recognise(options: argparse.Namespace) -> str:
     return "\n".join(
         [*lines, _summary(strokes, file.symbols.names, found), *([f"table in {options.out}"] if options.out else [])]
     )
+
+
+def _model(path: Path) -> Path:
+    """The file of a model; that of the package where `default` is given."""
+    return DEFAULT_FILE if str(path) == "default" else path
 
 
 def _features(dimensions: int) -> str:

@@ -27,7 +27,10 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
     gestures.add_argument("data", nargs="?", type=Path, metavar="DATA", help=_DATA)
     gestures.add_argument("--out", type=Path, required=True, metavar="MODEL.npz", help="the file to write")
     gestures.add_argument(
-        "--add", type=Path, metavar="MODEL.npz", help="keep the symbols of this model and add those of DATA; five do"
+        "--add",
+        type=Path,
+        metavar="MODEL.npz",
+        help="keep the symbols of this model (`default` is the package's) and add those of DATA; five do",
     )
     gestures.add_argument(
         "--held-out",
@@ -40,7 +43,7 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         "--states",
         type=positive_integer,
         metavar="N",
-        help="of each model (default: 10; 16 for paths in a plane, 18 for few strokes in space)",
+        help="of each model (default: 10; 16 for paths in a plane, 18 for few other strokes)",
     )
     gestures.add_argument(
         "--ways",

@@ -1,4 +1,4 @@
-"""Variations of strokes drawn in the air."""
+"""Variations of strokes."""
 
 import numpy as np
 

@@ -8,7 +8,8 @@ from jaxfilters import hmm
 from jaxfilters.models.gesture import learning
 from jaxfilters.models.gesture.calibration import Scores
 from jaxfilters.models.gesture.learning import LeftOut
-from jaxfilters.models.gesture.symbols import Symbols
+from jaxfilters.models.gesture.stroke import stacked, to_judge
+from jaxfilters.models.gesture.symbols import Symbols, learn, recognise_all
 
 STROKES = [([np.zeros((2, 2))], 1)] * 24
 LABELS = ["a", "b"] * 12
@@ -51,6 +52,21 @@ def test_margins_and_confidences_of_a_person_are_those_of_the_others():
     np.testing.assert_allclose(bob.beyond, [-0.05, 0.1, 0.1], atol=1e-9)
     assert (bob.confidence > 0.99).all()
     assert abs(learning.accuracy([bob]) - 200 / 3) < 1e-9
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_few_strokes_also_stand_for_slanted_ones(dimensions):
+    """Bars with a dot, of which the examples are upright: a slanted one is likelier than by the examples alone."""
+    rng = np.random.default_rng(0)
+    bar, dot = np.linspace([0.0, 0, 0], [0, 9, 0], 20), np.array([[4.0, 0, 0], [5, 1, 0]])
+    strokes = [([piece[:, :dimensions] + rng.normal(0, 0.1, (len(piece), dimensions)) for piece in (bar, dot)], 1)] * 6
+    turn = np.eye(dimensions)
+    turn[:2, :2] = [[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]
+    slanted = to_judge([([piece @ turn.T for piece in strokes[0][0]], 1)], dimensions)
+    few = learning.learn_strokes(strokes, ["i"] * 6, min_variance=0.01)
+    alone = learn(stacked(strokes), ["i"] * 6, num_states=learning.FEW_STATES, min_variance=0.01)
+    assert recognise_all(few, slanted).log_likelihood[0, 0] > recognise_all(alone, slanted).log_likelihood[0, 0] + 0.5
 
 
 def test_too_few_scores_calibrate_nothing(asked):

@@ -104,6 +104,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, capsys):
         (("fit", "gestures", nameless, "--out", model), "stroke a has no label"),
         (("fit", "gestures", flat, "--out", model, "--add", model), "new names"),
         (("fit", "gestures", deep, "--out", model, "--add", model), "2 dimensions (8 features a point), DATA are"),
+        (("fit", "gestures", deep, "--out", model, "--add", "default"), "default has models of the shapes of"),
         (("fit", "gestures", tmp_path / "none.csv", "--out", model), "no such file"),
         (("recognise", model, deep), "positions of 2 dimensions"),
         (("recognise", tmp_path / "deep.npz"), "in space"),
