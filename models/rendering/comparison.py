@@ -115,7 +115,7 @@ class _Frame(NamedTuple):
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _compare(surface, poses, observed, max_error):
     """Depth terms of the poses along the leading axis of `poses`."""
-    return _mapped(partial(_terms_of_pose, surface), FINE)(poses, observed, max_error)
+    return _mapped(partial(_terms_of_pose, surface))(poses, observed, max_error)
 
 
 @partial(_compare.defjvp, symbolic_zeros=True)
@@ -123,7 +123,7 @@ def _compare_jvp(surface, primals, tangents):
     poses_dot, observed_dot, max_error_dot = tangents
     if not isinstance(observed_dot, SymbolicZero):
         raise ValueError("observed is data: depth terms have no derivative in it; wrap it in jax.lax.stop_gradient.")
-    terms, gradient, saturated = _mapped(partial(_gradient_of_pose, surface), COARSE)(*primals)
+    terms, gradient, saturated = _mapped(partial(_gradient_of_pose, surface))(*primals)
     change = jnp.zeros_like(terms.absolute_sum)
     if not isinstance(poses_dot.coefficients, SymbolicZero):
         change += jnp.sum(gradient * poses_dot.coefficients, axis=(1, 2))
@@ -133,13 +133,13 @@ def _compare_jvp(surface, primals, tangents):
     return terms, zeros._replace(absolute_sum=change)
 
 
-def _mapped(of_one, sides):
+def _mapped(of_one):
     """`of_one((parts, plan), frame)` for the poses along the leading axis; under `vmap` the new axis joins that one."""
 
     @custom_vmap
     def mapped(poses, observed, max_error):
         few = poses.box.shape[0] < _FEW_POSES
-        plan = plan_windows(poses.box, observed.shape, COARSE if few else sides) if poses_in_turn() else None
+        plan = plan_windows(poses.box, observed.shape, COARSE if few else FINE) if poses_in_turn() else None
         return map_poses(of_one, (poses, plan), _frame(observed, max_error), observed.size)
 
     @mapped.def_vmap

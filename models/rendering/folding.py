@@ -1,6 +1,7 @@
 """Folding the parts of one pose into one image, each within its window."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxfilters.models.rendering.parts import Parts, Surface
 from jaxfilters.models.rendering.windows import Plan, Window
 
+_PIECES = 8
+"""Pieces of a part whose gradients are computed at once: what bounds the memory of parts with many faces."""
 Turn = Callable[..., Array]
 """`(part, window, start, x, y, image) -> image` with one part drawn in the window that begins at (row, column)."""
 
@@ -82,24 +85,39 @@ def pull_back(
     winner: Int[Array, "rows cols"],
     cotangent: Float[Array, "rows cols"],
 ) -> Float[Array, "k c"]:
-    """The transpose of the derivative of `smooth_inverse`, by sums over windows: scatters are serial on CPUs."""
+    """The transpose of the derivative of `smooth_inverse`, by sums over windows: scatters are serial on CPUs.
+
+    The gradient in the coefficients of a polynomial in (x, y) is the moments of an image of slopes: a product of small
+    matrices for each polynomial, however many coefficients it has.
+    """
     rows, to_coefficients = jax.vjp(surface.rows, parts.coefficients)
-    directions = jnp.eye(rows.shape[2], dtype=rows.dtype)
+    constants = jnp.eye(rows.shape[2], dtype=rows.dtype)[::3][: 1 + surface.has_root]
 
     def turn(part, window, start, x, y, gradient):
         observed, weight = cut(winner, start, window), cut(cotangent, start, window)
 
         def of_piece(piece):
             index, row = piece
-            slopes = [jax.jvp(lambda r: surface.smooth(r, x, y), (row,), (along,))[1] for along in directions]
             mine = jnp.where(observed == part * rows.shape[1] + index, weight, 0.0)
-            slopes = jnp.stack([jnp.broadcast_to(slope, window).reshape(-1) for slope in slopes])
-            return jnp.dot(slopes, mine.reshape(-1), precision=jax.lax.Precision.HIGHEST)
+            slopes = [jax.jvp(lambda r: surface.smooth(r, x, y), (row,), (constant,))[1] for constant in constants]
+            # Images of the two polynomials stay apart: XLA computes a stack of both element by element.
+            affine, *under_root = [_moments(mine * slope, x[0], y[:, 0]) for slope in slopes]
+            return jnp.concatenate([affine[:3], *under_root])
 
         pieces = jnp.arange(rows.shape[1], dtype=jnp.int32), rows[part]
-        return jax.lax.dynamic_update_index_in_dim(gradient, jax.lax.map(of_piece, pieces), part, 0)
+        moments = jax.lax.map(of_piece, pieces, batch_size=min(rows.shape[1], _PIECES))
+        return jax.lax.dynamic_update_index_in_dim(gradient, moments, part, 0)
 
     return to_coefficients(over_parts(parts, plan, winner.shape, turn, jnp.zeros_like(rows)))[0]
+
+
+def _moments(
+    image: Float[Array, "rows cols"], x: Float[Array, " cols"], y: Float[Array, " rows"]
+) -> Float[Array, " 6"]:
+    """Sums of the image times 1, x, y, x^2, x y and y^2."""
+    X, Y = (jnp.stack([jnp.ones_like(z), z, z * z]) for z in (x, y))
+    product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    return product("ir,rj->ij", Y, product("rc,jc->rj", image, X))[[0, 0, 1, 0, 1, 2], [0, 1, 0, 2, 1, 0]]
 
 
 def cut(image: Array, start: Int[Array, " 2"], window: Window) -> Array:

@@ -36,7 +36,13 @@ class Surface(NamedTuple):
     rows: Callable[[Array], Array]
     """`(coefficients (k, c)) -> (k, pieces, r)`: the coefficients that the pieces' smooth functions need."""
     smooth: Callable[..., Array]
-    """`(row (r, *pixels), x, y) -> w` of a piece known to be hit: what is differentiated."""
+    """`(row (r, *pixels), x, y) -> w` of a piece known to be hit: what is differentiated.
+
+    It is the polynomial `r0 + r1 x + r2 y`, plus, with `has_root`, the root of
+    `r3 + r4 x + r5 y + r6 x^2 + r7 x y + r8 y^2`.
+    """
+    has_root: bool
+    """Whether rows have nine coefficients, or three."""
 
 
 def anchor_of(camera: Pinhole, box: Float[Array, "*parts 4"]) -> Float[Array, "*parts 2"]:

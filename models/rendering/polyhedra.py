@@ -84,5 +84,6 @@ CONVEX = Surface(
     pieces=_pieces,
     rows=lambda coefficients: coefficients.reshape(len(coefficients), -1, 6)[..., :3],
     smooth=_affine,
+    has_root=False,
 )
 """One piece a face."""

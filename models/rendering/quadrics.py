@@ -171,6 +171,7 @@ CAPSULE = Surface(
     pieces=_capsule_pieces,
     rows=lambda coefficients: coefficients[:, :27].reshape(-1, 3, 9),
     smooth=_nearer_root,
+    has_root=True,
 )
 """Side, cap at the start, cap at the end."""
 
@@ -179,4 +180,5 @@ ELLIPSOID = Surface(
     pieces=lambda coefficients, x, y: [_nearer_root(coefficients, x, y)],
     rows=lambda coefficients: coefficients[:, None],
     smooth=_nearer_root,
+    has_root=True,
 )

@@ -77,5 +77,6 @@ TRIANGLES = Surface(
     pieces=_pieces,
     rows=lambda coefficients: coefficients.reshape(len(coefficients), _CLUSTER, -1)[..., :3],
     smooth=_affine,
+    has_root=False,
 )
 """One piece a triangle."""
