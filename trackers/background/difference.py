@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from jaxfilters.trackers.background.reflection import reflected_share, strongest_above
+from jaxfilters.trackers.background.reflection import enlarged, reflected_share, strongest_above
 
 NOISE_STEPS = 16
 """Steps of the noise to one level of brightness."""
@@ -20,8 +20,8 @@ SHADOW_CHROMATICITY = 0.02
 """Largest change of red / (red + green + blue), or of green or blue, within a shadow."""
 _REFLECTIONS, _MOST_MIRRORED = 2.0, 0.5
 """Median reflections that are no foreground, and what is more than a reflection in any case."""
-_SHADOW_COLS = 640
-"""Columns in which shadows are looked for, at least: in larger images they are larger as well."""
+_COARSE_COLS = 640
+"""Columns in which shadows and reflections are looked for, at least: in larger images they are larger as well."""
 _SHADOW_SIDE = 5
 """Pixels: shadows are at least as wide everywhere; the edges of dark clothes, which look alike, are not."""
 
@@ -117,11 +117,12 @@ class Difference:
         if not self.mirrors:
             return self._threshold
         share = min(_REFLECTIONS * self.reflection, _MOST_MIRRORED)
-        return cv2.max(self._threshold, cv2.convertScaleAbs(strongest_above(self._smooth), alpha=share))
+        mirrored = strongest_above(self._smooth, every=every_px(self._smooth))
+        return cv2.max(self._threshold, cv2.convertScaleAbs(mirrored, alpha=share))
 
     def _set_threshold(self) -> None:
         levels = cv2.convertScaleAbs(self.noise, alpha=self._spread * _MAD_TO_STD / NOISE_STEPS)
-        self._threshold = np.maximum(levels, np.uint8(round(self._least)))
+        self._threshold = cv2.max(levels, round(self._least))
 
     def _checked(self, image: np.ndarray) -> np.ndarray:
         if self.background is None:
@@ -135,7 +136,7 @@ class Difference:
     def _weaken_shadows(self, image: np.ndarray, probability: np.ndarray) -> None:
         """Only what differs at all is looked at, a few percent of an image; of large images not every pixel."""
         assert self.background is not None
-        every = max(1, image.shape[1] // _SHADOW_COLS)
+        every = every_px(image)
         ratio = np.ascontiguousarray(self._ratio[::every, ::every])
         found = cv2.findNonZero(cv2.inRange(ratio, _AT_THRESHOLD * 3 // 4, 255))
         if found is None:
@@ -145,11 +146,17 @@ class Difference:
         mask: np.ndarray = np.zeros(ratio.shape, np.uint8)
         mask[rows, cols] = is_shadow(_colors(image, places), _colors(self.background, places))
         mask = wide(mask, -(-_SHADOW_SIDE // every) | 1)
-        if every > 1:
-            mask = cv2.resize(mask, image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         u, v, width, height = cv2.boundingRect(mask)
-        shadow, within = mask[v : v + height, u : u + width] > 0, probability[v : v + height, u : u + width]
-        np.minimum(within, np.float32(self._shadow_probability), out=within, where=shadow)
+        if not width:
+            return
+        within = probability[every * v : every * (v + height), every * u : every * (u + width)]
+        shadow = enlarged(mask[v : v + height, u : u + width], every, within.shape)
+        cv2.copyTo(np.minimum(within, np.float32(self._shadow_probability)), shadow, within)
+
+
+def every_px(image: np.ndarray) -> int:
+    """The distance of the pixels (rows, cols[, channels]) at which shadows and reflections are looked for."""
+    return max(1, image.shape[1] // _COARSE_COLS)
 
 
 def logistic_table() -> np.ndarray:

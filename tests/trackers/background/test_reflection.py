@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter, maximum_filter1d
 
 from jaxfilters.trackers.background.median import MedianBackground
-from jaxfilters.trackers.background.reflection import REACH, reflected_share, strongest_above
+from jaxfilters.trackers.background.reflection import REACH, enlarged, reflected_share, strongest_above
 
 AT = np.random.default_rng(0)
 ROOM = AT.integers(150, 190, (280, 200, 3)).astype(np.uint8)
@@ -65,3 +65,16 @@ def test_the_strongest_above_is_that_of_the_columns_beside():
     for row in (0, 5, 30, 69):
         expected = beside[max(0, row - up) : row + 4].max(axis=0)
         np.testing.assert_array_equal(strongest_above(differences)[row], expected)
+
+
+def test_the_strongest_above_in_squares_is_never_less_and_off_by_two_at_most():
+    differences = AT.integers(0, 255, (70, 41), np.uint8)
+    for every in (2, 3):
+        found, exact = (strongest_above(differences, every=size) for size in (every, 1))
+        assert np.all(found >= exact)
+        assert np.all(found <= maximum_filter(exact, 4 * (every - 1) + 1, mode="constant"))
+
+
+def test_an_enlarged_image_repeats_each_pixel():
+    coarse = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    np.testing.assert_array_equal(enlarged(coarse, 3, (8, 11)), np.kron(coarse, np.ones((3, 3), np.uint8))[:8, :11])
