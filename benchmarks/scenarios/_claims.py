@@ -109,13 +109,13 @@ def metrics_of(claims: Claims, scores: Scores) -> dict[str, Metric]:
     return found
 
 
-def table(judged: list[tuple[Claims, Scores]]) -> str:
+def table(evaluated: list[tuple[Claims, Scores]]) -> str:
     """One line a coordinate, and above those of a system what is of all its coordinates."""
     header = ("coordinate", "1 sigma %", "2 sigma %", "95 % interval", "3 sigma %", "autocorr.", "sharpness", "crps")
-    rows = [row for claims, scores in judged for row in _by_coordinate(claims, scores)]
+    rows = [row for claims, scores in evaluated for row in _by_coordinate(claims, scores)]
     head, line, *lines = aligned([header, *rows], numbers=range(1, 8)).splitlines()
     shown = [head, line]
-    for claims, scores in judged:
+    for claims, scores in evaluated:
         low, high = scores.nees_band
         count = len(claims.coordinates)
         shown += [

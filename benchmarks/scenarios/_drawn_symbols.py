@@ -60,8 +60,8 @@ def drawn_metrics(scale: Scale, seed: int) -> dict[str, Metric]:
     return metrics
 
 
-def scored(names: tuple[str, ...], judged: Recognition, drawings: Tracked) -> list[float]:
+def scored(names: tuple[str, ...], evaluated: Recognition, drawings: Tracked) -> list[float]:
     """Percent of a person's symbols that are right, of those with one finger and of those with two."""
     labels = np.array(drawings.labels)
-    right = np.array([*names, ""])[judged.label] == labels
+    right = np.array([*names, ""])[evaluated.label] == labels
     return [100 * float(right[np.char.endswith(labels, fingers)].mean()) for fingers in ("1", "2")]

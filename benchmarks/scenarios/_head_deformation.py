@@ -67,11 +67,11 @@ class Schedule(NamedTuple):
 def deformation_metrics(seeds: range, schedule: Schedule, out: Path | None) -> dict[str, Metric]:
     """Section 5.2; the expressions of the first face also at the amplitude at which they hardly hurt (`mild`)."""
     runs = deforming_runs(seeds, schedule, AMPLITUDE, schedule.trackers)
-    metrics = judged("", runs, schedule)
+    metrics = evaluated("", runs, schedule)
     if out is not None:
         plot(out / "deformation.png", runs, schedule)
     modern = {name: schedule.trackers[name] for name in ("rigid", "deformable")}
-    return metrics | judged("mild_", deforming_runs(seeds[:1], schedule, MILD_AMPLITUDE, modern), schedule)
+    return metrics | evaluated("mild_", deforming_runs(seeds[:1], schedule, MILD_AMPLITUDE, modern), schedule)
 
 
 def deforming_runs(
@@ -94,7 +94,7 @@ def deforming_runs(
     return runs
 
 
-def judged(prefix: str, runs: dict[str, list[HeadRun]], schedule: Schedule) -> dict[str, Metric]:
+def evaluated(prefix: str, runs: dict[str, list[HeadRun]], schedule: Schedule) -> dict[str, Metric]:
     """Errors of every tracker in both phases, and those of deformable models over those of rigid ones."""
     metrics: dict[str, Metric] = {}
     for phase, frames in schedule.phases.items():

@@ -115,7 +115,7 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
             for i, image in enumerate(images[:, 0], start)
         ]
     pose, std = np.concatenate(poses), np.concatenate(stds)
-    return _judged(made, pose, std, np.isin(np.concatenate(status), TRACKED), np.stack(located))
+    return _evaluated(made, pose, std, np.isin(np.concatenate(status), TRACKED), np.stack(located))
 
 
 def pnp(
@@ -165,7 +165,7 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
     return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
 
 
-def _judged(
+def _evaluated(
     made: IctSequence,
     pose: Float[np.ndarray, "t 6"],
     std: Float[np.ndarray, "t 6"],

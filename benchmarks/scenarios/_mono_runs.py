@@ -138,10 +138,10 @@ def follow_all(made: FaceSequence | IctSequence, contenders: Mapping[str, Conten
         for name, session in sessions.items():
             tracks[name].append(session.process(images, made.times[start : start + len(images)]))
     joined = {name: jax.tree.map(lambda *rows: np.concatenate(rows), *parts) for name, parts in tracks.items()}
-    return {name: judged(track, made) for name, track in joined.items()}
+    return {name: evaluated(track, made) for name, track in joined.items()}
 
 
-def judged(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:
+def evaluated(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:
     """A track beside the truth, without the frames up to the start."""
     first = START_FRAMES[-1] + 1
     track = jax.tree.map(lambda leaf: leaf[first:], track)

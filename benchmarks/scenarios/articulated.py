@@ -50,7 +50,7 @@ def paper_metrics(seeds: range) -> dict[str, Metric]:
     for mode in paper.FILTERS:
         for shape in SHAPES:
             runs = paper.run_paper(mode, shape, seeds)
-            found = _judged(runs)
+            found = _evaluated(runs)
             final[mode, shape] = found.pop("final_r13_px")
             _say(f"  {mode:14} shape {shape}: " + "  ".join(f"{name} {value:.3g}" for name, value in found.items()))
             for name, value in found.items():
@@ -65,7 +65,7 @@ def paper_metrics(seeds: range) -> dict[str, Metric]:
     return metrics
 
 
-def _judged(runs: paper.Runs) -> dict[str, float]:
+def _evaluated(runs: paper.Runs) -> dict[str, float]:
     lost = paper.diverged(runs)
     r13 = runs.means[:, -1, paper.R13]
     finite = np.where(np.isfinite(r13), r13, 0.0)

@@ -32,7 +32,7 @@ from jaxfilters.benchmarks.scenarios._drawn_symbols import FULL, QUICK, drawn_me
 from jaxfilters.benchmarks.scenarios._sfinge import sfinge_metrics
 from jaxfilters.benchmarks.scenarios._simplest import nearest_by_warping
 from jaxfilters.models.gesture.calibration import calibration_error
-from jaxfilters.models.gesture.learning import accuracy, judged, leave_one_out, shown_of_others
+from jaxfilters.models.gesture.learning import accuracy, evaluated, leave_one_out, shown_of_others
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes
 
@@ -80,7 +80,7 @@ def recorded_metrics(name: str, *, quick: bool) -> dict[str, Metric]:
     except InputError as error:
         raise RecordingError(str(error)) from None
     people = sorted(set(recorded.people))[: QUICK_PEOPLE if quick else None]
-    found = judged(leave_one_out(recorded.strokes, recorded.labels, recorded.people, most=most, left_out=people))
+    found = evaluated(leave_one_out(recorded.strokes, recorded.labels, recorded.people, most=most, left_out=people))
     right, confidence, beyond = (
         np.concatenate([getattr(one, field) for one in found]) for field in ("right", "confidence", "beyond")
     )

@@ -140,12 +140,11 @@ def occlusion_metrics(seeds: range, num_frames: int, clean: Runs) -> dict[str, M
             found[suffix].append(judge_occlusion(one, level))
     metrics: dict[str, Metric] = {}
     units = {**dict(zip(AXES, AXIS_UNITS, strict=True)), "frames": "frames"}
-    for suffix, judged in found.items():
-        for name in judged[0]:
-            worst = max(one[name] for one in judged)
-            unit = units.get(name.rpartition("_")[2], "")
-            metrics[f"{name}{suffix}"] = Metric(worst, unit, "lower")
-        _say(f"  occlusion {suffix[1:]:12} " + "  ".join(f"{n} {max(o[n] for o in judged):.3g}" for n in judged[0]))
+    for suffix, evaluated in found.items():
+        worst = {name: max(one[name] for one in evaluated) for name in evaluated[0]}
+        for name, value in worst.items():
+            metrics[f"{name}{suffix}"] = Metric(value, units.get(name.rpartition("_")[2], ""), "lower")
+        _say(f"  occlusion {suffix[1:]:12} " + "  ".join(f"{name} {value:.3g}" for name, value in worst.items()))
     return metrics
 
 

@@ -54,7 +54,7 @@ SETTLED = 30
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Run all systems, print the table, return its numbers."""
-    judged, metrics = [], dict[str, Metric]()
+    evaluated, metrics = [], dict[str, Metric]()
     for name, claims_of in SYSTEMS.items():
         try:
             found = claims_of(quick, seed)
@@ -66,11 +66,11 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
             sys.stderr.write(f"  left out: {name} (it claims nothing on this data)\n")
             continue
         sys.stderr.write(f"  {name}: within 2 sigma {np.round(100 * scores.coverage[1])} %\n")
-        judged.append((found, scores))
+        evaluated.append((found, scores))
         metrics |= metrics_of(found, scores)
         if out is not None:
             draw_calibration(out, found, scores)
-    sys.stderr.write(f"{table(judged)}\n")
+    sys.stderr.write(f"{table(evaluated)}\n")
     return metrics
 
 
@@ -168,12 +168,12 @@ def keypoint_claims(model: str, quick: bool, seed: int) -> Claims:
     half = len(points.truth) // 2
     end = half + QUICK_KEYPOINT_FRAMES if quick else None
     constants = _keypoint_filters.constants_of(Keypoints(points.detected[:half], points.truth[:half]))
-    judged = slice(half, end)
+    evaluated = slice(half, end)
     found = _keypoint_filters.filtered(
-        _keypoint_filters.filters_of(constants)[model], jnp.asarray(points.detected[judged], jnp.float32)
+        _keypoint_filters.filters_of(constants)[model], jnp.asarray(points.detected[evaluated], jnp.float32)
     )
     mean, std = (np.asarray(values, float)[SETTLED:] for values in found)
-    errors = mean - points.truth[judged][SETTLED:]
+    errors = mean - points.truth[evaluated][SETTLED:]
     joints = range(0, errors.shape[1], 2)
     recordings = [Recording(errors[:, i : i + 2], std[:, i : i + 2]) for i in joints]
     return Claims(f"keypoints_{model}", "nyu", ("x_mm", "y_mm"), recordings)

@@ -46,11 +46,11 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     session.prime([video.sample(PRIMING_IMAGES)])
     for time_s, image in itertools.islice(video.images(), QUICK_FRAMES if quick else None):
         session.process([image], time_s)
-    rows = [(one.frame, who, *one.mean[:2]) for who, track in session.tracks.smoothed().items() for one in track]
+    rows = [(one.frame, identity, *one.mean[:2]) for identity, track in session.tracks.smoothed().items() for one in track]
     table = np.array(rows, float).reshape(-1, 4)
     found = floor_tracks(table[:, 0], table[:, 1], table[:, 2:])
-    judged = true.frame < session.tracks.frames
-    return _scores(FloorTracks(*(rows[judged] for rows in true)), found, np.asarray(camera.position())[:2])
+    evaluated = true.frame < session.tracks.frames
+    return _scores(FloorTracks(*(rows[evaluated] for rows in true)), found, np.asarray(camera.position())[:2])
 
 
 def corridor_camera(path: Path, shape: tuple[int, int]) -> FloorCamera:

@@ -167,8 +167,8 @@ def symbol_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         other = tracked(drawn(seed + 1 + writer, 1 if quick else 5))
         ones = [i for i, label in enumerate(other.labels) if label.endswith("1")]
         truth = [other.labels[i] for i in ones]
-        judged = recognise_paths(model, [other.paths[i] for i in ones], margin=-np.inf)
-        ours = np.array([*model.names, ""])[judged.label]
+        evaluated = recognise_paths(model, [other.paths[i] for i in ones], margin=-np.inf)
+        ours = np.array([*model.names, ""])[evaluated.label]
         near = simplest.nearest_by_warping(known, labels, [other.paths[i][0] for i in ones])
         right[""].append(100 * float(np.mean(ours == truth)))
         right["_simple"].append(100 * float(np.mean(np.array(near) == truth)))

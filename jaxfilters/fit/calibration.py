@@ -158,7 +158,7 @@ def calibrate(
         mask = data.mask & (jnp.arange(count) != left_out)
         thetas.append(maximize(density(mask), fit.theta, constraints, method=method).theta)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *thetas)
-    folds = _judged(filter_of, believed, key, stacked, data)
+    folds = _evaluated(filter_of, believed, key, stacked, data)
     return _summary(key, fit, num_draws, folds, data)
 
 
@@ -293,7 +293,7 @@ class _Folds(NamedTuple):
 
 
 @jax.jit
-def _judged(filter_of: Callable, believed: Callable | None, key: AnyKey, thetas: PyTree, data: _Data) -> _Folds:
+def _evaluated(filter_of: Callable, believed: Callable | None, key: AnyKey, thetas: PyTree, data: _Data) -> _Folds:
     def one(theta: PyTree, observations: PyTree, inputs: PyTree, mask: Array, truth: Any) -> _Folds:
         filter = filter_of(theta)
         _, (states, infos) = filters.run(filter, key, observations, inputs, mask=mask)

@@ -39,7 +39,7 @@ class LeftOut(NamedTuple):
     scores: Scores
 
 
-class Judged(NamedTuple):
+class Evaluated(NamedTuple):
     """The same with confidences and margins that were fitted to the other people's scores."""
 
     person: str
@@ -138,31 +138,31 @@ def leave_one_out(
     Raises:
         ValueError: If there are fewer than two people.
     """
-    named, who = np.asarray(labels), np.asarray(people)
+    named, drawn_by = np.asarray(labels), np.asarray(people)
     everybody = sorted(set(people))
     if len(everybody) < 2:
         raise ValueError(f"people must be two or more; got {everybody}.")
     found = []
     for person in everybody if left_out is None else left_out:
-        shown = shown_of_others(named, who, person, most)
-        scores = _scores(strokes, named, shown, np.flatnonzero(who == person), num_states, num_variants)
+        shown = shown_of_others(named, drawn_by, person, most)
+        scores = _scores(strokes, named, shown, np.flatnonzero(drawn_by == person), num_states, num_variants)
         found.append(LeftOut(person, scores))
     return found
 
 
-def shown_of_others(labels: np.ndarray, who: np.ndarray, person: str, most: int | None) -> np.ndarray:
+def shown_of_others(labels: np.ndarray, drawn_by: np.ndarray, person: str, most: int | None) -> np.ndarray:
     """Indices of the training set where one person is left out.
 
     Args:
         labels: The symbol of each stroke.
-        who: Who drew each.
+        drawn_by: Who drew each.
         person: Who is left out.
         most: Examples of a symbol that are used of one person, drawn at random but always the same; `None` is all.
     """
     rng = np.random.default_rng(0)
     groups = [
-        rng.permutation(np.flatnonzero((who == other) & (labels == label)))[:most]
-        for other in np.unique(who[who != person])
+        rng.permutation(np.flatnonzero((drawn_by == other) & (labels == label)))[:most]
+        for other in np.unique(drawn_by[drawn_by != person])
         for label in np.unique(labels)
     ]
     return np.concatenate(groups)
@@ -199,9 +199,9 @@ def cross_scores(
 
     Arguments are those of `leave_one_out`.
     """
-    named, who = np.asarray(labels), np.unique(np.asarray(people), return_inverse=True)[1]
-    parts = who
-    if not who.max():
+    named, drawn_by = np.asarray(labels), np.unique(np.asarray(people), return_inverse=True)[1]
+    parts = drawn_by
+    if not drawn_by.max():
         parts = np.zeros(len(named), int)
         for name in np.unique(named):
             parts[named == name] = np.arange(np.sum(named == name))
@@ -235,7 +235,7 @@ def calibrated(symbols: Symbols, scores: Scores) -> Symbols:
     return replace(symbols, sharpness=found.sharpness, lapse=found.lapse, margins=margins)
 
 
-def judged(found: Sequence[LeftOut]) -> list[Judged]:
+def evaluated(found: Sequence[LeftOut]) -> list[Evaluated]:
     """Every person's strokes, with confidences and margins fitted to those of the other people."""
     rows = []
     for one in found:
@@ -245,13 +245,13 @@ def judged(found: Sequence[LeftOut]) -> list[Judged]:
         share, lapse = (fitted.sharpness, fitted.lapse) if fitted else (SHARPNESS, 0.0)
         margins = fitted.margins if fitted else np.zeros(len(one.scores.log_likelihood))
         confidence = calibration.confidences(one.scores, share, lapse)
-        rows.append(Judged(one.person, one.scores.is_right, confidence, one.scores.lead - margins[one.scores.best]))
+        rows.append(Evaluated(one.person, one.scores.is_right, confidence, one.scores.lead - margins[one.scores.best]))
     return rows
 
 
-def accuracy(found: Sequence[Judged | LeftOut]) -> float:
+def accuracy(found: Sequence[Evaluated | LeftOut]) -> float:
     """Share of all strokes, in percent, whose best symbol is theirs."""
-    right = np.concatenate([one.right if isinstance(one, Judged) else one.scores.is_right for one in found])
+    right = np.concatenate([one.right if isinstance(one, Evaluated) else one.scores.is_right for one in found])
     return 100 * float(right.mean())
 
 

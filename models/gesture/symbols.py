@@ -210,7 +210,7 @@ def recognise_all(
     )
     lengths = np.pad(lengths, (0, missing))
     parts = [
-        _judged(
+        _evaluated(
             symbols,
             jax.tree.map(lambda leaf, i=i: leaf[..., i : i + chunk], filled),
             lengths[i : i + chunk],
@@ -223,7 +223,7 @@ def recognise_all(
 
 
 @jax.jit
-def _judged(symbols, observations, lengths, margin, distance):
+def _evaluated(symbols, observations, lengths, margin, distance):
     observed = _observed(symbols, observations)
     bar = threshold_log_likelihood(symbols.models, observed, lengths)
     return _decided(symbols, observed, bar, lengths, margin, distance, None)

@@ -58,7 +58,7 @@ NUM_REGISTERED, NUM_FINALISTS = 56, 6
 """Hypotheses that are registered with the middle one of the sizes, and of these with every size."""
 NUM_REPEATED = 2
 """Finalists that are registered with every size once more: the first time they start where the middle size has led."""
-REGISTRATION_STRIDE, JUDGING_STRIDE = 4, 2
+REGISTRATION_STRIDE, SCORING_STRIDE = 4, 2
 """Every how many pixels of the window one is used; coarser pixels mistake the back of a hand for its palm."""
 MAX_ERROR = 0.05
 """Metres that one pixel costs at most."""
@@ -304,7 +304,7 @@ def _refine_batch(
 def _refine_each(batch: Hypotheses, shared: tuple) -> tuple[Float[Array, "h 22"], Float[Array, " h"]]:
     camera, near, geometry, widths, num_steps = shared
     coarse_camera, coarse = _every(REGISTRATION_STRIDE, camera, near)
-    judging_camera, judged = _every(JUDGING_STRIDE, camera, near)
+    scoring_camera, evaluated = _every(SCORING_STRIDE, camera, near)
     root = jnp.diag(per_coordinate(0.06, 0.6, 0.6))
 
     def refine(pose: Array, scale: Array, side: Array) -> tuple[Array, Array]:
@@ -315,7 +315,7 @@ def _refine_each(batch: Hypotheses, shared: tuple) -> tuple[Float[Array, "h 22"]
             return gauss_newton(coarse_camera, target, hand, at, PosePrior(pose, root), widths[i], REGISTRATION)[0]
 
         found = jax.lax.fori_loop(0, num_steps, step, pose)
-        return found, explained(judging_camera, judged, forward_kinematics(found, hand), found, scale)
+        return found, explained(scoring_camera, evaluated, forward_kinematics(found, hand), found, scale)
 
     return jax.vmap(refine)(*map(jnp.asarray, batch))
 

@@ -96,16 +96,16 @@ def room_image(
     """
     depths = jax.lax.map(lambda one: render_ellipsoids(camera.pinhole, body(one), camera.T_camera_world), people)
     depths = jnp.where(here[:, None, None], depths, jnp.inf)
-    who, nearest = jnp.argmin(depths, axis=0), jnp.min(depths, axis=0)
+    visible_person, nearest = jnp.argmin(depths, axis=0), jnp.min(depths, axis=0)
     observed = nearest < camera.furniture
     rays, origin = _world_rays(camera)
     height = origin[2] + jnp.where(observed, nearest, 1.0) * rays[..., 2]
-    share = height / people.height[who]
-    cloth = jnp.where((share > LEGS)[..., None], clothes[who, 0], clothes[who, 1])
+    share = height / people.height[visible_person]
+    cloth = jnp.where((share > LEGS)[..., None], clothes[visible_person, 0], clothes[visible_person, 1])
     color = jnp.where((share > NECK)[..., None], jnp.array(SKIN), cloth)
     lit = camera.empty * _light(camera, rays, origin, people, here)[..., None]
     image = jnp.where(observed[..., None], color, lit) + NOISE_STD * jax.random.normal(key, (*camera.shape, 3))
-    return jnp.clip(jnp.round(image), 0, 255).astype(jnp.uint8), jnp.where(observed, who, -1)
+    return jnp.clip(jnp.round(image), 0, 255).astype(jnp.uint8), jnp.where(observed, visible_person, -1)
 
 
 def _world_rays(camera: RoomCamera):

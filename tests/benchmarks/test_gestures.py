@@ -36,9 +36,9 @@ def test_without_recordings_only_what_is_drawn_is_measured(two_shapes, monkeypat
 
 
 def test_a_symbol_is_right_if_shape_and_fingers_are_and_wrong_if_rejected():
-    judged = Recognition(np.array([0, -1, 1, 0]), np.ones((2, 4)), np.ones((2, 4)), np.ones(4))
+    evaluated = Recognition(np.array([0, -1, 1, 0]), np.ones((2, 4)), np.ones((2, 4)), np.ones(4))
     drawings = Tracked([], [], ("V 1", "V 1", "V 2", "V 2"))
-    assert scored(("V 1", "V 2"), judged, drawings) == [50, 50]
+    assert scored(("V 1", "V 2"), evaluated, drawings) == [50, 50]
 
 
 @pytest.mark.system

@@ -128,13 +128,13 @@ def test_recovery_is_when_the_errors_of_the_next_frames_are_the_usual_ones():
     errors[200:229] = 2.0  # frames 201 to 229: covered until 230
     errors[229:236, 5] = 2.0  # frames 230 to 236; of 15 frames' errors, one of 2.0 is allowed: 4 / 15 < 0.7^2 < 8 / 15
     errors[310, 2] = 5.0
-    judged = head_stereo.judge_occlusion(fake_run(errors), np.full(6, 0.1))
-    assert judged["recovery_frames"] == 6
-    assert judged["occlusion_peak_x"] == pytest.approx(2)
-    assert judged["dimming_peak_z"] == pytest.approx(5)
-    assert judged["dimming_peak_x"] == pytest.approx(0.1)
-    assert judged["after_occlusion_to_allowed"] == pytest.approx(0.1 / 0.7)
-    assert judged["occlusion_lost_share"] == 0
+    evaluated = head_stereo.judge_occlusion(fake_run(errors), np.full(6, 0.1))
+    assert evaluated["recovery_frames"] == 6
+    assert evaluated["occlusion_peak_x"] == pytest.approx(2)
+    assert evaluated["dimming_peak_z"] == pytest.approx(5)
+    assert evaluated["dimming_peak_x"] == pytest.approx(0.1)
+    assert evaluated["after_occlusion_to_allowed"] == pytest.approx(0.1 / 0.7)
+    assert evaluated["occlusion_lost_share"] == 0
     errors[240:] = ASTRAY
     never = head_stereo.judge_occlusion(fake_run(errors), np.full(6, 0.1))
     assert never["recovery_frames"] == np.inf
@@ -150,7 +150,7 @@ def test_deformation_is_judged_in_the_frames_in_which_it_is():
     far[119:, 5] = near[119:, 5] = 0.5
     learned = fake_run(near, shapes=shapes, contributions=(0.1, 0.2, 0.9, 0.9, 0.9))
     of = {"rigid": [fake_run(far, shapes=shapes)], "deformable": [learned]}
-    metrics = {name: metric.value for name, metric in deformation.judged("", of, schedule).items()}
+    metrics = {name: metric.value for name, metric in deformation.evaluated("", of, schedule).items()}
     assert metrics["deforming_rmse_pitch_rigid"] == pytest.approx(4)
     assert metrics["deforming_ratio_to_rigid_rmse_pitch"] == pytest.approx(0.25)
     assert metrics["afterwards_ratio_to_rigid_rmse_pitch"] == pytest.approx(1)

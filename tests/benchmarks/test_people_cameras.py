@@ -113,11 +113,11 @@ def test_peaks_of_the_published_method_are_looked_for_among_the_tracks(data_dir,
     tracks[empty] = np.zeros((0, 2))
     monkeypatch.setattr(_pom, "follow", lambda folder: tracks)
     value = {name: metric.value for name, metric in _pom.pom_metrics(folder).items()}
-    judged = [len(peaks.get(i, [])) for i in _pom.FRAMES[_pom.START_UP_FRAMES :]]
-    assert value["pom_agreement"] == pytest.approx(1 - len(peaks[empty]) / sum(judged))
+    evaluated = [len(peaks.get(i, [])) for i in _pom.FRAMES[_pom.START_UP_FRAMES :]]
+    assert value["pom_agreement"] == pytest.approx(1 - len(peaks[empty]) / sum(evaluated))
     assert value["pom_distance_m"] == pytest.approx(0.1)
-    assert value["pom_peaks_per_frame"] == pytest.approx(np.mean(judged))
-    assert value["pom_tracks_per_frame"] == pytest.approx(np.mean(judged) - len(peaks[empty]) / len(judged))
+    assert value["pom_peaks_per_frame"] == pytest.approx(np.mean(evaluated))
+    assert value["pom_tracks_per_frame"] == pytest.approx(np.mean(evaluated) - len(peaks[empty]) / len(evaluated))
 
 
 @pytest.mark.data

@@ -11,12 +11,12 @@ import numpy as np
 from jaxfilters.models.gesture.calibration import calibration_error
 from jaxfilters.models.gesture.coded import codes_of, recognise_each
 from jaxfilters.models.gesture.learning import (
-    Judged,
+    Evaluated,
     LeftOut,
     accuracy,
     calibrated,
     cross_calibrated,
-    judged,
+    evaluated,
     learn_strokes,
     leave_one_out,
     together,
@@ -79,7 +79,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
         if options.held_out:
             found = _held_out(examples, options.states, ways)
             trained = as_input_error(lambda: calibrated(trained, together([one.scores for one in found])))
-            lines = _of_held_out(judged(found))
+            lines = _of_held_out(evaluated(found))
         elif options.data:
             drawings = (examples.strokes, examples.labels, examples.people)
             trained = as_input_error(lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=ways))
@@ -109,7 +109,7 @@ def recognise(options: argparse.Namespace) -> str:
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
     strokes = _to_recognise(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
-    found = as_input_error(lambda: _judged(file, strokes, options.margin))
+    found = as_input_error(lambda: _evaluated(file, strokes, options.margin))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
         _write(options.out, rows)
@@ -171,7 +171,7 @@ def _drawn(num_writers: int, num_trials: int, seed: int) -> StrokeSet:
     return StrokeSet(tuple(strokes), ids, tuple(labels), tuple(people), 2)
 
 
-def _judged(file: SymbolsFile, strokes: StrokeSet, margin: float) -> Recognition:
+def _evaluated(file: SymbolsFile, strokes: StrokeSet, margin: float) -> Recognition:
     if file.dimensions:
         return recognise_all(file.symbols, to_judge(strokes.strokes, file.dimensions), margin=margin)
     if strokes.dimensions != 2:
@@ -219,7 +219,7 @@ def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list
     )
 
 
-def _of_held_out(found: list[Judged]) -> list[str]:
+def _of_held_out(found: list[Evaluated]) -> list[str]:
     """What `recognise` does with strokes of people whom a model does not know, for several margins."""
     right, confidence, beyond = (
         np.concatenate([getattr(one, name) for one in found]) for name in ("right", "confidence", "beyond")

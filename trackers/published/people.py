@@ -134,7 +134,7 @@ def paper_step(scene: PaperScene, state: PaperState, mask: Bool[Array, "rows col
     drawn = jax.vmap(_drawn, in_axes=(None, 0))(scene, _bodies(state.xy, state.size))[0] & searched[:, None, None]
     nothing = PaperReport(jnp.full(len(searched), -jnp.inf), jnp.zeros(len(searched), bool))
     xy, _, report = jax.lax.fori_loop(0, passes * people, one_turn, (state.xy, drawn, nothing))
-    return _judged(config, state._replace(xy=xy), searched, report.score), report
+    return _evaluated(config, state._replace(xy=xy), searched, report.score), report
 
 
 class Profile(NamedTuple):
@@ -221,7 +221,7 @@ def _in_view(scene: PaperScene, state: PaperState) -> PaperState:
     return state._replace(mode=mode, low_frames=jnp.where(mode == OUTSIDE, 0, state.low_frames))
 
 
-def _judged(config: PaperConfig, state: PaperState, searched: Array, score: Array) -> PaperState:
+def _evaluated(config: PaperConfig, state: PaperState, searched: Array, score: Array) -> PaperState:
     low_frames = jnp.where(searched, jnp.where(score < config.lost, state.low_frames + 1, 0), state.low_frames)
     found = (state.mode == ACQUIRE) & (score > config.acquired)
     mode = jnp.where(searched & found, TRACK, state.mode)

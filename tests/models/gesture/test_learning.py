@@ -47,7 +47,7 @@ def test_margins_and_confidences_of_a_person_are_those_of_the_others():
     log_likelihood = np.where(np.arange(2)[:, None] == truth, 0.0, -100.0)
     others = LeftOut("Ann", Scores(log_likelihood, np.array([0.5, 0.1])[truth], truth))
     own = LeftOut("Bob", Scores(log_likelihood[:, :3], np.array([0.45, 0.2, 0.6]), np.array([0, 1, 1])))
-    bob = next(one for one in learning.judged([others, own]) if one.person == "Bob")
+    bob = next(one for one in learning.evaluated([others, own]) if one.person == "Bob")
     np.testing.assert_array_equal(bob.right, [True, True, False])
     np.testing.assert_allclose(bob.beyond, [-0.05, 0.1, 0.1], atol=1e-9)
     assert (bob.confidence > 0.99).all()

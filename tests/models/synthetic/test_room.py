@@ -38,8 +38,8 @@ def people():
 
 
 def image_of(camera, people, here=(True, True), key=1):
-    image, who = room_image(jax.random.key(key), camera, people, CLOTHES, jnp.array(here))
-    return np.asarray(image, float), np.asarray(who)
+    image, visible_person = room_image(jax.random.key(key), camera, people, CLOTHES, jnp.array(here))
+    return np.asarray(image, float), np.asarray(visible_person)
 
 
 def hulls(people, P):
@@ -85,11 +85,11 @@ def test_a_camera_looks_where_it_is_told(pinhole):
 
 def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
     """They do not overlap in this image. OpenCV also fills pixels that the border only touches, of every part."""
-    _, who = image_of(empty_room, people)
+    _, visible_person = image_of(empty_room, people)
     expected = hulls(people, np.asarray(floor_camera(pinhole, looking(POSITION, 90.0, 20.0)).P, float))
     assert not np.any(expected.all(axis=0))
     for k, mask in enumerate(expected):
-        mine = who == k
+        mine = visible_person == k
         assert not np.any(mine & ~mask.astype(bool))
         inner = cv2.erode(mask, np.ones((3, 3), np.uint8)).astype(bool)
         assert np.mean(mine[inner]) > 0.98
@@ -97,8 +97,8 @@ def test_people_are_seen_where_they_project_to(pinhole, empty_room, people):
 
 
 def test_clothes_and_heads_are_in_their_places(empty_room, people):
-    image, who = image_of(empty_room, people)
-    rows, cols = np.nonzero(who == 1)
+    image, visible_person = image_of(empty_room, people)
+    rows, cols = np.nonzero(visible_person == 1)
     top, bottom = rows.min(), rows.max()
     middle = cols[rows < top + 5].mean().round().astype(int)
     np.testing.assert_allclose(image[top + 2, middle], room.SKIN, atol=15)
@@ -110,7 +110,7 @@ def test_clothes_and_heads_are_in_their_places(empty_room, people):
 
 def test_shadows_lie_on_the_floor_beside_the_feet(pinhole, empty_room, people):
     """What is darkened is exactly the ellipse of each shadow, where nobody stands in front of it."""
-    with_people, who = image_of(empty_room, people)
+    with_people, visible_person = image_of(empty_room, people)
     without, _ = image_of(empty_room, people, here=(False, False))
     v, u = np.meshgrid(*[np.arange(n, dtype=float) for n in SHAPE], indexing="ij")
     camera = floor_camera(pinhole, looking(POSITION, 90.0, 20.0))
@@ -120,7 +120,7 @@ def test_shadows_lie_on_the_floor_beside_the_feet(pinhole, empty_room, people):
     away = (floor[None] - (PLACES + room.SHADOW_AWAY_M)[:, None, None]) / np.array(room.SHADOW_AXES_M)
     radius = np.min(np.linalg.norm(away, axis=-1), axis=0)
     ratio = with_people.sum(axis=-1) / without.sum(axis=-1)
-    inside, outside = (radius < 0.95) & (who < 0), (radius > 1.05) & (who < 0)
+    inside, outside = (radius < 0.95) & (visible_person < 0), (radius > 1.05) & (visible_person < 0)
     assert inside.sum() > 60
     np.testing.assert_allclose(ratio[inside], room.SHADOW, atol=0.02)
     np.testing.assert_allclose(ratio[outside], 1, atol=1e-6)
@@ -129,15 +129,15 @@ def test_shadows_lie_on_the_floor_beside_the_feet(pinhole, empty_room, people):
 def test_furniture_hides_people_and_shadows(pinhole, people):
     wall = jnp.full(SHAPE, jnp.inf).at[:, 40:].set(1.0)
     camera = room_camera(jax.random.key(0), pinhole, looking(POSITION, 90.0, 20.0), wall)
-    image, who = image_of(camera, people)
+    image, visible_person = image_of(camera, people)
     without, _ = image_of(camera, people, here=(False, False))
-    assert np.all(who[:, 40:] == -1)
+    assert np.all(visible_person[:, 40:] == -1)
     np.testing.assert_array_equal(image[:, 40:], without[:, 40:])
 
 
 def test_who_is_not_here_is_not_seen_and_noise_is_as_stated(empty_room, people):
-    image, who = image_of(empty_room, people, here=(False, True))
-    assert set(np.unique(who)) == {-1, 1}
+    image, visible_person = image_of(empty_room, people, here=(False, True))
+    assert set(np.unique(visible_person)) == {-1, 1}
     other, _ = image_of(empty_room, people, here=(False, True), key=2)
     assert np.std(image - other) == pytest.approx(room.NOISE_STD * np.sqrt(2), rel=0.03)
     again, _ = image_of(empty_room, people, here=(False, True))

@@ -50,7 +50,7 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
     )
 
 
-def judged(scene, people, fit, *, dt=0.1, looked=True, frames=1):
+def evaluated(scene, people, fit, *, dt=0.1, looked=True, frames=1):
     for _ in range(frames):
         people = judge(scene, people, fit, jnp.asarray(dt), jnp.asarray(looked))
     return people
@@ -60,31 +60,31 @@ def judged(scene, people, fit, *, dt=0.1, looked=True, frames=1):
 def test_evidence_confirms_somebody(scene):
     """Four units of log odds, at most one a frame however good the score."""
     people = people_of(TENTATIVE)
-    assert judged(scene, people, fit_of(3.0), frames=4).mode[0] == TENTATIVE
-    assert judged(scene, people, fit_of(3.0), frames=5).mode[0] == TRACKED
-    assert judged(scene, people, fit_of(0.1), frames=30).mode[0] == TENTATIVE
+    assert evaluated(scene, people, fit_of(3.0), frames=4).mode[0] == TENTATIVE
+    assert evaluated(scene, people, fit_of(3.0), frames=5).mode[0] == TRACKED
+    assert evaluated(scene, people, fit_of(0.1), frames=30).mode[0] == TENTATIVE
 
 
 def test_what_is_nobody_is_given_up_and_somebody_is_remembered(scene):
     people = people_of(TENTATIVE, TRACKED, log_odds=[0.0, 0.0, 0.0, 0.0])
-    after = judged(scene, people, fit_of(-1.5))
+    after = evaluated(scene, people, fit_of(-1.5))
     assert after.mode.tolist() == [FREE, DORMANT, FREE, FREE]
     long_known = people_of(TENTATIVE, TRACKED, log_odds=[0.0, 8.0, 0.0, 0.0])
-    assert judged(scene, long_known, fit_of(-1.5)).mode[1] == TRACKED
+    assert evaluated(scene, long_known, fit_of(-1.5)).mode[1] == TRACKED
 
 
 def test_somebody_hidden_is_believed_in_for_a_while_then_remembered_then_forgotten(scene):
     """Seconds: 3 hidden, 5 more remembered."""
     people, hidden = people_of(TRACKED, log_odds=[8.0, 0, 0, 0]), fit_of(0.0, share_seen=0.05)
-    assert judged(scene, people, hidden, frames=29).mode[0] == TRACKED
-    assert judged(scene, people, hidden, frames=31).mode[0] == DORMANT
-    assert judged(scene, people, hidden, frames=79).mode[0] == DORMANT
-    assert judged(scene, people, hidden, frames=81).mode[0] == FREE
+    assert evaluated(scene, people, hidden, frames=29).mode[0] == TRACKED
+    assert evaluated(scene, people, hidden, frames=31).mode[0] == DORMANT
+    assert evaluated(scene, people, hidden, frames=79).mode[0] == DORMANT
+    assert evaluated(scene, people, hidden, frames=81).mode[0] == FREE
 
 
 def test_without_an_image_nothing_is_learnt_but_time_passes(scene):
     people = people_of(TENTATIVE, TRACKED, log_odds=[2.0, 5.0, 0, 0])
-    after = judged(scene, people, fit_of(-2.0), looked=False)
+    after = evaluated(scene, people, fit_of(-2.0), looked=False)
     assert after.log_odds.tolist() == [2, 5, 0, 0]
     assert after.mode.tolist()[:2] == [TENTATIVE, TRACKED]
     np.testing.assert_allclose(after.unseen_s[:2], 0.1, rtol=1e-6)
@@ -93,14 +93,14 @@ def test_without_an_image_nothing_is_learnt_but_time_passes(scene):
 def test_whom_another_explains_as_well_is_given_up(scene):
     people = people_of(TRACKED, TRACKED, TENTATIVE, log_odds=[8.0, 8.0, 1.0, 0])
     fit = fit_of(1.0, surplus=[np.inf, 0.2, 0.2, np.inf])
-    after = judged(scene, people, fit)
+    after = evaluated(scene, people, fit)
     np.testing.assert_allclose(after.log_odds[:3], [8.0, 7.8, 0.7], rtol=1e-5)
 
 
 def test_nobody_is_followed_off_the_floor_or_without_a_place(scene):
     off = people_of(TRACKED, TRACKED, log_odds=[8.0, 8.0, 0, 0])
     off = off._replace(belief=Gaussian(off.belief.mean.at[0, 1].set(9.0), off.belief.covariance.at[1, 0, 0].set(2.0)))
-    assert judged(scene, off, fit_of(1.0)).mode.tolist()[:2] == [DORMANT, DORMANT]
+    assert evaluated(scene, off, fit_of(1.0)).mode.tolist()[:2] == [DORMANT, DORMANT]
 
 
 @pytest.mark.system
@@ -110,12 +110,12 @@ def test_the_border_of_the_floor_is_crossed_by_two_standard_deviations(scene, sd
     people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0])
     mean = people.belief.mean.at[0, 1].set(4.3)
     people = people._replace(belief=Gaussian(mean, people.belief.covariance.at[0, 1, 1].set(sd_m**2)))
-    assert judged(scene, people, fit_of(1.0)).mode[0] == mode
+    assert evaluated(scene, people, fit_of(1.0)).mode[0] == mode
 
 
 def test_time_that_stands_still_changes_nothing_of_the_hidden(scene):
     people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0])
-    after = judged(scene, people, fit_of(0.0, share_seen=0.0), dt=0.0)
+    after = evaluated(scene, people, fit_of(0.0, share_seen=0.0), dt=0.0)
     assert after.log_odds[0] == 8
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
 
