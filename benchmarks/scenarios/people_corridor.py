@@ -46,7 +46,9 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     session.prime([video.sample(PRIMING_IMAGES)])
     for time_s, image in itertools.islice(video.images(), QUICK_FRAMES if quick else None):
         session.process([image], time_s)
-    rows = [(one.frame, identity, *one.mean[:2]) for identity, track in session.tracks.smoothed().items() for one in track]
+    rows = [
+        (one.frame, identity, *one.mean[:2]) for identity, track in session.tracks.smoothed().items() for one in track
+    ]
     table = np.array(rows, float).reshape(-1, 4)
     found = floor_tracks(table[:, 0], table[:, 1], table[:, 2:])
     evaluated = true.frame < session.tracks.frames

@@ -122,7 +122,7 @@ class Difference:
 
     def _set_threshold(self) -> None:
         levels = cv2.convertScaleAbs(self.noise, alpha=self._spread * _MAD_TO_STD / NOISE_STEPS)
-        self._threshold = cv2.max(levels, round(self._least))
+        self._threshold = cv2.max(levels, np.full_like(levels, round(self._least)))
 
     def _checked(self, image: np.ndarray) -> np.ndarray:
         if self.background is None:
