@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 _GROUPS = (
+    ("Beside published errors", ("ratio_to_paper", "ratio_to_thesis"), "Error divided by the published one."),
     ("Against other libraries", ("ratio_",), "Processor time divided by that of the other library: 0.5 is half."),
     ("Standard deviations", ("coverage", "nees", "nis"), "A 2-sigma interval should cover 95 %."),
     ("Accuracy", (), ""),
