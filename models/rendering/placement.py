@@ -46,12 +46,16 @@ def share_poses(of_many: Callable, poses: PyTree, shared: PyTree) -> PyTree:
     """
     count = jax.tree.leaves(poses)[0].shape[0]
     devices = jax.local_devices(backend="cpu") if poses_in_turn() else []
-    if len(devices) < 2 or count % len(devices) or not jax.sharding.get_abstract_mesh().empty:
+    if len(devices) < 2 or count < len(devices) or not jax.sharding.get_abstract_mesh().empty:
         return of_many(poses, shared)
     mesh = Mesh(np.array(devices), (_AXIS,))
-    return jax.shard_map(of_many, mesh=mesh, in_specs=(P(_AXIS), P()), out_specs=P(_AXIS), check_vma=False)(
-        poses, shared
+    sharded = jax.shard_map(of_many, mesh=mesh, in_specs=(P(_AXIS), P()), out_specs=P(_AXIS), check_vma=False)
+    # The last pose is repeated, as one that any computation about a pose is made for.
+    missing = -count % len(devices)
+    padded = jax.tree.map(
+        lambda leaf: jnp.pad(leaf, [(0, missing)] + [(0, 0)] * (leaf.ndim - 1), mode="edge") if missing else leaf, poses
     )
+    return jax.tree.map(lambda leaf: leaf[:count], sharded(padded, shared))
 
 
 def _map_sharded(of_one, poses, shared, count, mesh):
