@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,6 +24,21 @@ from jaxfilters.models.rendering.depth import (
     render_mesh,
 )
 from jaxfilters.models.rendering.geometry import Capsules, Ellipsoids, convex_parts, mesh_from_trimesh
+
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+@pytest.fixture
+def on_two_devices():
+    """`(code) -> finished process`: one of its own, because the number of devices is fixed when JAX starts."""
+
+    def run(code):
+        flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2 {QUICK_TO_COMPILE}"
+        environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, check=False, env=environment, timeout=300, capture_output=True, text=True)
+
+    return run
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 """Depth terms against sums over rendered images, pixel by pixel in numpy; batches, devices and derivatives."""
 
-import os
-import subprocess
-import sys
 from functools import partial
 
 import jax
@@ -15,7 +12,6 @@ from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.depth import render_capsules
 
 MAX_ERROR = 0.08
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 def observed_image(shape, seed=0):
@@ -198,10 +194,7 @@ for index in range(7):
 
 
 @pytest.mark.system
-def test_two_devices_share_the_poses_of_a_sequence():
-    """In a process of its own, because the number of devices is fixed when JAX starts; seven poses leave one over."""
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2 {QUICK_TO_COMPILE}"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-c", _ON_TWO_DEVICES]
-    done = subprocess.run(command, check=False, env=environment, timeout=300, capture_output=True, text=True)
+def test_two_devices_share_the_poses_of_a_sequence(on_two_devices):
+    """Seven poses leave one over."""
+    done = on_two_devices(_ON_TWO_DEVICES)
     assert done.returncode == 0, done.stderr

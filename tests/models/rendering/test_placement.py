@@ -1,9 +1,5 @@
 """Poses divided over CPU devices."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 _ON_TWO_DEVICES = """
@@ -27,10 +23,6 @@ for count, of_a_device in ((8, 4), (7, 4), (1, 1)):
 
 
 @pytest.mark.system
-def test_each_of_two_devices_computes_half_of_the_poses():
-    """In a process of its own, because the number of devices is fixed when JAX starts."""
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-c", _ON_TWO_DEVICES]
-    done = subprocess.run(command, check=False, env=environment, timeout=300, capture_output=True, text=True)
+def test_each_of_two_devices_computes_half_of_the_poses(on_two_devices):
+    done = on_two_devices(_ON_TWO_DEVICES)
     assert done.returncode == 0, done.stderr

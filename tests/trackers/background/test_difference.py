@@ -50,15 +50,19 @@ def test_shadows_are_darker_and_of_the_same_colour():
     assert not is_shadow(np.zeros((3, 1)), empty[:1].T).any()
 
 
-def test_shadows_are_weakened_and_nothing_else():
-    background = np.full((30, 60, 3), (100, 150, 200), np.uint8)
+@pytest.mark.parametrize("cols", [100, 1981], ids=["every pixel", "squares of 3 pixels"])
+def test_shadows_are_weakened_and_nothing_else(cols):
+    """The wide image is not a whole number of squares."""
+    background = np.full((61, cols, 3), (100, 150, 200), np.uint8)
     image = background.copy()
-    image[:, :20] = (70, 105, 140)
-    image[:, 40:] = (70, 140, 70)
+    image[30:, 30:48] = (70, 105, 140)
+    image[:, 66:84] = (70, 140, 70)
+    image[30:, 90:] = (70, 105, 140)
     probability = made(background, shadow_probability=0.3).probability(image)
-    np.testing.assert_allclose(probability[5:-5, 2:18], 0.3, atol=1e-6)
-    assert probability[:, 22:38].max() < 0.01
-    assert probability[:, 42:].min() > 0.99
+    for shadow in (probability[33:, 33:45], probability[33:, 93:]):
+        np.testing.assert_allclose(shadow, 0.3, atol=1e-6)
+    assert probability[:, 69:81].min() > 0.99
+    assert max(probability[:27, :63].max(), probability[33:, 51:63].max()) < 0.01
 
 
 def test_edges_of_dark_clothes_are_no_shadows():
