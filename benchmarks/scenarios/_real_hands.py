@@ -46,8 +46,10 @@ class HandRecording(NamedTuple):
     """+1 for a right hand, -1 for a left one."""
 
 
-def load(name: str, num_frames: int = NUM_FRAMES) -> HandRecording:
+def load(name: str, num_frames: int = NUM_FRAMES, *, evenly: bool = False) -> HandRecording:
     """One of `DEVELOPMENT` or `HELD`: the frames in the middle of a motion, the first ones of a camera's recording.
+
+    With `evenly` the frames of a motion are spread over all of it, so that the times are no longer those of the motion.
 
     Raises:
         RecordingError: the data are not there.
@@ -62,7 +64,8 @@ def load(name: str, num_frames: int = NUM_FRAMES) -> HandRecording:
         hand = {part: data[f"{side}_{part}"] for part in ("bones", "verts", "faces", "weights", "bind")}
         matrix = data["K"]
     first = max(0, (len(motion) - num_frames) // 2)
-    motion = motion[first : first + num_frames]
+    every = np.linspace(0, len(motion) - 1, num_frames).round().astype(int)
+    motion = motion[every] if evenly else motion[first : first + num_frames]
     shape, rng = (480, 640), np.random.default_rng(int(sequence))
     depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape) for vertices in _skinned(motion, hand)])
     depth = np.round(depth + NOISE_M * rng.normal(size=depth.shape), 3)

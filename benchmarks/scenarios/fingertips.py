@@ -6,7 +6,8 @@ frame, a mean over subjects; `least_with_<n>` the smallest over seven subjects, 
 without a suffix are the modern tracker's, with `_published` the paper's, with `_detected` those of single frames,
 without correspondence. `_image` are rendered hands of 640x480 pixels, blurred by lens and motion, through detection.
 `hand_video_` is the recording dexretarget_hand_video, where JAXFILTERS_DATA has it: tips beside key points.
-`found_pct_`, `false_pct_` and `names_per_finger_` are of real videos beside tips marked by hand, see `_marked_tips`.
+`found_pct_`, `false_pct_` and `names_per_finger_` are of real videos beside tips marked by hand, see `_marked_tips`;
+those with `_depth_` are of single depth images with true joints, see `_depth_tips`.
 """
 
 import sys
@@ -21,6 +22,7 @@ import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios._depth_tips import depth_tip_metrics
 from jaxfilters.benchmarks.scenarios._hand_video import (
     REDUCTION,
     STRETCHED,
@@ -78,6 +80,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     metrics |= image_metrics(rendered, parameters)
     metrics |= time_metrics(rendered[-1], parameters, QUICK_ROUNDS if quick else ROUNDS)
     metrics |= video_metrics(out, 40 if quick else None)
+    metrics |= depth_tip_metrics(quick=quick, seed=seed)
     return metrics if quick else metrics | marked_video_metrics()
 
 

@@ -9,6 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfilters.models.fingertip.arm import Palm, border_contact, find_arm, find_palm
+from jaxfilters.models.fingertip.depth_edges import (
+    DepthEdges,
+    Windows,
+    checked_depth,
+    depth_edges,
+    goes_behind,
+    own_surfaces,
+    with_edges_near,
+)
 from jaxfilters.models.fingertip.fingers import Bases, find_bases, measured_ends
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.fingertip.observation import COVERAGE_SHAPE, MAX_TIPS, WHOLE_IMAGE, HandObservation
@@ -55,6 +64,26 @@ class _Silhouette(NamedTuple):
         return self.origin + self.step * points
 
 
+class _Layout(NamedTuple):
+    """Where palm and arm of a silhouette are, and how tips look there; pixels of its image."""
+
+    inside: UInt8[np.ndarray, "rows cols"]
+    palm: Palm
+    axis: Float[np.ndarray, "2"]
+    radius: float
+    half_size: int
+    min_correlation: float
+
+
+class _Tips(NamedTuple):
+    """Candidates after a closer look."""
+
+    points: Float[np.ndarray, "n 2"]
+    scores: Float[np.ndarray, " n"]
+    """0 of what is no tip."""
+    bases: Bases
+
+
 def no_hand() -> HandObservation:
     """The observation of a frame in which no hand is visible."""
     numbers, no = np.zeros(MAX_TIPS, np.float32), np.zeros(MAX_TIPS, bool)
@@ -76,38 +105,47 @@ def no_hand() -> HandObservation:
     return HandObservation(**hand)
 
 
-def detect_hand(mask: np.ndarray, parameters: HandParameters) -> HandObservation:
+def detect_hand(mask: np.ndarray, parameters: HandParameters, depth: np.ndarray | None = None) -> HandObservation:
     """The largest component of a mask that can be a hand; `no_hand()` if none can.
 
     Args:
         mask: (rows, cols) of bool: which pixels are skin.
         parameters: Of the user, for the camera that gave the mask.
+        depth: As for `detect_hands`.
 
     Raises:
-        ValueError: a mask that is not (rows, cols) of bool.
+        ValueError: a mask that is not (rows, cols) of bool, or as for `detect_hands`.
     """
-    return detect_hands(mask, parameters, capacity=1)[0]
+    return detect_hands(mask, parameters, depth, capacity=1)[0]
 
 
-def detect_hands(mask: np.ndarray, parameters: HandParameters, *, capacity: int = 2) -> tuple[HandObservation, ...]:
+def detect_hands(
+    mask: np.ndarray, parameters: HandParameters, depth: np.ndarray | None = None, *, capacity: int = 2
+) -> tuple[HandObservation, ...]:
     """The largest components of a mask that can be hands, from left to right by their palms; then `no_hand()`.
 
-    Hands that touch are one component, and one hand with the tips of both, at most `MAX_TIPS` of them.
+    Hands that touch are one component, and one hand with the tips of both, at most `MAX_TIPS` of them. With depths,
+    edges within the mask part fingers that touch, or lie before each other or the palm. A finger that is folded before
+    the palm has no tip: it does not lead from its end to the palm on one surface.
 
     Args:
         mask: (rows, cols) of bool: which pixels are skin.
         parameters: Of the user, for the camera that gave the mask.
+        depth: (rows, cols) metres along the optical axis in the pixels of the mask; what is not finite or not positive
+            is no reading. Without it the outline of the mask decides alone.
         capacity: How many observations to give.
 
     Raises:
-        ValueError: a mask that is not (rows, cols) of bool, or a capacity below 1.
+        ValueError: a mask that is not (rows, cols) of bool, a capacity below 1, or depth that is not (rows, cols) of
+            floats, has another shape than the mask, or is not in metres.
     """
     if capacity < 1:
         raise ValueError(f"capacity must be at least 1; got {capacity}.")
     skin = checked_mask(mask)
+    metres = None if depth is None else checked_depth(depth, skin)
     hands: list[HandObservation] = []
     for silhouette in _components(skin, parameters.tip_radius):
-        hand = _hand(silhouette, parameters)
+        hand = _hand(silhouette, parameters, metres)
         if hand is not None:
             hands.append(hand)
         if len(hands) == capacity:
@@ -151,35 +189,35 @@ def _components(skin: np.ndarray, tip_radius: float) -> Iterator[_Silhouette]:
         yield _Silhouette(image, (step - 1) / 2, step)
 
 
-def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservation | None:
+def _hand(
+    silhouette: _Silhouette, parameters: HandParameters, metres: Float[np.ndarray, "rows cols"] | None
+) -> HandObservation | None:
     """What a component shows of a hand; `None` if it has no palm."""
     scale = float(silhouette.step.mean())
     radius = parameters.tip_radius / scale
     inside = cv2.threshold(silhouette.image, 127, 1, cv2.THRESH_BINARY)[1]
-    # What lies beyond the border of the image counts as background, as in an erosion.
-    depth = cv2.distanceTransform(cv2.copyMakeBorder(inside, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0), cv2.DIST_L2, 5)
-    depth = np.ascontiguousarray(depth[1:-1, 1:-1])
+    inset = _inset(inside)
     contact = border_contact(inside)
-    palm = find_palm(depth, contact)
+    palm = find_palm(inset, contact)
     if palm.radius < SMALLEST_PALM * radius:
         return None
     arm = find_arm(inside, palm, contact)
     half_size = max(round(parameters.half_size / scale), math.ceil(radius) + 1)
-    found = _candidates(silhouette.image, palm, arm.direction, radius, half_size, parameters.min_correlation)
-    bases = find_bases(depth, found, palm.center, radius)
-    towards = found - np.where(bases.is_found[:, None], bases.points, palm.center)
-    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
-    ends = measured_ends(silhouette.image, found, towards, radius)
-    is_finger = ~bases.is_found | (np.hypot(*(found - bases.points).T) > SHORTEST * radius)
-    is_tip = is_finger & ends.is_end & (ends.scores > LEAST_AGREEMENT) & (ends.radii < THICKEST * radius)
-    is_tip &= ~_is_cut(inside, ends.points + AHEAD * ends.radii[:, None] * towards)
-    best = best_apart(ends.points, np.where(is_tip, ends.scores, 0.0), SUPPRESSION * radius, MAX_TIPS)
-    bases = Bases(bases.points[best], bases.is_found[best])
+    layout = _Layout(inside, palm, arm.direction, radius, half_size, parameters.min_correlation)
+    found = _candidates(silhouette.image, layout)
+    tips = _judged(layout, found, inset, Windows(silhouette.image, found))
+    if metres is not None:
+        small = cv2.resize(metres, inside.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        edges = depth_edges(small, inside, radius)
+        if edges.is_behind.any():
+            tips = _joined(_parted(layout, silhouette.image, found, edges), tips)
+    best = best_apart(tips.points, tips.scores, SUPPRESSION * radius, MAX_TIPS)
+    bases = Bases(tips.bases.points[best], tips.bases.is_found[best])
     starts = np.where(bases.is_found[:, None], silhouette.placed(bases.points), 0.0)
     hand: Any = {
-        "tips": _filled(silhouette.placed(ends.points[best])),
+        "tips": _filled(silhouette.placed(tips.points[best])),
         "is_tip": np.arange(MAX_TIPS) < len(best),
-        "scores": _filled(ends.scores[best]),
+        "scores": _filled(tips.scores[best]),
         "bases": _filled(starts),
         "has_base": _filled(bases.is_found),
         "palm": silhouette.placed(palm.center).astype(np.float32),
@@ -193,18 +231,65 @@ def _hand(silhouette: _Silhouette, parameters: HandParameters) -> HandObservatio
     return HandObservation(**hand)
 
 
-def _candidates(
-    image: np.ndarray, palm: Palm, axis: np.ndarray, radius: float, half_size: int, min_correlation: float
-) -> Float[np.ndarray, "n 2"]:
+def _inset(inside: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
+    """Distance of each pixel to the outline; what lies beyond the border of the image is outside, as in an erosion."""
+    padded = cv2.copyMakeBorder(inside, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    return np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
+
+
+def _judged(
+    layout: _Layout,
+    found: Float[np.ndarray, "n 2"],
+    inset: Float[np.ndarray, "rows cols"],
+    windows: Windows,
+) -> _Tips:
+    """Candidates with their bases, and scores above 0 of those that are tips, as their windows show them."""
+    radius, inside = layout.radius, layout.inside
+    bases = find_bases(inset, found, layout.palm.center, radius)
+    towards = found - np.where(bases.is_found[:, None], bases.points, layout.palm.center)
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
+    ends = measured_ends(windows.image, windows.points, towards, radius)
+    points = ends.points + found - windows.points
+    is_finger = ~bases.is_found | (np.hypot(*(found - bases.points).T) > SHORTEST * radius)
+    is_tip = is_finger & ends.is_end & (ends.scores > LEAST_AGREEMENT) & (ends.radii < THICKEST * radius)
+    is_tip &= ~_is_cut(inside, points + AHEAD * ends.radii[:, None] * towards)
+    return _Tips(points, np.where(is_tip, ends.scores, 0.0), bases)
+
+
+def _parted(
+    layout: _Layout,
+    image: UInt8[np.ndarray, "rows cols"],
+    found: Float[np.ndarray, "n 2"],
+    edges: DepthEdges,
+) -> _Tips:
+    """Tips on surfaces of their own, of fingers that lead to the palm without an edge on the way."""
+    cut = np.where(edges.is_behind, np.uint8(0), image)
+    found = with_edges_near(edges, np.concatenate([found, _candidates(cut, layout)]), layout.radius)
+    inset = _inset(cv2.threshold(cut, 127, 1, cv2.THRESH_BINARY)[1])
+    tips = _judged(layout, found, inset, own_surfaces(cut, found, layout.radius))
+    towards = tips.points - tips.bases.points
+    is_end = tips.bases.is_found & ~goes_behind(edges, tips.points, towards, layout.radius)
+    return tips._replace(scores=np.where(is_end, tips.scores, 0.0))
+
+
+def _joined(first: _Tips, second: _Tips) -> _Tips:
+    points, scores = (np.concatenate([a, b]) for a, b in zip(first[:2], second[:2], strict=True))
+    return _Tips(
+        points, scores, Bases(*(np.concatenate(parts) for parts in zip(first.bases, second.bases, strict=True)))
+    )
+
+
+def _candidates(image: np.ndarray, layout: _Layout) -> Float[np.ndarray, "n 2"]:
     """Places that may be ends of fingers, neither near nor behind the palm, several of each."""
     left, top, width, height = cv2.boundingRect(image)
     window = image[top : top + height, left : left + width]
-    found = peaks(correlation(window, tip_template(radius, half_size)), min_correlation)
+    template = tip_template(layout.radius, layout.half_size)
+    found = peaks(correlation(window, template), layout.min_correlation)
     places = found.points + np.array([left, top])
-    arm = places - palm.center
-    far = np.linalg.norm(arm, axis=1) > NEAR * palm.radius
-    score = np.where(far & (arm @ axis > -BEHIND * palm.radius), found.scores, 0.0)
-    return places[best_apart(places, score, CANDIDATES_APART * radius, MAX_CANDIDATES)]
+    arm = places - layout.palm.center
+    far = np.linalg.norm(arm, axis=1) > NEAR * layout.palm.radius
+    score = np.where(far & (arm @ layout.axis > -BEHIND * layout.palm.radius), found.scores, 0.0)
+    return places[best_apart(places, score, CANDIDATES_APART * layout.radius, MAX_CANDIDATES)]
 
 
 def _is_cut(inside: UInt8[np.ndarray, "rows cols"], ahead: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

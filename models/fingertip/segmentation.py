@@ -81,7 +81,7 @@ def fit_desk(depth: np.ndarray) -> Float[np.ndarray, "rows cols"]:
         ValueError: depth that is not (rows, cols) of floats, or that has fewer than `FEWEST_READINGS` readings.
     """
     _check_floats("depth", depth)
-    y, x = np.nonzero(_is_reading(depth))
+    y, x = np.nonzero(is_reading(depth))
     if len(x) < FEWEST_READINGS:
         raise ValueError(f"depth must have at least {FEWEST_READINGS} finite, positive readings; got {len(x)}.")
     every = max(1, len(x) // 20_000)
@@ -122,7 +122,7 @@ def depth_mask(
     _check_floats("desk", desk)
     if depth.shape != desk.shape:
         raise ValueError(f"desk must have the shape of depth, {depth.shape}; got {desk.shape}.")
-    known = _is_reading(depth)
+    known = is_reading(depth)
     height = np.where(known, desk - np.where(known, depth, 0.0), 0.0)
     mask = ((height > least_height) & (height < most_height)).astype(np.uint8)
     # Single readings at edges and on the desk are wrong by as much as a finger is thick.
@@ -139,10 +139,16 @@ def reading_mask(depth: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
         ValueError: depth that is not (rows, cols) of floats.
     """
     _check_floats("depth", depth)
-    return cv2.medianBlur(_is_reading(depth).astype(np.uint8), 3).view(bool)
+    return cv2.medianBlur(is_reading(depth).astype(np.uint8), 3).view(bool)
 
 
-def _is_reading(depth: np.ndarray) -> np.ndarray:
+def is_reading(depth: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
+    """Where a depth image has a reading: a finite, positive number.
+
+    Raises:
+        ValueError: depth that is not (rows, cols) of floats.
+    """
+    _check_floats("depth", depth)
     return np.isfinite(depth) & (depth > 0)
 
 

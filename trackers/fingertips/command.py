@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.gesture import coded
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
@@ -49,6 +50,7 @@ def track(options: argparse.Namespace) -> str:
         run_config.mask,
         fps=options.fps,
         seed=run_config.seed,
+        depth=options.depth,
         keypoints=options.keypoints,
         image_size=options.image_size,
     )
@@ -68,7 +70,7 @@ def track(options: argparse.Namespace) -> str:
         recogniser=recogniser_of(symbols),
     )
     with closing(EventFile(options.out / "events.jsonl")) as events:
-        stream = FingertipStream(source, lambda image: hands_in(image, user, run_config.hands), session, events)
+        stream = FingertipStream(source, partial(_observed, user, run_config.hands), session, events)
         total = getattr(source, "frames", 0) or None
         spec = StreamSpec(
             *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
@@ -76,6 +78,10 @@ def track(options: argparse.Namespace) -> str:
         )
         with closing(StreamRun(options, spec)) as run:
             return _tracked(source, user, session, stream, run, run_config, options)
+
+
+def _observed(user: User, num_hands: int, image: Any) -> HandObservation:
+    return as_input_error(partial(hands_in, image, user, num_hands))
 
 
 def _tracked(

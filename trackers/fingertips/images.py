@@ -21,6 +21,7 @@ from jaxfilters.models.fingertip.skin import SkinModel, fit_skin_model, skin_mas
 from jaxfilters.models.fingertip.thumb import POSTURE, Posture, ThumbAngles, calibrated, usual
 from jaxfilters.trackers.fingertips.events import Event, Recogniser
 from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, hands_of, parameters_of
+from jaxfilters.trackers.fingertips.rgbd_input import RgbdImage
 from jaxfilters.trackers.fingertips.session import USUAL, FingertipSession
 from jaxfilters.trackers.fingertips.state import FingertipConfig, HandReport
 from jaxfilters.trackers.tracker import checked_times
@@ -60,6 +61,7 @@ def track(
     mask: str = "infrared",
     config: FingertipConfig | None = None,
     *,
+    depths: Sequence[np.ndarray] | None = None,
     num_hands: int = 1,
     recogniser: Recogniser | None = None,
 ) -> tuple[HandReport, list[Event]]:
@@ -71,6 +73,8 @@ def track(
         mask: How hands differ from the desk: they are brighter (`infrared`), above it (`depth`), or have the colour of
             skin (`colour`).
         config: Constants of the tracker.
+        depths: (rows, cols) metres in the pixels of each image, not finite or not positive without a reading; their
+            edges part fingers that touch or lie before each other. With the mask `depth` the images are these.
         num_hands: At most.
         recogniser: What names strokes; without one they have no label.
 
@@ -79,11 +83,15 @@ def track(
 
     Raises:
         ValueError: There are fewer than two images, an unknown mask, or no image in which a hand differs from the desk;
-            or as for `checked_times`.
+            depths of another number, shape or unit, or beside the mask `depth`; or as for `checked_times`.
     """
     seconds = checked_times(times_s, len(images))
     if len(images) < 2:
         raise ValueError("images: expected two or more; got one.")
+    if depths is not None and mask == "depth":
+        raise ValueError("depths: of no use with the mask 'depth', whose images are depths.")
+    if depths is not None and len(depths) != len(images):
+        raise ValueError(f"depths: expected one for each of the {len(images)} images; got {len(depths)}.")
     user = estimate_user(images[:: max(1, len(images) // OPEN_HAND_IMAGES)], mask)
     session = FingertipSession(
         angles_of(user),
@@ -95,13 +103,14 @@ def track(
         recogniser=recogniser,
     )
     seconds = seconds - seconds[0]
-    reports = [session.process(hands_in(image, user, num_hands), seconds[i : i + 1]) for i, image in enumerate(images)]
+    frames = images if depths is None else list(map(RgbdImage, images, depths))
+    reports = [session.process(hands_in(frame, user, num_hands), seconds[i : i + 1]) for i, frame in enumerate(frames)]
     session.finish()
     return jax.tree.map(lambda *rows: np.concatenate(rows), *reports), session.events
 
 
-def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> User:
-    """The user's hand and the desk from images in which the hand is open at some time.
+def estimate_user(images: Sequence[np.ndarray | HandKeypoints | RgbdImage], mask: str) -> User:
+    """The user's hand and the desk from images in which the hand is open at some time; depths beside them do not count.
 
     Raises:
         ValueError: an unknown mask, no images, or none in which a hand differs from the desk.
@@ -113,6 +122,7 @@ def estimate_user(images: Sequence[np.ndarray | HandKeypoints], mask: str) -> Us
         raise ValueError("no image.")
     if isinstance(images[0], HandKeypoints):
         return User(*_of_keypoints(images), KEYPOINT_POSTURE)
+    images = [image.image if isinstance(image, RgbdImage) else image for image in images]
     user, why = _best_user(kinds[mask], images)
     if user is not None and user.has_open_hand:
         return user
@@ -173,17 +183,26 @@ def angles_of(user: User) -> ThumbAngles:
     return calibrated(thumb, index, user.posture)
 
 
-def hands_in(image: np.ndarray | HandKeypoints, user: User, num_hands: int) -> HandObservation:
-    """What an image, or a frame of keypoints, shows of each hand, (1, hands, ...) as a session wants it."""
+def hands_in(image: np.ndarray | HandKeypoints | RgbdImage, user: User, num_hands: int) -> HandObservation:
+    """What an image, or a frame of keypoints, shows of each hand, (1, hands, ...) as a session wants it.
+
+    Raises:
+        ValueError: depths beside the image that have another shape, or are not in metres.
+    """
     if isinstance(image, HandKeypoints):
         return hands_of(image, num_hands)
-    found = detect_hands(user.segment(image), user.parameters, capacity=num_hands)
+    colours, depth = image if isinstance(image, RgbdImage) else (image, image if _is_depth(image) else None)
+    found = detect_hands(user.segment(colours), user.parameters, depth, capacity=num_hands)
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves])[None], *found)
 
 
 def _of_keypoints(frames: Sequence[Any]) -> tuple[HandParameters, Segment, bool]:
     parameters, is_open = parameters_of(list(frames))
     return parameters, lambda image: image, is_open
+
+
+def _is_depth(image: np.ndarray) -> bool:
+    return bool(np.issubdtype(image.dtype, np.floating))
 
 
 def _grey(image: np.ndarray) -> np.ndarray:

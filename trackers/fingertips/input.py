@@ -11,6 +11,7 @@ import numpy as np
 from jaxfilters.models.synthetic.desk_hand import DeskFrame, desk_video
 from jaxfilters.models.synthetic.desk_script import script
 from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, drawn_keypoints, open_keypoints
+from jaxfilters.trackers.fingertips.rgbd_input import RgbdImage, RgbdVideo
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.video_input import LiveCamera, open_video
@@ -103,14 +104,17 @@ def open_hands(
     *,
     fps: float | None,
     seed: int,
+    depth: Path | None = None,
     keypoints: Path | None = None,
     image_size: tuple[int, int] | None = None,
 ) -> Any:
     """The source of images, or of keypoints, that a command was given.
 
     Raises:
-        InputError: nothing there, nothing that can be read, or a mask or size that does not go with it.
+        InputError: nothing there, nothing that can be read, or a mask, size or depths that do not go with it.
     """
+    if depth is not None:
+        return RgbdVideo(_colours_beside(depth, place, mask, keypoints, fps), depth)
     if keypoints is not None:
         if mask != "infrared":
             raise InputError(f"--mask {mask}: of no use with --keypoints, which need no mask.")
@@ -129,10 +133,27 @@ def open_hands(
     return LiveHands(source) if isinstance(source, LiveCamera) else source
 
 
-def shown(image: np.ndarray | HandKeypoints) -> np.ndarray:
+def _colours_beside(depth: Path, place: str | None, mask: str, keypoints: Path | None, fps: float | None) -> Any:
+    """The recording that depths belong to.
+
+    Raises:
+        InputError: it cannot be read, or there is none whose pixels depths could be of.
+    """
+    if keypoints is not None:
+        raise InputError(f"--depth {depth}: of no use with --keypoints, which need no edges.")
+    if mask == "depth":
+        raise InputError(f"--depth {depth}: of no use with --mask depth, where VIDEO is the depth recording.")
+    if place is None or place.isdecimal():
+        raise InputError(f"--depth {depth}: expected VIDEO, the colour images of the same recording.")
+    return open_video(place, fps=fps)
+
+
+def shown(image: np.ndarray | HandKeypoints | RgbdImage) -> np.ndarray:
     """A picture (rows, cols, 3) of an image that is one, of depths or of keypoints."""
     if isinstance(image, HandKeypoints):
         return drawn_keypoints(image)
+    if isinstance(image, RgbdImage):
+        return image.image
     if image.ndim == 3:
         return image
     near = np.isfinite(image) & (image > 0)

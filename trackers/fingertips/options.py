@@ -26,6 +26,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_config(parser, RunConfig, "mask", "hands")
     parser.add_argument(
+        "--depth",
+        type=Path,
+        metavar="RECORDING",
+        help="depth images aligned to those of VIDEO, one for each, whose edges part fingers that touch: folder of "
+        "16-bit PNGs with camera.json, or .npz; with --mask depth, VIDEO has them itself",
+    )
+    parser.add_argument(
         "--keypoints",
         type=Path,
         metavar="FILE",

@@ -1,0 +1,162 @@
+"""Edges in a depth image within the mask of a hand: where one finger lies before another one, or before the palm."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxfilters.models.fingertip.segmentation import is_reading
+
+FINGER_RADIUS_M = 0.0075
+"""Half the width of a finger, by which pixels become metres without a camera."""
+LEAST_JUMP_M, NOISE_FACTOR = 0.008, 5.0
+"""Metres between two surfaces, at least, and standard deviations of the noise of a reading."""
+STEEPEST = 1.5
+"""Depth over width of one surface."""
+REACH = 2
+"""Pixels over which depths jump: at edges, sensors have a reading in between."""
+HOLE = 2
+"""Pixels from the border of a hole in the depth image to its middle, at most, for it to be filled."""
+AHEAD = (1.2, 1.6, 2.0)
+"""Tip radii from the middle of a tip to what lies ahead of it."""
+WINDOW, MARGIN = 3.0, 1.0
+"""Tip radii from a place to the side of its window, and between two windows."""
+NEAREST_M, FARTHEST_M = 0.1, 10.0
+"""Of a hand before a depth camera."""
+
+
+def checked_depth(depth: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "rows cols"]:
+    """The depth image in single precision, 0 where there is no reading.
+
+    Args:
+        depth: (rows, cols) metres along the optical axis; what is not finite or not positive is no reading.
+        mask: (rows, cols) of the hands, in the same pixels.
+
+    Raises:
+        ValueError: depth that is not (rows, cols) of floats, has another shape than the mask, or is not in metres.
+    """
+    known = is_reading(depth)
+    if depth.shape != mask.shape:
+        raise ValueError(f"depth must have the shape of mask, {mask.shape}, and its pixels; got {depth.shape}.")
+    inside = depth[known & (mask > 0)]
+    median = float(np.median(inside)) if inside.size else NEAREST_M
+    if not NEAREST_M <= median <= FARTHEST_M:
+        raise ValueError(f"depth must be in metres; got a median of {median:.3g} in the mask of the hands.")
+    return np.where(known, depth, 0).astype(np.float32)
+
+
+class DepthEdges(NamedTuple):
+    """Where surfaces of a hand end before or behind each other."""
+
+    is_behind: Bool[np.ndarray, "rows cols"]
+    """Pixels that lie behind a surface beside them, so that what is in front keeps its outline."""
+    depth: Float[np.ndarray, "rows cols"]
+    """Metres, small holes filled; 0 beside the hand and without a reading."""
+    jump: float
+    """Metres between two surfaces, at least."""
+
+
+def depth_edges(
+    depth: Float[np.ndarray, "rows cols"], inside: UInt8[np.ndarray, "rows cols"], radius: float
+) -> DepthEdges:
+    """Jumps of depth within a hand.
+
+    A jump is larger than the noise of the readings in this image, than `LEAST_JUMP_M`, and than a slope makes it.
+
+    Args:
+        depth: Metres, 0 without a reading.
+        inside: 0 beside the hand.
+        radius: Half the width of a finger, pixels.
+    """
+    filled = _filled(depth)
+    known = (filled > 0) & (inside > 0)
+    jump = max(LEAST_JUMP_M, NOISE_FACTOR * reading_noise(filled, known)) + STEEPEST * REACH * FINGER_RADIUS_M / radius
+    near = cv2.erode(np.where(known, filled, np.float32(np.inf)), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
+    return DepthEdges(known & (filled > near + np.float32(jump)), np.where(known, filled, np.float32(0)), jump)
+
+
+def goes_behind(
+    edges: DepthEdges, tips: Float[np.ndarray, "n 2"], towards: Float[np.ndarray, "n 2"], radius: float
+) -> Bool[np.ndarray, " n"]:
+    """Whether what ends at each place does so behind something nearer, where it is covered and does not end.
+
+    Args:
+        edges: Of the hand.
+        tips: Middles of the discs in which fingers end, pixels.
+        towards: Vectors along the fingers to their ends, of any length.
+        radius: Of tips, pixels.
+    """
+    along = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
+    ahead = tips[:, None] + radius * np.array(AHEAD)[:, None] * along[:, None]
+    here, there = _at(edges.depth, tips), _at(edges.depth, ahead)
+    return np.any((there > 0) & (there < here[:, None] - edges.jump / 2), axis=1) & (here > 0)
+
+
+def _at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Values at the pixels nearest to points (..., 2), 0 beyond the image."""
+    x, y = np.moveaxis(np.rint(points).astype(int), -1, 0)
+    rows, cols = image.shape
+    is_there = (x >= 0) & (y >= 0) & (x < cols) & (y < rows)
+    return np.where(is_there, image[np.clip(y, 0, rows - 1), np.clip(x, 0, cols - 1)], 0)
+
+
+def reading_noise(depth: Float[np.ndarray, "rows cols"], known: Bool[np.ndarray, "rows cols"]) -> float:
+    """Standard deviation of a reading, metres: of second differences along rows, robustly (median); 0 without any.
+
+    Second differences of a smooth surface are small, and have six times the variance of independent noise.
+    """
+    second = depth[:, 2:] - 2 * depth[:, 1:-1] + depth[:, :-2]
+    values = np.abs(second[known[:, 2:] & known[:, 1:-1] & known[:, :-2]])
+    return 1.4826 * float(np.median(values)) / math.sqrt(6) if values.size else 0.0
+
+
+def with_edges_near(edges: DepthEdges, points: Float[np.ndarray, "n 2"], radius: float) -> Float[np.ndarray, "kept 2"]:
+    """The points (pixels) whose windows hold an edge: elsewhere the outline of the hand shows all there is."""
+    side = 2 * math.ceil(WINDOW * radius) + 1
+    near = cv2.dilate(edges.is_behind.view(np.uint8), np.ones((side, side), np.uint8))
+    return points[_at(near, points) > 0]
+
+
+class Windows(NamedTuple):
+    """Places of an image, each in a window of its own, one beneath the other."""
+
+    image: UInt8[np.ndarray, "rows cols"]
+    points: Float[np.ndarray, "n 2"]
+    """The places in that image."""
+
+
+def own_surfaces(image: UInt8[np.ndarray, "rows cols"], points: Float[np.ndarray, "n 2"], radius: float) -> Windows:
+    """What is connected to each place within `WINDOW` tip radii, without crossing an edge; the rest is 0.
+
+    A finger before a palm is connected to it through the knuckle alone, which is farther away.
+
+    Args:
+        image: 0 at edges and beside the hand, more than 127 in it.
+        points: Pixels.
+        radius: Of tips, pixels.
+    """
+    reach, margin = math.ceil(WINDOW * radius), math.ceil(MARGIN * radius)
+    side = 2 * reach + 1
+    padded = cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
+    height = side + 2 * margin
+    stacked = np.zeros((max(1, len(points)) * height, height), np.uint8)
+    whole = np.rint(points).astype(int)
+    for i, (x, y) in enumerate(whole):
+        window = padded[y : y + side, x : x + side]
+        labels = cv2.connectedComponents(cv2.threshold(window, 127, 1, cv2.THRESH_BINARY)[1], connectivity=4)[1]
+        middle = labels[reach - 1 : reach + 2, reach - 1 : reach + 2]
+        # Beside a place on an edge is the surface that it belongs to.
+        label = labels[reach, reach] or middle.max()
+        own = cv2.copyTo(window, ((labels == label) & (label > 0)).view(np.uint8))
+        stacked[i * height + margin : i * height + margin + side, margin : margin + side] = own
+    middles = margin + reach + np.stack([np.zeros(len(points)), height * np.arange(len(points))], axis=1)
+    return Windows(stacked, points - whole + middles)
+
+
+def _filled(depth: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
+    """With small holes filled by the farthest reading beside them: the shadow of what is in front."""
+    for _ in range(HOLE):
+        depth = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+    return depth
