@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
-from jaxfilters.benchmarks.scenarios._real_hands import HELD, WALL_M, load
+from jaxfilters.benchmarks.scenarios._real_hands import HELD, NUM_FRAMES, WALL_M, load
 from jaxfilters.models.fingertip.detection import detect_hand
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.hand.skeleton import hand_geometry, open_palm
@@ -38,7 +38,7 @@ BEHIND_SURFACE_M, BEFORE_SURFACE_M = 0.022, 0.012
 GATE = 1.3
 """Tip radii."""
 NUM_RENDERED, QUICK_NUM_RENDERED, NUM_SCANNED = 60, 4, 16
-"""Poses, and frames of each motion."""
+"""Poses, and frames of each motion; of the camera's recording all count."""
 SENSOR = DepthSensor(flying_fraction=0.02, dropout_fraction=0.02)
 
 
@@ -135,7 +135,7 @@ def recorded_hands(name: str) -> Iterator[DepthHand]:
     Raises:
         RecordingError: the data are not there.
     """
-    recording = load(name, NUM_SCANNED, evenly=True)
+    recording = load(name, NUM_SCANNED if name in HELD else NUM_FRAMES, evenly=True)
     matrix = np.asarray(recording.camera.matrix(), float)
     for depth, joints in zip(recording.depth, recording.joints, strict=True):
         near = np.where(depth < WALL_M - 0.1, depth, np.inf)
