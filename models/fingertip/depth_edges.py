@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxfilters.models.fingertip.segmentation import is_reading
+from jaxfilters.models.fingertip.segmentation import check_floats, is_reading
 
 FINGER_RADIUS_M = 0.0075
 """Half the width of a finger, by which pixels become metres without a camera."""
@@ -25,10 +25,12 @@ WINDOW, MARGIN = 3.0, 1.0
 """Tip radii from a place to the side of its window, and between two windows."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Of a hand before a depth camera."""
+UNIT_STEP = 8
+"""Every such row and column of an image shows the unit of its readings."""
 
 
-def checked_depth(depth: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "rows cols"]:
-    """The depth image in single precision, 0 where there is no reading.
+def check_depth(depth: np.ndarray, mask: np.ndarray) -> None:
+    """Refuse a depth image that does not belong to the mask, or is not in metres.
 
     Args:
         depth: (rows, cols) metres along the optical axis; what is not finite or not positive is no reading.
@@ -37,14 +39,32 @@ def checked_depth(depth: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "row
     Raises:
         ValueError: depth that is not (rows, cols) of floats, has another shape than the mask, or is not in metres.
     """
-    known = is_reading(depth)
+    check_floats("depth", depth)
     if depth.shape != mask.shape:
         raise ValueError(f"depth must have the shape of mask, {mask.shape}, and its pixels; got {depth.shape}.")
-    inside = depth[known & (mask > 0)]
+    thinned = depth[::UNIT_STEP, ::UNIT_STEP]
+    inside = thinned[is_reading(thinned) & (mask[::UNIT_STEP, ::UNIT_STEP] > 0)]
     median = float(np.median(inside)) if inside.size else NEAREST_M
     if not NEAREST_M <= median <= FARTHEST_M:
         raise ValueError(f"depth must be in metres; got a median of {median:.3g} in the mask of the hands.")
-    return np.where(known, depth, 0).astype(np.float32)
+    # What is left of the image is read where hands are found, see `readings`.
+
+
+def readings(
+    depth: Float[np.ndarray, "rows cols"], corner: tuple[int, int], shape: tuple[int, ...], step: tuple[float, float]
+) -> Float[np.ndarray, "small_rows small_cols"]:
+    """A part of a depth image with fewer pixels, whose readings are not mixed, single precision, 0 without one.
+
+    Args:
+        depth: Metres; what is not finite or not positive is no reading.
+        corner: Column and row at which the part begins, its own pixels.
+        shape: Of the part.
+        step: Columns and rows of `depth` to a pixel of the part.
+    """
+    for axis in (0, 1):
+        places = corner[1 - axis] + np.arange(shape[axis])
+        depth = depth.take((places * step[1 - axis]).astype(int), axis)
+    return np.where(is_reading(depth), depth, 0).astype(np.float32)
 
 
 class DepthEdges(NamedTuple):
@@ -70,8 +90,9 @@ def depth_edges(
         inside: 0 beside the hand.
         radius: Half the width of a finger, pixels.
     """
-    filled = _filled(depth)
-    known = (filled > 0) & (inside > 0)
+    part = inside > 0
+    filled = _filled(depth, part)
+    known = (filled > 0) & part
     jump = max(LEAST_JUMP_M, NOISE_FACTOR * reading_noise(filled, known)) + STEEPEST * REACH * FINGER_RADIUS_M / radius
     near = cv2.erode(np.where(known, filled, np.float32(np.inf)), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
     return DepthEdges(known & (filled > near + np.float32(jump)), np.where(known, filled, np.float32(0)), jump)
@@ -114,9 +135,11 @@ def reading_noise(depth: Float[np.ndarray, "rows cols"], known: Bool[np.ndarray,
 
 def with_edges_near(edges: DepthEdges, points: Float[np.ndarray, "n 2"], radius: float) -> Float[np.ndarray, "kept 2"]:
     """The points (pixels) whose windows hold an edge: elsewhere the outline of the hand shows all there is."""
-    side = 2 * math.ceil(WINDOW * radius) + 1
-    near = cv2.dilate(edges.is_behind.view(np.uint8), np.ones((side, side), np.uint8))
-    return points[_at(near, points) > 0]
+    reach = math.ceil(WINDOW * radius)
+    low, high = (np.maximum(np.rint(points).astype(int) + aside, 0) for aside in (-reach, reach + 1))
+    corners = zip(low.tolist(), high.tolist(), strict=True)
+    is_near = [edges.is_behind[top:bottom, left:right].any() for (left, top), (right, bottom) in corners]
+    return points[np.array(is_near, bool)]
 
 
 class Windows(NamedTuple):
@@ -145,18 +168,26 @@ def own_surfaces(image: UInt8[np.ndarray, "rows cols"], points: Float[np.ndarray
     whole = np.rint(points).astype(int)
     for i, (x, y) in enumerate(whole):
         window = padded[y : y + side, x : x + side]
-        labels = cv2.connectedComponents(cv2.threshold(window, 127, 1, cv2.THRESH_BINARY)[1], connectivity=4)[1]
-        middle = labels[reach - 1 : reach + 2, reach - 1 : reach + 2]
-        # Beside a place on an edge is the surface that it belongs to.
-        label = labels[reach, reach] or middle.max()
-        own = cv2.copyTo(window, ((labels == label) & (label > 0)).view(np.uint8))
-        stacked[i * height + margin : i * height + margin + side, margin : margin + side] = own
+        own = cv2.threshold(window, 127, 1, cv2.THRESH_BINARY)[1]
+        if not own[reach, reach]:
+            # Beside a place on an edge is the surface that it belongs to.
+            rows, columns = np.nonzero(own[reach - 1 : reach + 2, reach - 1 : reach + 2])
+            seeds = [(int(columns[-1]) + reach - 1, int(rows[-1]) + reach - 1)] if len(rows) else []
+        else:
+            seeds = [(reach, reach)]
+        for seed in seeds:
+            cv2.floodFill(own, None, seed, (2,), flags=4)
+        is_own = cv2.threshold(own, 1, 1, cv2.THRESH_BINARY)[1]
+        part = stacked[i * height + margin : i * height + margin + side, margin : margin + side]
+        cv2.copyTo(window, is_own, part)
     middles = margin + reach + np.stack([np.zeros(len(points)), height * np.arange(len(points))], axis=1)
     return Windows(stacked, points - whole + middles)
 
 
-def _filled(depth: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
-    """With small holes filled by the farthest reading beside them: the shadow of what is in front."""
-    for _ in range(HOLE):
+def _filled(
+    depth: Float[np.ndarray, "rows cols"], inside: Bool[np.ndarray, "rows cols"]
+) -> Float[np.ndarray, "rows cols"]:
+    """With small holes in the hand filled by the farthest reading beside them: the shadow of what is in front."""
+    for _ in range(HOLE if (depth[inside] <= 0).any() else 0):
         depth = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
     return depth

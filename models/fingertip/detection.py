@@ -1,7 +1,7 @@
 """Hands in a mask: palm, forearm, fingertips and where the fingers begin."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -12,13 +12,14 @@ from jaxfilters.models.fingertip.arm import Palm, border_contact, find_arm, find
 from jaxfilters.models.fingertip.depth_edges import (
     DepthEdges,
     Windows,
-    checked_depth,
+    check_depth,
     depth_edges,
     goes_behind,
     own_surfaces,
+    readings,
     with_edges_near,
 )
-from jaxfilters.models.fingertip.fingers import Bases, find_bases, measured_ends
+from jaxfilters.models.fingertip.fingers import Bases, end_patches, ends_of, find_bases
 from jaxfilters.models.fingertip.hand_parameters import HandParameters
 from jaxfilters.models.fingertip.observation import COVERAGE_SHAPE, MAX_TIPS, WHOLE_IMAGE, HandObservation
 from jaxfilters.models.fingertip.tip_template import (
@@ -45,23 +46,35 @@ AHEAD = 1.25
 """Radii from the middle of a tip to where the image is over if its border cuts the finger."""
 MOST_FOR_SHORT_LABELS = 4 * 2**16
 """Pixels of a mask whose components are labelled in 16 bits, twice as fast; four pixels hold one component at most."""
+LEAST_ALONG = 0.1
+"""Part of the direction of an arm in which it is cut off before it is searched for tips."""
+BESIDE = 2
+"""Pixels beside a hand that are looked at with it: those that are hand in part, and what fills holes of its depths."""
 MAX_CANDIDATES, CANDIDATES_APART = 24, 0.7
 """Places that are looked at more closely, and tip radii between them."""
 
 
 class _Silhouette(NamedTuple):
-    """One component of the mask, alone in an image with fingers no thicker than the working radius."""
+    """One component of the mask, alone in its part of an image with fingers no thicker than the working radius."""
 
     image: UInt8[np.ndarray, "rows cols"]
-    """0 to 255: the share of each pixel that is skin."""
-    origin: Float[np.ndarray, "2"]
-    """Pixel of the mask at (0, 0) here."""
+    """0 to 255: the share of each pixel that is skin. It is 0 at borders that are not those of the mask."""
+    corner: tuple[int, int]
+    """Column and row of the whole image at (0, 0) here."""
+    whole: tuple[int, int]
+    """Rows and columns of the whole image."""
     step: Float[np.ndarray, "2"]
     """Pixels of the mask per pixel here."""
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """In the mask."""
-        return self.origin + self.step * points
+        return (self.step - 1) / 2 + self.step * (points + self.corner)
+
+    def coverage(self, inside: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "cell_rows cell_cols"]:
+        """Shares of the cells of the whole image that are hand."""
+        around, (left, top) = np.zeros(self.whole, np.uint8), self.corner
+        around[top : top + len(inside), left : left + inside.shape[1]] = 255 * inside
+        return cv2.resize(around, COVERAGE_SHAPE[::-1], interpolation=cv2.INTER_AREA) / np.float32(255)
 
 
 class _Layout(NamedTuple):
@@ -73,6 +86,16 @@ class _Layout(NamedTuple):
     radius: float
     half_size: int
     min_correlation: float
+
+
+class _View(NamedTuple):
+    """Places that may be tips, and the silhouette in which they are looked at."""
+
+    found: Float[np.ndarray, "n 2"]
+    inset: Float[np.ndarray, "rows cols"]
+    """Distance of each pixel to the outline."""
+    windows: Windows
+    """What shows how fingers end there."""
 
 
 class _Tips(NamedTuple):
@@ -142,10 +165,11 @@ def detect_hands(
     if capacity < 1:
         raise ValueError(f"capacity must be at least 1; got {capacity}.")
     skin = checked_mask(mask)
-    metres = None if depth is None else checked_depth(depth, skin)
+    if depth is not None:
+        check_depth(depth, skin)
     hands: list[HandObservation] = []
     for silhouette in _components(skin, parameters.tip_radius):
-        hand = _hand(silhouette, parameters, metres)
+        hand = _hand(silhouette, parameters, depth)
         if hand is not None:
             hands.append(hand)
         if len(hands) == capacity:
@@ -185,12 +209,17 @@ def _components(skin: np.ndarray, tip_radius: float) -> Iterator[_Silhouette]:
     for label in np.argsort(-areas, kind="stable"):
         if areas[label] < math.pi * (SMALLEST_PALM * tip_radius / shrink) ** 2:
             return
-        image = small if areas[label] == areas.sum() else cv2.copyTo(small, (labels == label).view(np.uint8))
-        yield _Silhouette(image, (step - 1) / 2, step)
+        left, top, width, height = stats[label, : cv2.CC_STAT_AREA].tolist()
+        corner = (max(0, left - BESIDE), max(0, top - BESIDE))
+        part = np.s_[corner[1] : top + height + BESIDE, corner[0] : left + width + BESIDE]
+        image = small[part]
+        if areas[label] != areas.sum():
+            image = cv2.copyTo(image, (labels[part] == label).view(np.uint8))
+        yield _Silhouette(image, corner, small.shape, step)
 
 
 def _hand(
-    silhouette: _Silhouette, parameters: HandParameters, metres: Float[np.ndarray, "rows cols"] | None
+    silhouette: _Silhouette, parameters: HandParameters, depth: Float[np.ndarray, "rows cols"] | None
 ) -> HandObservation | None:
     """What a component shows of a hand; `None` if it has no palm."""
     scale = float(silhouette.step.mean())
@@ -205,12 +234,16 @@ def _hand(
     half_size = max(round(parameters.half_size / scale), math.ceil(radius) + 1)
     layout = _Layout(inside, palm, arm.direction, radius, half_size, parameters.min_correlation)
     found = _candidates(silhouette.image, layout)
-    tips = _judged(layout, found, inset, Windows(silhouette.image, found))
-    if metres is not None:
-        small = cv2.resize(metres, inside.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        edges = depth_edges(small, inside, radius)
-        if edges.is_behind.any():
-            tips = _joined(_parted(layout, silhouette.image, found, edges), tips)
+    by_contour = _View(found, inset, Windows(silhouette.image, found))
+    edges = None
+    if depth is not None:
+        step = tuple(silhouette.step.tolist())
+        edges = depth_edges(readings(depth, silhouette.corner, inside.shape, step), inside, radius)
+    if edges is None or not edges.is_behind.any():
+        tips = _judged(layout, by_contour)
+    else:
+        by_edges = _parted(layout, silhouette.image, found, edges)
+        tips = _uncovered(_judged(layout, by_edges, by_contour), len(by_edges.found), edges, radius)
     best = best_apart(tips.points, tips.scores, SUPPRESSION * radius, MAX_TIPS)
     bases = Bases(tips.bases.points[best], tips.bases.is_found[best])
     starts = np.where(bases.is_found[:, None], silhouette.placed(bases.points), 0.0)
@@ -225,8 +258,8 @@ def _hand(
         "axis": arm.direction.astype(np.float32),
         "has_axis": np.asarray(arm.is_observed),
         "is_hand": np.asarray(True),
-        "coverage": cv2.resize(255 * inside, COVERAGE_SHAPE[::-1], interpolation=cv2.INTER_AREA) / np.float32(255),
-        "cell": (silhouette.step * inside.shape[::-1] / COVERAGE_SHAPE[::-1]).astype(np.float32),
+        "coverage": silhouette.coverage(inside),
+        "cell": (silhouette.step * silhouette.whole[::-1] / COVERAGE_SHAPE[::-1]).astype(np.float32),
     }
     return HandObservation(**hand)
 
@@ -237,19 +270,20 @@ def _inset(inside: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows co
     return np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
 
 
-def _judged(
-    layout: _Layout,
-    found: Float[np.ndarray, "n 2"],
-    inset: Float[np.ndarray, "rows cols"],
-    windows: Windows,
-) -> _Tips:
+def _judged(layout: _Layout, *views: _View) -> _Tips:
     """Candidates with their bases, and scores above 0 of those that are tips, as their windows show them."""
     radius, inside = layout.radius, layout.inside
-    bases = find_bases(inset, found, layout.palm.center, radius)
+    found = np.concatenate([view.found for view in views])
+    # Fingers are many times as fast together as one view after the other.
+    layers = cv2.merge([view.inset for view in views]) if len(views) > 1 else views[0].inset
+    layer = np.repeat(np.arange(len(views)), [len(view.found) for view in views]) if len(views) > 1 else None
+    bases = find_bases(layers, found, layout.palm.center, radius, layer)
     towards = found - np.where(bases.is_found[:, None], bases.points, layout.palm.center)
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
-    ends = measured_ends(windows.image, windows.points, towards, radius)
-    points = ends.points + found - windows.points
+    parts = np.split(towards, np.cumsum([len(view.found) for view in views])[:-1])
+    patches = [end_patches(*view.windows, part, radius) for view, part in zip(views, parts, strict=True)]
+    ends = ends_of(np.concatenate(patches), np.concatenate([view.windows.points for view in views]), towards, radius)
+    points = ends.points + found - np.concatenate([view.windows.points for view in views])
     is_finger = ~bases.is_found | (np.hypot(*(found - bases.points).T) > SHORTEST * radius)
     is_tip = is_finger & ends.is_end & (ends.scores > LEAST_AGREEMENT) & (ends.radii < THICKEST * radius)
     is_tip &= ~_is_cut(inside, points + AHEAD * ends.radii[:, None] * towards)
@@ -261,28 +295,25 @@ def _parted(
     image: UInt8[np.ndarray, "rows cols"],
     found: Float[np.ndarray, "n 2"],
     edges: DepthEdges,
-) -> _Tips:
-    """Tips on surfaces of their own, of fingers that lead to the palm without an edge on the way."""
+) -> _View:
+    """What a silhouette with the places found in it shows on surfaces of their own, where edges are near."""
     cut = np.where(edges.is_behind, np.uint8(0), image)
     found = with_edges_near(edges, np.concatenate([found, _candidates(cut, layout)]), layout.radius)
     inset = _inset(cv2.threshold(cut, 127, 1, cv2.THRESH_BINARY)[1])
-    tips = _judged(layout, found, inset, own_surfaces(cut, found, layout.radius))
+    return _View(found, inset, own_surfaces(cut, found, layout.radius))
+
+
+def _uncovered(tips: _Tips, number: int, edges: DepthEdges, radius: float) -> _Tips:
+    """The first tips, parted by edges, without those that do not lead to the palm, or go on behind something nearer."""
     towards = tips.points - tips.bases.points
-    is_end = tips.bases.is_found & ~goes_behind(edges, tips.points, towards, layout.radius)
-    return tips._replace(scores=np.where(is_end, tips.scores, 0.0))
-
-
-def _joined(first: _Tips, second: _Tips) -> _Tips:
-    points, scores = (np.concatenate([a, b]) for a, b in zip(first[:2], second[:2], strict=True))
-    return _Tips(
-        points, scores, Bases(*(np.concatenate(parts) for parts in zip(first.bases, second.bases, strict=True)))
-    )
+    is_end = tips.bases.is_found & ~goes_behind(edges, tips.points, towards, radius)
+    return tips._replace(scores=np.where(is_end | (np.arange(len(is_end)) >= number), tips.scores, 0.0))
 
 
 def _candidates(image: np.ndarray, layout: _Layout) -> Float[np.ndarray, "n 2"]:
     """Places that may be ends of fingers, neither near nor behind the palm, several of each."""
-    left, top, width, height = cv2.boundingRect(image)
-    window = image[top : top + height, left : left + width]
+    left, top, right, bottom = _before_arm(cv2.boundingRect(image), layout)
+    window = image[top:bottom, left:right]
     template = tip_template(layout.radius, layout.half_size)
     found = peaks(correlation(window, template), layout.min_correlation)
     places = found.points + np.array([left, top])
@@ -290,6 +321,25 @@ def _candidates(image: np.ndarray, layout: _Layout) -> Float[np.ndarray, "n 2"]:
     far = np.linalg.norm(arm, axis=1) > NEAR * layout.palm.radius
     score = np.where(far & (arm @ layout.axis > -BEHIND * layout.palm.radius), found.scores, 0.0)
     return places[best_apart(places, score, CANDIDATES_APART * layout.radius, MAX_CANDIDATES)]
+
+
+def _before_arm(box: Sequence[int], layout: _Layout) -> list[int]:
+    """Left, top, right and bottom of a box (left, top, width, height) without what lies behind the palm.
+
+    Templates that are compared with the rest see all of their surroundings in it.
+    """
+    low, high = np.array(box[:2]), np.array(box[:2]) + box[2:]
+    ends = np.stack([low, high - 1]) - layout.palm.center
+    most = (ends * layout.axis).max(axis=0)
+    for i, along in enumerate(layout.axis):
+        if abs(along) > LEAST_ALONG:
+            # Where the place that is farthest along the other side of the box is as far behind as tips can be.
+            last = layout.palm.center[i] - (BEHIND * layout.palm.radius + most[1 - i]) / along
+            if along > 0:
+                low[i] = min(max(low[i], math.floor(last) - layout.half_size - 1), high[i] - 1)
+            else:
+                high[i] = max(min(high[i], math.ceil(last) + layout.half_size + 2), low[i] + 1)
+    return [*low.tolist(), *high.tolist()]
 
 
 def _is_cut(inside: UInt8[np.ndarray, "rows cols"], ahead: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

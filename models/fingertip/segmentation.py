@@ -62,7 +62,7 @@ def foreground_mask(probability: np.ndarray, *, least: float = 0.5) -> Bool[np.n
     Raises:
         ValueError: a probability that is not (rows, cols) of floats.
     """
-    _check_floats("probability", probability)
+    check_floats("probability", probability)
     square = np.ones((3, 3), np.uint8)
     opened = cv2.morphologyEx((probability >= least).astype(np.uint8), cv2.MORPH_OPEN, square)
     return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, square).view(bool)
@@ -80,7 +80,7 @@ def fit_desk(depth: np.ndarray) -> Float[np.ndarray, "rows cols"]:
     Raises:
         ValueError: depth that is not (rows, cols) of floats, or that has fewer than `FEWEST_READINGS` readings.
     """
-    _check_floats("depth", depth)
+    check_floats("depth", depth)
     y, x = np.nonzero(is_reading(depth))
     if len(x) < FEWEST_READINGS:
         raise ValueError(f"depth must have at least {FEWEST_READINGS} finite, positive readings; got {len(x)}.")
@@ -118,8 +118,8 @@ def depth_mask(
     Raises:
         ValueError: depth or desk that are not (rows, cols) of floats, or that differ in shape.
     """
-    _check_floats("depth", depth)
-    _check_floats("desk", desk)
+    check_floats("depth", depth)
+    check_floats("desk", desk)
     if depth.shape != desk.shape:
         raise ValueError(f"desk must have the shape of depth, {depth.shape}; got {desk.shape}.")
     known = is_reading(depth)
@@ -138,7 +138,7 @@ def reading_mask(depth: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
     Raises:
         ValueError: depth that is not (rows, cols) of floats.
     """
-    _check_floats("depth", depth)
+    check_floats("depth", depth)
     return cv2.medianBlur(is_reading(depth).astype(np.uint8), 3).view(bool)
 
 
@@ -148,11 +148,16 @@ def is_reading(depth: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
     Raises:
         ValueError: depth that is not (rows, cols) of floats.
     """
-    _check_floats("depth", depth)
+    check_floats("depth", depth)
     return np.isfinite(depth) & (depth > 0)
 
 
-def _check_floats(name: str, array: np.ndarray) -> None:
+def check_floats(name: str, array: np.ndarray) -> None:
+    """Refuse what is no image of floats.
+
+    Raises:
+        ValueError: an array that is not (rows, cols) of floats, called by the name of the argument.
+    """
     if not isinstance(array, np.ndarray) or array.ndim != 2 or not np.issubdtype(array.dtype, np.floating):
         got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise ValueError(f"{name} must be an array (rows, cols) of floats; got {got}.")

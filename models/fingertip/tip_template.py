@@ -53,11 +53,13 @@ def best_apart(
 ) -> Int[np.ndarray, " kept"]:
     """Which points are kept, best first: at most `most` with positive scores, none near a better one."""
     kept: list[int] = []
-    for i in np.argsort(-scores, kind="stable"):
-        if len(kept) == most or scores[i] <= 0:
+    is_free = scores > 0
+    for i in np.argsort(-scores, kind="stable").tolist():
+        if len(kept) == most:
             break
-        if not kept or np.hypot(*(points[kept] - points[i]).T).min() > distance:
-            kept.append(int(i))
+        if is_free[i]:
+            kept.append(i)
+            is_free &= np.hypot(*(points - points[i]).T) > distance
     return np.array(kept, int)
 
 
