@@ -119,6 +119,34 @@ def test_a_finger_does_not_end_behind_its_own_tip():
     assert not goes_behind(edges, tips[[2]], up, RADIUS)
 
 
+def with_plate(depth, mask, middle, size):
+    """With a plate of that many columns and rows about a pixel, 40 mm before the hand, in depth and mask."""
+    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    plate = (np.abs(x - middle[0]) < size[0] / 2) & (np.abs(y - middle[1]) < size[1] / 2)
+    return np.where(plate, np.float32(0.54), depth), mask | plate
+
+
+@pytest.mark.parametrize("finger", [1, 2, 3])
+def test_a_finger_whose_end_is_covered_has_no_tip_where_it_goes_behind(finger):
+    depth, mask, tips = hand_depth()
+    depth, mask = with_plate(depth, mask, tips[finger], (40, 12))
+    hand = detect_hand(mask, PARAMETERS, depth)
+    assert hand.is_tip.sum() == 4
+    apart = np.linalg.norm(hand.tips[hand.is_tip][:, None] - np.delete(tips, finger, axis=0), axis=-1)
+    assert apart.min(axis=1).max() < RADIUS
+
+
+@pytest.mark.parametrize("finger", [2, 3])
+def test_what_lies_before_a_finger_has_no_tips_as_it_does_not_lead_to_the_palm(finger):
+    depth, mask, tips = hand_depth()
+    middle = [160, 130] + 0.75 * (tips[finger] - [160, 130])
+    depth, mask = with_plate(depth, mask, middle, (40, 20))
+    hand = detect_hand(mask, PARAMETERS, depth)
+    apart = np.linalg.norm(hand.tips[hand.is_tip][:, None] - tips, axis=-1)
+    assert hand.is_tip.sum() >= 4
+    assert apart.min(axis=1).max() < RADIUS
+
+
 def test_a_hand_without_edges_is_as_without_depths():
     _, mask, _ = hand_depth()
     flat = np.full(mask.shape, 0.6) + np.random.default_rng(0).normal(0, 0.0005, mask.shape)
