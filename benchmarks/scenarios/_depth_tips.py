@@ -1,10 +1,11 @@
 """Fingertips in depth images with true joints: edges in the depth image beside the contour of the same mask alone.
 
 Three sets: `rendered` are poses of the package's capsule hand, whose fingers touch, cross and fold before the palm;
-`scanned` are motions of real hands rendered from scanned ones (`HELD`, on which nothing was chosen); `camera` is the
-recording of a depth camera, whose joints are a fit. A forearm is added where there is none, since the hand comes in
-from the border of the image. A tip counts if its surface is visible and its finger is stretched; it is found if a
-detection is nearer than 1.3 tip radii. A detection is false if it is near no fingertip at all.
+`scanned` are motions of real hands rendered from scanned ones (`HELD`, looked at once before the two last changes to
+the method); `camera` is the recording of a depth camera, whose joints are a fit. A forearm is added where there is
+none, since the hand comes in from the border of the image. A tip counts if its surface is visible and its finger is
+stretched; it is found if a detection is nearer than 1.3 tip radii. A detection is false if it is near no fingertip at
+all.
 """
 
 import math
