@@ -75,7 +75,8 @@ def counted(name: str, hands: Iterator[DepthHand]) -> dict[str, Metric]:
         parameters = _parameters(hand, mask)
         for way, depth in (("edges", hand.depth), ("contour", None)):
             observed = detect_hand(mask, parameters, depth)
-            totals[way] += count(hand, mask, observed.tips[observed.is_tip], parameters.tip_radius)
+            found = np.asarray(observed.tips)[np.asarray(observed.is_tip)]
+            totals[way] = totals[way] + np.array(count(hand, mask, found, parameters.tip_radius))
     metrics = {}
     for way, (shown, hit, reported, false) in totals.items():
         metrics[f"found_pct_depth_{name}_{way}"] = Metric(100 * hit / max(shown, 1), "%", "higher")

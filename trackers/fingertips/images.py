@@ -103,7 +103,9 @@ def track(
         recogniser=recogniser,
     )
     seconds = seconds - seconds[0]
-    frames = images if depths is None else list(map(RgbdImage, images, depths))
+    frames: Sequence[np.ndarray | RgbdImage] = images
+    if depths is not None:
+        frames = [RgbdImage(*pair) for pair in zip(images, depths, strict=True)]
     reports = [session.process(hands_in(frame, user, num_hands), seconds[i : i + 1]) for i, frame in enumerate(frames)]
     session.finish()
     return jax.tree.map(lambda *rows: np.concatenate(rows), *reports), session.events
