@@ -1,6 +1,6 @@
 """Gaussian filters of an articulated hand: one hypothesis with limits, and a bank of hypotheses about depth.
 
-Three ways to filter one hypothesis. `recommended` makes the observation linear to the second order, cuts the belief by
+Three filters of one hypothesis. `recommended` makes the observation linear to the second order, cuts the belief by
 expectation propagation with memory, and learns lengths from new views only. `literal` is the paper's: an extended
 Kalman filter, half-spaces one after the other in every frame. `unconstrained` is a second-order filter without limits.
 """

@@ -36,8 +36,8 @@ def scores(
     needed = jnp.max(reach, axis=(0, 1)) + size
     too_small = [jnp.any(needed > jnp.array(_box_shape(side, image_shape))[::-1]) for side in BOXES]
     in_box = lambda side: jax.vmap(partial(_score_in_box, _box_shape(side, image_shape)), (None, 0, 0, 0))
-    ways = [jax.vmap(in_box(side)) for side in BOXES] + [jax.vmap(_score_one_by_one)]
-    found = lax.switch(jnp.sum(jnp.stack(too_small)), ways, images, templates.astype(uv.dtype), low, top_left)
+    scorers = [jax.vmap(in_box(side)) for side in BOXES] + [jax.vmap(_score_one_by_one)]
+    found = lax.switch(jnp.sum(jnp.stack(too_small)), scorers, images, templates.astype(uv.dtype), low, top_left)
     return jnp.where(observed, found, -1.0)
 
 

@@ -34,7 +34,7 @@ def border_contact(silhouette: UInt8[np.ndarray, "rows cols"]) -> Int[np.ndarray
     """Pixels (n, 2) of the longest unbroken part of the image's border that lies in the silhouette."""
     rows, cols = silhouette.shape
     x, y = np.arange(cols), np.arange(rows)
-    way = np.concatenate(
+    border = np.concatenate(
         [
             np.stack([x, np.zeros(cols, int)], axis=1),
             np.stack([np.full(rows, cols - 1), y], axis=1),
@@ -42,15 +42,15 @@ def border_contact(silhouette: UInt8[np.ndarray, "rows cols"]) -> Int[np.ndarray
             np.stack([np.zeros(rows, int), y[::-1]], axis=1),
         ]
     )
-    inside = silhouette[way[:, 1], way[:, 0]] > 0
+    inside = silhouette[border[:, 1], border[:, 0]] > 0
     if not inside.any() or inside.all():
-        return way[inside]
-    start = int(np.argmin(inside))  # outside, so that no part is broken by where the way begins
-    way, inside = np.roll(way, -start, axis=0), np.roll(inside, -start)
+        return border[inside]
+    start = int(np.argmin(inside))  # outside, so that no part is broken by where the border begins
+    border, inside = np.roll(border, -start, axis=0), np.roll(inside, -start)
     ends = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
     begins, ends = ends[::2], ends[1::2]
     longest = int(np.argmax(ends - begins))
-    return way[begins[longest] : ends[longest]]
+    return border[begins[longest] : ends[longest]]
 
 
 def find_palm(depth: Float[np.ndarray, "rows cols"], contact: Int[np.ndarray, "n 2"]) -> Palm:

@@ -22,9 +22,11 @@ LENGTH_SD, SCALE_SD = 0.2, 0.3
 FEWEST_TIPS = 4
 """Of fewer fingers both sides are nearly as likely."""
 
-_WAYS = [way for count in range(FEWEST_TIPS, MAX_TIPS + 1) for way in combinations(range(MAX_TIPS), count)]
-_FINGERS = np.array([np.pad(way, (0, MAX_TIPS - len(way))) for way in _WAYS])
-_COUNTS = np.array([len(way) for way in _WAYS])
+_COMBINATIONS = [
+    chosen for count in range(FEWEST_TIPS, MAX_TIPS + 1) for chosen in combinations(range(MAX_TIPS), count)
+]
+_FINGERS = np.array([np.pad(chosen, (0, MAX_TIPS - len(chosen))) for chosen in _COMBINATIONS])
+_COUNTS = np.array([len(chosen) for chosen in _COMBINATIONS])
 
 
 def thumb_side_log_odds(hand: HandObservation) -> Float[Array, ""]:

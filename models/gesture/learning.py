@@ -16,8 +16,8 @@ from jaxfilters.models.gesture.free_hand import with_variations
 from jaxfilters.models.gesture.stroke import NUM_POINTS, Drawn, stacked, to_judge
 from jaxfilters.models.gesture.symbols import SHARPNESS, Symbols, learn, recognise_all
 
-EXAMPLES_A_WAY, MOST_WAYS = 40, 20
-"""Examples of a symbol for each way to draw it that is looked for, and how many ways at most."""
+EXAMPLES_PER_VARIANT, MOST_VARIANTS = 40, 20
+"""Examples of a symbol for each variant in which it is drawn, and how many variants at most."""
 NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS = 10, 0.1, 8
 """Of many strokes."""
 FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS = 18, 0.07, 4
@@ -25,9 +25,9 @@ FEW_STATES, FEW_VARIANCE, FEW_ITERATIONS = 18, 0.07, 4
 than those of few examples, and few iterations of Baum-Welch suffice."""
 PATH_STATES, PATH_VARIANCE = 16, 0.15
 """Of strokes of one piece in the plane."""
-EXAMPLES_TO_PART, MOST_WAYS_APART = 40, 8
+EXAMPLES_TO_PART, MOST_VARIANTS_APART = 40, 8
 """Examples of a symbol from which on models are trained discriminatively, of which fewer do: with 8 examples of each
-no decision changes, and with 20 ways models learn the training strokes by heart."""
+no decision changes, and with 20 variants models learn the training strokes by heart."""
 NUM_FOLDS, FEWEST_SCORES = 3, 20
 """Parts of the strokes that are left out in turn to calibrate, and recognised strokes that this takes."""
 
@@ -56,10 +56,10 @@ def is_path(strokes: Sequence[Drawn]) -> bool:
     return all(len(pieces) == 1 and np.shape(pieces[0])[1:] == (2,) for pieces, _ in strokes)
 
 
-def ways_of(labels: Sequence[str]) -> int:
-    """How many ways to draw a symbol its examples can tell of: one for 40, and at most 20."""
+def num_variants_of(labels: Sequence[str]) -> int:
+    """How many variants of a symbol its examples can distinguish: one for 40, and at most 20."""
     counts = np.unique(np.asarray(labels), return_counts=True)[1]
-    return int(np.clip(np.median(counts) // EXAMPLES_A_WAY, 1, MOST_WAYS))
+    return int(np.clip(np.median(counts) // EXAMPLES_PER_VARIANT, 1, MOST_VARIANTS))
 
 
 def learn_strokes(
@@ -79,8 +79,8 @@ def learn_strokes(
         strokes: In two dimensions or in three.
         labels: The symbol of each.
         num_states: States of each model; `None` is as many as suit the kind of strokes.
-        num_variants: Ways to draw each symbol; `None` is `ways_of(labels)`, and at most
-            `MOST_WAYS_APART` of models that are trained discriminatively.
+        num_variants: Of each symbol; `None` is `num_variants_of(labels)`, and at most
+            `MOST_VARIANTS_APART` of models that are trained discriminatively.
         min_variance: Floor of the variances of features; `None` is what suits the kind of strokes.
 
     Raises:
@@ -93,11 +93,15 @@ def learn_strokes(
             paths,
             labels,
             num_states=num_states or PATH_STATES,
-            num_variants=ways_of(labels) if num_variants is None else num_variants,
+            num_variants=num_variants_of(labels) if num_variants is None else num_variants,
             min_variance=PATH_VARIANCE if min_variance is None else min_variance,
         )
     are_many = np.median(np.unique(np.asarray(labels), return_counts=True)[1]) >= EXAMPLES_TO_PART
-    ways = min(ways_of(labels), MOST_WAYS_APART if are_many else MOST_WAYS) if num_variants is None else num_variants
+    variants = (
+        min(num_variants_of(labels), MOST_VARIANTS_APART if are_many else MOST_VARIANTS)
+        if num_variants is None
+        else num_variants
+    )
     usual_states, usual_variance, iterations = NUM_STATES, MIN_VARIANCE, NUM_ITERATIONS
     if not are_many:
         strokes, labels = with_variations(strokes, labels)
@@ -107,7 +111,7 @@ def learn_strokes(
         features,
         labels,
         num_states=num_states or usual_states,
-        num_variants=ways,
+        num_variants=variants,
         max_iterations=iterations,
         min_variance=usual_variance if min_variance is None else min_variance,
     )

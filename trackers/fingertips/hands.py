@@ -29,7 +29,7 @@ def component_of(
     """Which component of the image each hand is: by the least sum of squared distances from where the palms go.
 
     Two hands that touch are one component; it is the hand that is nearer, and the other one coasts. Hands that cross
-    are distinguished by their ways. Of two that appear together, the one with the thumb counter-clockwise is to the
+    are distinguished by their paths. Of two that appear together, the one with the thumb counter-clockwise is to the
     right: the right hand of a person who is viewed from above, with crossed arms excluded.
 
     Args:

@@ -1,4 +1,4 @@
-"""Pictures of fingertips: names, ways, palms, and what the hands do."""
+"""Pictures of fingertips: names, trails, palms, and what the hands do."""
 
 import math
 from collections import deque
@@ -13,17 +13,17 @@ from jaxfilters.trackers.fingertips.events import SYMBOL, Event
 from jaxfilters.trackers.fingertips.state import MODE_NAMES, HandReport
 from jaxfilters.trackers.fingertips.table import name_of
 
-WAY_FRAMES = 25
+TRAIL_FRAMES = 25
 EVENT_FRAMES = 45
 """For which an event is shown."""
 _PALM, _THUMB = (230, 230, 230), (60, 60, 255)
 
 
 class FingertipPictures:
-    """Frames with what was found in them; ways and events stay for a while."""
+    """Frames with what was found in them; trails and events stay for a while."""
 
     def __init__(self) -> None:
-        self._ways: dict[str, deque[tuple[int, int]]] = {}
+        self._trails: dict[str, deque[tuple[int, int]]] = {}
         self._events: deque[tuple[int, str]] = deque(maxlen=4)
 
     def drawn(
@@ -37,7 +37,7 @@ class FingertipPictures:
                 _draw_palm(picture, report, hand)
             for slot in np.flatnonzero(report.is_tip[hand]):
                 now.add(self._draw_tip(picture, report, hand, int(slot)))
-        self._ways = {name: way for name, way in self._ways.items() if name in now}
+        self._trails = {name: trail for name, trail in self._trails.items() if name in now}
         modes = ", ".join(MODE_NAMES[int(mode)] for mode in report.mode)
         caption(picture, f"{time_s:.1f} s  {modes}", 0)
         self._events.extend((frame, in_words(event)) for event in events)
@@ -49,9 +49,9 @@ class FingertipPictures:
         identity = int(report.identity[hand, slot])
         name, color = name_of(hand, identity), color_of(5 * hand + identity)
         place = _pixel(report.position[hand, slot])
-        way = self._ways.setdefault(name, deque(maxlen=WAY_FRAMES))
-        way.append(place)
-        cv2.polylines(picture, [np.asarray(way, np.int32)], False, color, 1, cv2.LINE_AA)
+        trail = self._trails.setdefault(name, deque(maxlen=TRAIL_FRAMES))
+        trail.append(place)
+        cv2.polylines(picture, [np.asarray(trail, np.int32)], False, color, 1, cv2.LINE_AA)
         thickness = 2 if report.is_observed[hand, slot] else 1
         cv2.circle(picture, place, 9, color, thickness, cv2.LINE_AA)
         if report.is_thumb[hand, slot]:

@@ -55,7 +55,7 @@ def fit_gestures(options: argparse.Namespace) -> str:
     with jax.enable_x64(True):
         examples, source = _examples(options)
         # The generator draws every shape in one way.
-        ways = 1 if options.ways is None and not options.data else options.ways
+        num_variants = 1 if options.ways is None and not options.data else options.ways
         if "" in examples.labels:
             raise InputError(f"{source}: stroke {examples.ids[examples.labels.index('')]} has no label.")
         before = read_symbols(_model(options.add)) if options.add else None
@@ -71,18 +71,20 @@ def fit_gestures(options: argparse.Namespace) -> str:
                 examples.strokes,
                 examples.labels,
                 num_states=states,
-                num_variants=ways,
+                num_variants=num_variants,
                 min_variance=floor,
             )
         )
         lines = []
         if options.held_out:
-            found = _held_out(examples, options.states, ways)
+            found = _held_out(examples, options.states, num_variants)
             trained = as_input_error(lambda: calibrated(trained, together([one.scores for one in found])))
             lines = _of_held_out(evaluated(found))
         elif options.data:
             drawings = (examples.strokes, examples.labels, examples.people)
-            trained = as_input_error(lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=ways))
+            trained = as_input_error(
+                lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=num_variants)
+            )
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
         symbols = as_input_error(lambda: extended(before.symbols, trained)) if before else trained
         source = f"{before.source}; {source}" if before else source
@@ -213,9 +215,11 @@ def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}.") from None
 
 
-def _held_out(examples: StrokeSet, states: int | None, ways: int | None) -> list[LeftOut]:
+def _held_out(examples: StrokeSet, states: int | None, num_variants: int | None) -> list[LeftOut]:
     return as_input_error(
-        lambda: leave_one_out(examples.strokes, examples.labels, examples.people, num_states=states, num_variants=ways)
+        lambda: leave_one_out(
+            examples.strokes, examples.labels, examples.people, num_states=states, num_variants=num_variants
+        )
     )
 
 

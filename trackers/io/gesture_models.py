@@ -1,6 +1,6 @@
 """Models of symbols on disk, and the one that comes with the package.
 
-An `.npz` with the arrays `owner` (m,), the symbol that each model is a way to draw; `log_initial` (m, Q) and
+An `.npz` with the arrays `owner` (m,), the symbol that each model is a variant of; `log_initial` (m, Q) and
 `log_transition` (m, Q, Q) of the models; those of their emission, and `header`, a text in JSON:
 
     {"format": "jaxfilters symbols", "version": 1, "names": [...], "emission": "shape" or "codes",

@@ -1,4 +1,4 @@
-"""Pictures of people on a floor: outlines over the images, and the floor plan with everybody's way."""
+"""Pictures of people on a floor: outlines over the images, and the floor plan with the path of each person."""
 
 import itertools
 from pathlib import Path
@@ -43,10 +43,10 @@ def _draw_one(image, center, shape, color, identity):
 
 
 def write_plan(path: Path, scene: PeopleScene, tracks: dict[int, list[Sighting]]) -> None:
-    """The floor from above, X to the right and Y up, with cameras and ways; a dot where a person was last.
+    """The floor from above, X to the right and Y up, with cameras and paths; a dot where a person was last.
 
-    Where a person is hidden or the distance from the camera is not measured, the way is thin and faint, in a band of
-    two standard deviations. A way is interrupted where a person was lost and found again.
+    Where a person is hidden or the distance from the camera is not measured, the path is thin and faint, in a band of
+    two standard deviations. A path is interrupted where a person was lost and found again.
 
     Raises:
         OutputError: it cannot be written.
