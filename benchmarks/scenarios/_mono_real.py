@@ -21,7 +21,7 @@ from jaxfilters.models.synthetic.face_training import ict_shapes
 from jaxfilters.models.synthetic.ict_course import biwi_course, livelink_course, read_biwi, read_livelink
 from jaxfilters.models.synthetic.ict_face import IctModel, read_ict
 from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
-from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
+from jaxfilters.trackers.head.common.focal_prior import usual_focal
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
@@ -120,8 +120,9 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     for name, file in list(VIDEOS.items())[: 1 if quick else None]:
         images, fps = read_video(folder / file, QUICK_VIDEO_FRAMES if quick else None)
         rows, cols = images.shape[1:]
-        rig = monocular(Pinhole.from_intrinsics(FOCAL_WIDTHS * cols, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
-        session = MonoSession(rig, people_face_model().model, MonoConfig(seed=seed))
+        focal = usual_focal((cols, rows))
+        rig = monocular(Pinhole.from_intrinsics(focal.px, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
+        session = MonoSession(rig, people_face_model().model, MonoConfig(seed=seed), focal_log_std=focal.log_std)
         times = np.arange(len(images)) / fps
         parts = [
             session.process(images[i : i + PIECE, None], times[i : i + PIECE]) for i in range(0, len(images), PIECE)

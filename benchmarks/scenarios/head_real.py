@@ -34,7 +34,7 @@ from jaxfilters.models.synthetic.ict_sequence import IctSequence, ict_sequence
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.detect import detect
-from jaxfilters.trackers.head.common.input import FOCAL_WIDTHS
+from jaxfilters.trackers.head.common.focal_prior import usual_focal
 from jaxfilters.trackers.head.common.state import HeadTrack
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.stereo.session import HeadSession
@@ -92,7 +92,7 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     for name, file in list(VIDEOS.items())[: 1 if quick else None]:
         images, fps = read_video(folder / file, QUICK_VIDEO_FRAMES if quick else None)
         rows, cols = images.shape[1:]
-        focal = FOCAL_WIDTHS * cols
+        focal = usual_focal((cols, rows)).px
         rig = monocular(Pinhole.from_intrinsics(focal, ((cols - 1) / 2, (rows - 1) / 2), (rows, cols)))
         session = HeadSession(rig, HeadConfig(seed=seed))
         track = follow(session, images[:, None], np.arange(len(images)) / fps)

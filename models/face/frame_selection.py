@@ -1,6 +1,7 @@
 """Which frames of a video a face is adjusted to: those that turn most (Sugano 2007), or those that tell most."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -71,12 +72,14 @@ class FrameInformation(NamedTuple):
     """How the pose (mm, rad) and the expression found in this frame change with identity and offset."""
     gradient: Float[Array, " d"]
     """Of the frame's energy, in the same units, at the person that the frame was given."""
+    by_focal: Float[Array, " 6+A"]
+    """How the pose (mm, rad) and the expression change with the logarithm of the focal length."""
 
 
 def frame_information(
     face: MultilinearFace, rig: CameraRig, view: Views, frame: Bundle, prior: Prior
 ) -> FrameInformation:
-    """The information of one frame about identity and offset.
+    """The information of one frame about identity and offset, and how its pose depends on the focal length.
 
     Args:
         face: Model.
@@ -91,16 +94,19 @@ def frame_information(
     count = frame.person.identity.size
 
     def residuals(person: Array, own: Array) -> Array:
-        offset = person[count:].reshape(frame.person.offset.shape)
+        offset = person[count:-1].reshape(frame.person.offset.shape)
         offset = frame.person.offset + prior.offset_deviations * offset
         other = Person(frame.person.identity + s_std * person[:count], offset)
+        camera = replace(rig, focal=rig.focal * jnp.exp(person[-1]))
         pose, expression = frame.poses + units[:6] * own[:6], frame.expressions + units[6:] * own[6:]
         # What is known of the person beforehand must not count once for every frame.
-        return frame_residuals(face, rig, view, Bundle(pose, expression, other), prior.weight)
+        return frame_residuals(face, camera, view, Bundle(pose, expression, other), prior.weight)
 
-    of_person, own = jnp.zeros(count + frame.person.offset.size), jnp.zeros_like(units)
-    information, by_person, gradient = reduced(residuals, of_person, own)
-    return FrameInformation(information, units[:, None] * by_person, gradient)
+    # The last one is the logarithm of the focal length.
+    of_person, own = jnp.zeros(count + frame.person.offset.size + 1), jnp.zeros_like(units)
+    information, response, gradient = reduced(residuals, of_person, own)
+    response = units[:, None] * response
+    return FrameInformation(information[:-1, :-1], response[:, :-1], gradient[:-1], response[:, -1])
 
 
 def reduced(

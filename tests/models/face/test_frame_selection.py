@@ -1,5 +1,7 @@
 """Which frames are chosen, against exhaustive search and normal matrices written out (oracle 13)."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,6 +127,20 @@ def test_the_estimate_responds_to_the_person_as_its_normal_equations_say(x64, sc
     own = J[:, :11].T @ J[:, :11] + held(face)
     expected = -units[:11, None] * np.linalg.solve(own, J[:, :11].T @ J[:, 11:])
     np.testing.assert_allclose(found.response, expected, atol=2e-5 * np.abs(expected).max())
+
+
+@pytest.mark.system
+def test_the_estimate_responds_to_the_focal_length_as_its_normal_equations_say(x64, scene):
+    """Mostly in depth, which grows in proportion to it."""
+    face, rig, view, frame = scene
+    found = frame_information(face, rig, view, frame, Prior(1.0, 0.8)).by_focal
+    J, units = whole_jacobian(scene, 0.8)
+    h = 1e-5
+    longer, shorter = (replace(rig, focal=rig.focal * np.exp(step)) for step in (h, -h))
+    by_focal = (projections(face, longer, frame) - projections(face, shorter, frame)).ravel() / (2 * h) / 0.5
+    expected = -units[:11] * np.linalg.solve(J[:, :11].T @ J[:, :11] + held(face), J[:, :11].T @ by_focal)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+    assert float(found[2]) == pytest.approx(650, rel=0.05)
 
 
 @pytest.mark.system

@@ -16,6 +16,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.synthetic.face_motion import FPS, MONOCULAR_PLACE_MM, motion, speech_schedule
 from jaxfilters.models.synthetic.face_sequence import FaceSequence, face_sequence, sequence
+from jaxfilters.trackers.head.common.focal_prior import focal_prior
 from jaxfilters.trackers.head.common.quarter_turns import upright
 from jaxfilters.trackers.head.common.report import HeadTruth
 from jaxfilters.trackers.head.common.table import pose_in_metres
@@ -26,8 +27,6 @@ from jaxfilters.trackers.io.rigs import open_rig
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.io.video_input import LiveCamera, VideoSource, open_video
 
-FOCAL_WIDTHS = 1.2
-"""Assumed focal length of a single camera, image widths: a horizontal field of view of 45 degrees."""
 _SYNTHETIC_FRAMES, _MOTION = 600, "mix"
 _COMPARED = 3
 """First images by which two recordings are recognised as the same."""
@@ -48,6 +47,8 @@ class Setup(NamedTuple):
     """Of the synthetic face."""
     note: str | None
     """What was assumed, for a person."""
+    focal_log_std: float = 0.0
+    """Standard deviation of the logarithm of a single camera's focal length; 0 where it is calibrated."""
 
 
 class Places(NamedTuple):
@@ -116,7 +117,7 @@ def _single(name: str, places: Places) -> Setup:
         raise InputError(
             "--rig: for two sources or more; one alone is described by --camera CAMERA.json, or not at all."
         )
-    source, note = open_video(name, fps=places.fps), None
+    source, note, log_std = open_video(name, fps=places.fps), None, 0.0
     if not places.camera and places.points is None:
         source, note = upright(source)
     cols, rows = source.image_size
@@ -124,12 +125,12 @@ def _single(name: str, places: Places) -> Setup:
         K, distortion, image_size = open_intrinsics(places.camera)
         _check_size(source, image_size, str(places.camera))
     else:
-        focal = FOCAL_WIDTHS * cols
+        focal, log_std, origin = focal_prior(name, (cols, rows))
         K, distortion = np.array([[focal, 0, (cols - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1]]), np.zeros(5)
-        note = "; ".join([*filter(None, [note]), f"an assumed focal length of {focal:.0f} px"])
+        note = "; ".join([*filter(None, [note]), origin])
     undistortion = Undistortion((rows, cols), K, distortion)
     rig = monocular(Pinhole.from_matrix(K, (rows, cols)))
-    return Setup(rig, [undistortion], [source], _points(places.points, undistortion), None, note)
+    return Setup(rig, [undistortion], [source], _points(places.points, undistortion), None, note, log_std)
 
 
 def _refuse_unused(places: Places) -> None:

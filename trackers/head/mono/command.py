@@ -58,7 +58,15 @@ def track(options: argparse.Namespace) -> str:
     gallery = None if known is None else known.gallery
     detected_by, detector = _detector(options)
     session = as_input_error(
-        lambda: MonoSession(place.rig, model.model, settings, place.points, detector=detector, gallery=gallery)
+        lambda: MonoSession(
+            place.rig,
+            model.model,
+            settings,
+            place.points,
+            detector=detector,
+            gallery=gallery,
+            focal_log_std=place.focal_log_std,
+        )
     )
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
     stream = HeadStream(place, session, rows, settings.chunk)
@@ -79,12 +87,13 @@ def _tracked(
 ) -> str:
     place, face = stream.place, tracked(model.model)
     if place.note:
-        warn(f"{place.note}: distances are wrong in proportion")
+        warn(place.note)
     followed = run.follow()
     person = session.person
     report = run_report(stream, run.writer.results, followed) | {
         "focal_length_px": np.asarray(place.rig.focal[0], float).tolist(),
-        "is_focal_length_assumed": place.truth is None and options.camera is None,
+        "is_focal_length_assumed": place.focal_log_std > 0,
+        "focal_length_log_std": place.focal_log_std,
         "eyes_apart_mm": None if person is None else finite(float(eyes_apart(face, person))),
         "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
         "taken_for": _taken_for(run, known),

@@ -22,7 +22,7 @@ from jaxfilters.trackers.head.mono.recognition import weighed
 from jaxfilters.trackers.head.mono.state import MonoState
 
 LOG_STD = 0.3
-"""Of the logarithm of a focal length about the assumed one: cameras of 0.9 to 1.6 image widths where 1.2 is assumed."""
+"""Of the logarithm of a focal length about the given one, whatever is known of that: as wide as among cameras."""
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 21) * LOG_STD)
 """Of the assumed focal length that are tried."""
 DETERMINED = 0.5

@@ -23,7 +23,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="video file, folder of images or number of a live camera; without it, a synthetic face",
     )
     parser.add_argument(
-        "--camera", type=Path, metavar="CAMERA.json", help="intrinsics (default: a focal length of 1.2 image widths)"
+        "--camera",
+        type=Path,
+        metavar="CAMERA.json",
+        help="intrinsics (default: the focal length that the file's metadata say, or that of a usual camera)",
     )
     parser.add_argument(
         "--estimate-focal",

@@ -72,6 +72,7 @@ class MonoSession:
         detections: Detections | None = None,
         detector: Detector | None = None,
         gallery: Gallery | None = None,
+        focal_log_std: float = 0.0,
     ) -> None:
         """A session before its first frame.
 
@@ -85,11 +86,13 @@ class MonoSession:
             detections: Landmarks that were found otherwise in several images, the last of which is still to come.
             detector: What finds landmarks; OpenCV's cascades if none.
             gallery: People of the same model who may be before the camera, beside unknown people.
+            focal_log_std: Standard deviation of the logarithm of the camera's focal length, by which distances are
+                uncertain in proportion; 0 for one that is calibrated.
 
         Raises:
             ValueError: if there is not one camera, or its frame is not the world, the model has other landmarks,
-                `points` are not ten or 68 finite pixels, or `gallery` is not of the model or for the tracker of the
-                thesis, which knows nobody.
+                `points` are not ten or 68 finite pixels, `gallery` is not of the model or for the tracker of the
+                thesis, which knows nobody, or `focal_log_std` is negative or not finite.
         """
         if rig.num_cameras != 1:
             raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
@@ -101,7 +104,9 @@ class MonoSession:
             check_points(np.asarray(points)[list(FROM_68)])
         options = options or MonoConfig()
         _check_gallery(gallery, tracked(face), options)
-        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, gallery)
+        if not (math.isfinite(focal_log_std) and focal_log_std >= 0):
+            raise ValueError(f"focal_log_std must be finite and at least 0; got {focal_log_std}.")
+        self._tracker = _MonoTracker(rig, face, options, points, detections, detector, gallery, focal_log_std)
         self._following = Following(self._tracker)
 
     @property
@@ -170,7 +175,7 @@ def track(
         config: Constants.
         face: Model of ten landmarks, or of the 68 of iBUG; by default the general one of
             `jaxfilters.trackers.io.face_models.people_face_model`, as for videos by the command.
-        known: `points`, `detections`, `detector` and `gallery` of `MonoSession`.
+        known: `points`, `detections`, `detector`, `gallery` and `focal_log_std` of `MonoSession`.
 
     Returns:
         The track: millimetres and radians, NaN where the head is not tracked.
@@ -196,6 +201,7 @@ class _MonoTracker:
         detections: Detections | None,
         detector: Detector | None,
         gallery: Gallery | None,
+        focal_log_std: float,
     ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
         self._whole, face = face, tracked(face)
@@ -205,7 +211,8 @@ class _MonoTracker:
         self._compiled = replace(MonoConfig(), **{name: getattr(options, name) for name in _STATIC})
         self._gallery = gallery
         self._people = people(face, gallery)
-        self._system = System(face, face, rig, search_of(rig, options))
+        deviation = jnp.asarray(focal_log_std, face.mean.dtype)
+        self._system = System(face, face, rig, search_of(rig, options), deviation)
         self._num_at_recognition = 0
         """Adjustments when it was last asked who it is."""
         self._detector = detector

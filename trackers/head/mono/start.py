@@ -158,6 +158,7 @@ def begin(
         model=model,
         modes=modes,
         response=jnp.zeros((POSE + face.num_expressions, size), x.dtype),
+        by_focal=jnp.zeros(POSE + face.num_expressions, x.dtype),
         registered=registered,
         window=window,
         identities=jnp.tile(person.identity, (AVERAGED, 1)),

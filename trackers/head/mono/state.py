@@ -94,6 +94,8 @@ class MonoState(NamedTuple):
     """Between those and the parameters of expressions."""
     response: Float[Array, "6+A d"]
     """How pose and expression change with the person, when the face was last found."""
+    by_focal: Float[Array, " 6+A"]
+    """The same with the logarithm of the focal length."""
     registered: Registered
     window: Window
     identities: Float[Array, "m S"]

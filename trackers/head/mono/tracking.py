@@ -52,6 +52,8 @@ class System(NamedTuple):
     """Whom the state is about: the same, or an enrolled person."""
     rig: CameraRig
     searches: Searches
+    focal_log_std: Float[Array, ""]
+    """Standard deviation of the logarithm of the focal length."""
 
 
 @partial(jax.jit, static_argnames="options")
@@ -188,10 +190,14 @@ def _adjusted(
     system: System, state: MonoState, estimate: Estimate, score: Array, missed: Array, options: MonoConfig
 ) -> tuple[MonoState, Array]:
     """The state after the face was adjusted, if this frame allows and deserves it; and whether it was."""
-    unknown, face, rig, _ = system
+    unknown, face, rig = system[:3]
     frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, state.prior)
-    response = jnp.where(missed, state.response, frame.about_person.response)
-    state = state._replace(response=jnp.where(jnp.all(jnp.isfinite(response)), response, state.response))
+    _, response, _, by_focal = frame.about_person
+    is_told = ~missed & jnp.all(jnp.isfinite(response)) & jnp.all(jnp.isfinite(by_focal))
+    state = state._replace(
+        response=jnp.where(is_told, response, state.response),
+        by_focal=jnp.where(is_told, by_focal, state.by_focal),
+    )
     if not options.adjust:
         return state, jnp.zeros((), bool)
     further = 1.0 if options.is_published else adjustment.FURTHER
@@ -211,7 +217,7 @@ def _adjusted(
 def _track(
     system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, num_sure: Array
 ) -> MonoTrack:
-    unknown, face, rig, _ = system
+    unknown, face, rig = system[:3]
     lost = state.misses >= PATIENCE
     known = lambda a: jnp.where(lost, jnp.nan, a)
     x = state.belief.mean
@@ -222,6 +228,7 @@ def _track(
     # Landmarks that are followed from frame to frame are wrong together: only those that look as registered count.
     wider = jnp.where(is_sure, 1.0, jnp.square(NUM_LANDMARKS / jnp.maximum(num_sure, FEWEST_ANCHORED)))
     variance = wider * jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
+    variance += jnp.square(system.focal_log_std * state.by_focal[:POSE])
     expression = state.modes.expression(face, x[POSE:])
     return MonoTrack(
         pose=known(x[:POSE]),

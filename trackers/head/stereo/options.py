@@ -23,7 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--camera",
         type=Path,
         metavar="CAMERA.json",
-        help="intrinsics of a single camera (default: a focal length of 1.2 image widths)",
+        help="intrinsics of a single camera (default: the focal length in the file's metadata, or a usual one)",
     )
     parser.add_argument(
         "--points",

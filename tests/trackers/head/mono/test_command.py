@@ -20,10 +20,13 @@ from jaxfilters.trackers.head.mono import command as mono_command
 from jaxfilters.trackers.head.mono.focal import FocalLength
 from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.head.mono.table import empty_mono_rows
+from jaxfilters.trackers.io.cameras import write_camera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.face_models import default_face_model, save_face_model
 
 ROWS, COLS, FRAMES = 48, 64, 20
+FILM_MM = np.hypot(36, 24)
+"""Diagonal."""
 OUTPUTS = {"person.npz", "track.csv", "track.npz", "report.json", "summary.png", "overlay.mp4"}
 
 
@@ -63,8 +66,8 @@ def fake(monkeypatch):
     class FakeSession(mono_command.MonoSession):
         events, model, person, gallery = (), None, None, None
 
-        def __init__(self, rig, face, options, points, *, detector, gallery=None):
-            self.known = gallery
+        def __init__(self, rig, face, options, points, *, detector, gallery=None, focal_log_std=0.0):
+            self.known, self.focal_log_std = gallery, focal_log_std
             self.rig, self.face, self.options, self.points, self.frames = rig, face, options, points, 0
             self.events = []
             made.append(self)
@@ -117,7 +120,9 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     report = json.loads((out / "report.json").read_text())
     assert report["is_focal_length_assumed"] is True
     assert report["detector"] in ("cascades", "mediapipe")
-    assert report["focal_length_px"][0] == pytest.approx(1.2 * COLS)
+    # A lens of 30 mm, of which the diagonal of film is 43.27.
+    assert report["focal_length_px"][0] == pytest.approx(30 / FILM_MM * np.hypot(COLS, ROWS))
+    assert report["focal_length_log_std"] == fake[0].focal_log_std == 0.25
     assert 50 < report["eyes_apart_mm"] < 80
     assert report["events"] == [{"frame": 2, "what": "registered"}]
     assert report["adjusted_frames"] > 0
@@ -153,11 +158,32 @@ def test_whom_one_run_followed_the_next_may_know(pictures, fake, tmp_path, capsy
 def test_the_focal_length_is_said_if_asked_for(pictures, fake, tmp_path, capsys):
     assert run(pictures, "--out", tmp_path / "out", "--estimate-focal", "--no-video") == 0
     estimate = json.loads((tmp_path / "out" / "report.json").read_text())["focal_length_estimate"]
-    assert estimate["px"] == pytest.approx(1.1 * 1.2 * COLS, rel=1e-5)
-    assert estimate["std_px"] == pytest.approx(0.1 * 1.1 * 1.2 * COLS, rel=1e-5)
-    assert "the focal length looks like 84 px, give or take 8" in capsys.readouterr().out
+    assumed = 30 / FILM_MM * np.hypot(COLS, ROWS)
+    assert estimate["px"] == pytest.approx(1.1 * assumed, rel=1e-4)
+    assert estimate["std_px"] == pytest.approx(0.1 * 1.1 * assumed, rel=1e-4)
+    assert "the focal length looks like 61 px, give or take 6" in capsys.readouterr().out
     assert run(pictures, "--out", tmp_path / "again", "--no-video") == 0
     assert json.loads((tmp_path / "again" / "report.json").read_text())["focal_length_estimate"] is None
+
+
+def test_the_focal_length_is_that_of_the_metadata_or_of_the_camera_file(fake, tmp_path, capsys):
+    image_module = pytest.importorskip("PIL.Image")
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    exif = image_module.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    for i in range(FRAMES):
+        image_module.fromarray(np.full((ROWS, COLS, 3), 100 + i, np.uint8)).save(folder / f"{i:03d}.jpg", exif=exif)
+    assert run(folder, "--out", tmp_path / "a", "--no-video") == 0
+    focal = 26 / FILM_MM * np.hypot(COLS, ROWS)
+    np.testing.assert_allclose(fake[0].rig.focal, [[focal, focal]], rtol=1e-5)
+    assert fake[0].focal_log_std == 0.1
+    assert f"a focal length of {focal:.0f} px from the file's metadata (26 mm on film)" in capsys.readouterr().err
+    write_camera(tmp_path / "camera.json", (COLS, ROWS), K=np.array([[80.0, 0, 31], [0, 80, 23], [0, 0, 1]]))
+    assert run(folder, "--out", tmp_path / "b", "--camera", tmp_path / "camera.json", "--no-video") == 0
+    assert (float(fake[1].rig.focal[0, 0]), fake[1].focal_log_std) == (80.0, 0.0)
+    report = json.loads((tmp_path / "b" / "report.json").read_text())
+    assert report["is_focal_length_assumed"] is False
 
 
 def test_marked_landmarks_reach_the_session(pictures, fake, tmp_path):

@@ -108,6 +108,22 @@ def test_standard_deviations_hold_what_is_not_known_of_the_person(followed, talk
 
 
 @pytest.mark.system
+def test_a_focal_length_that_is_not_calibrated_is_in_the_standard_deviations(rig, face, talking, detected):
+    """Taken for a fifth too long, with a deviation of a fifth: depths are a fifth too long, and say that they may."""
+    made, images = talking
+    longer = dataclasses.replace(rig, focal=1.2 * rig.focal)
+    session = MonoSession(longer, face, detections=detected, focal_log_std=0.2)
+    track = process(session, images[:32], made.times[:32])
+    z, z_std = track.pose[START:32, 2], track.pose_std[START:32, 2]
+    assert np.median(z / made.poses[START:32, 2]) == pytest.approx(1.2, abs=0.06)
+    np.testing.assert_allclose(z_std / z, 0.2, atol=0.02)
+    within = np.abs(track.pose[START:] - made.poses[START:32]) < 2 * track.pose_std[START:]
+    assert within.mean(axis=0).min() > 0.9
+    with pytest.raises(ValueError, match="focal_log_std must be finite and at least 0; got -1"):
+        MonoSession(rig, face, focal_log_std=-1.0)
+
+
+@pytest.mark.system
 def test_a_lost_face_is_reported_and_found_again(rig, face, talking, detected):
     made, images = talking
     session = MonoSession(rig, face, detections=detected)

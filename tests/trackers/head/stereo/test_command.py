@@ -229,8 +229,8 @@ def test_ctrl_c_before_anything_was_tracked(stereo, fake_head, tmp_path, monkeyp
 def test_one_camera_is_followed_with_an_assumed_focal_length(stereo, fake_head, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(stereo[0], "--out", out, "--no-video", "--fps", 10, "--seconds", 1) == 0
-    assert "an assumed focal length of 77 px" in capsys.readouterr().err
-    np.testing.assert_allclose(fake_head[0].rig.focal, [[76.8, 76.8]], rtol=1e-6)
+    assert "an assumed focal length of 55 px" in capsys.readouterr().err
+    np.testing.assert_allclose(fake_head[0].rig.focal, [[55.4701, 55.4701]], rtol=1e-5)
     np.testing.assert_allclose(fake_head[0].rig.center, [[31.5, 23.5]])
     assert [float(row["time_s"]) for row in rows_of(out)] == pytest.approx(np.arange(11) / 10)
     assert "assumed" in json.loads((out / "report.json").read_text())["note"]
