@@ -31,6 +31,8 @@ from jaxfilters.trackers.io.face_models import people_face_model
 
 SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
 """Of the metrics, by detector."""
+WORN = {"glasses": {"has_glasses": True}, "beard": {"beard": 0.9}}
+"""What the same people wear besides, in runs of their own with the model of the package."""
 AXES = {"x": 0, "y": 1, "z": 2, "roll": 3, "yaw": 4, "pitch": 5}
 EVERY = 3
 """Frames from one in which landmarks are detected for `solvePnP` to the next."""
@@ -57,6 +59,8 @@ class DetectedRun(NamedTuple):
 def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Errors of both detectors with a model of other people of the same kind, and with that of the package.
 
+    With the latter also of the same people with glasses, and with a beard.
+
     Raises:
         RecordingError: if a recording is missing.
     """
@@ -66,17 +70,24 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     faces = {"modelled": modelled_face(seed)}
     if not quick:
         faces["modelled_rendered"] = people_face_model().model
-    detectors = available_detectors()
+    detectors, num_frames = available_detectors(), QUICK_NUM_FRAMES if quick else NUM_FRAMES
     runs: dict[str, list[DetectedRun]] = {}
+
+    def follow(made: IctSequence, kind: str, face: MultilinearFace, person: int) -> None:
+        for name, detector in detectors.items():
+            one = detected_run(made, face, detector, person + seed)
+            runs.setdefault(f"{kind}{SUFFIXES[name]}", []).append(one)
+            means = {"tracked": one.errors, "solvePnP": one.pnp_errors}
+            message = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
+            sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {message}\n")
+
     for person, stretch in PEOPLE[: 1 if quick else None]:
-        made = filmed(model, turns[stretch], speech, person + seed, QUICK_NUM_FRAMES if quick else NUM_FRAMES)
+        made = filmed(model, turns[stretch], speech, person + seed, num_frames)
         for kind, face in faces.items():
-            for name, detector in detectors.items():
-                one = detected_run(made, face, detector, person + seed)
-                runs.setdefault(f"{kind}{SUFFIXES[name]}", []).append(one)
-                means = {"tracked": one.errors, "solvePnP": one.pnp_errors}
-                message = ", ".join(f"{key} {np.round(np.mean(errors, axis=0), 1)}" for key, errors in means.items())
-                sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {message}\n")
+            follow(made, kind, face, person)
+        for worn, how in () if quick else WORN.items():
+            made = filmed(model, turns[stretch], speech, person + seed, num_frames, **how)
+            follow(made, f"modelled_{worn}", faces["modelled_rendered"], person)
     metrics: dict[str, Metric] = {}
     for name, of_people in runs.items():
         metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])

@@ -2,6 +2,7 @@
 
 import sys
 from functools import cache
+from typing import Any
 
 import jax
 import numpy as np
@@ -146,11 +147,14 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     return metrics
 
 
-def filmed(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int) -> IctSequence:
-    """A person that turns and speaks as recorded, before one camera."""
+def filmed(
+    model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int, **worn: Any
+) -> IctSequence:
+    """A person that turns and speaks as recorded, before one camera; `worn` as in `ict_sequence`."""
     poses = biwi_course(turns, num_frames, place_mm=MONOCULAR_PLACE_MM)
     expressions = livelink_course(speech, num_frames)
-    return ict_sequence(jax.random.key(FIRST_PERSON + person), model, poses, rig=camera(), expressions=expressions)
+    key = jax.random.key(FIRST_PERSON + person)
+    return ict_sequence(key, model, poses, rig=camera(), expressions=expressions, **worn)
 
 
 def _by_yaw(name: str, runs: list[MonoRun]) -> dict[str, Metric]:

@@ -12,7 +12,8 @@ the tracker of the thesis, `_paper_map` the same with priors, `_projected` witho
 by how widely the five heads are turned. Modelled people are followed by two models of faces, by one of them also from
 68 landmarks, `modelled_68_`. Metrics that end in `_modelled` are of the same people from their images alone, as a
 detector finds their landmarks, beside `solvePnP` on the same landmarks (`pnp_`); in `_modelled_rendered` with the model
-of the package, in `_mediapipe` with MediaPipe's mesh where it is installed. They need `ict_face_model`,
+of the package, in `_mediapipe` with MediaPipe's mesh where it is installed, in `_modelled_glasses` and
+`_modelled_beard` with the model of the package and what these people then wear. They need `ict_face_model`,
 `biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos `talking_face_video`; what is
 missing is said and left out. All of it takes hours: with `--out`, a run that was cut off goes on after the last user
 and the last part that it had finished.

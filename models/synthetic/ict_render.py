@@ -17,7 +17,18 @@ from jaxfilters.models.rendering.triangles import TRIANGLES, mesh_parts
 from jaxfilters.models.rendering.windows import COARSE, plan_windows
 from jaxfilters.models.synthetic.face_render import NOISE_STD
 from jaxfilters.models.synthetic.ict_face import IctModel, IctPerson, deformed
-from jaxfilters.models.synthetic.ict_skin import EYE_FIELD, HAIR_FIELD, LOW_MM, MOUTH_FIELD, PIXEL_MM, Skin, map_place
+from jaxfilters.models.synthetic.ict_skin import (
+    EYE_FIELD,
+    HAIR_FIELD,
+    LOW_MM,
+    MOUTH_FIELD,
+    PIXEL_MM,
+    REFLECTION_FIELD,
+    RIM_FIELD,
+    Skin,
+    map_place,
+)
+from jaxfilters.models.synthetic.ict_worn import LIDS, Glasses, reflection_faces, reflections
 from jaxfilters.typing import AnyKey
 
 EYE_RADIUS_MM, EYE_DEPTH_MM = 12.5, 10.6
@@ -27,8 +38,9 @@ SKULL_HEIGHT_MM, SKULL_DEPTH_MM = 190.0, 95.0
 """Of the hair that closes the head behind the skin."""
 LIGHT, AMBIENT, DIRECT = (-0.35, -0.65, -0.68), 0.42, 0.62
 """Direction to the light in the world, and what the surface gets without and from it."""
-_LIDS = (tuple(range(36, 42)), tuple(range(42, 48)))
 _INNER_LIPS = tuple(range(60, 68))
+_AHEAD = np.array([0.0, 0.0, 600.0, 0.0, 0.0, 0.0])
+"""A pose by which triangles are put in order."""
 
 
 @pytree_dataclass
@@ -43,13 +55,15 @@ class IctHead:
     """Balls of the right and the left eye, millimetres in the model frame."""
     skull: Float[Array, "points 3"]
     """Millimetres in the model frame."""
+    glasses: Glasses | None
+    """Which the person wears, if any."""
 
 
-def make_ict_head(model: IctModel, person: IctPerson) -> IctHead:
-    """The head of a person: the skin, balls behind the lids, a dark sheet behind the lips, hair."""
+def make_ict_head(model: IctModel, person: IctPerson, glasses: Glasses | None = None) -> IctHead:
+    """The head of a person: the skin, balls behind the lids, a dark sheet behind the lips, hair, perhaps glasses."""
     neutral, landmarks = np.asarray(person.neutral, float), np.asarray(model.landmarks)
     eye, eye_faces, eye_place = _eyeball()
-    centers = [neutral[landmarks[list(lids)]].mean(axis=0) + np.array([0, 0, EYE_DEPTH_MM]) for lids in _LIDS]
+    centers = [neutral[landmarks[list(lids)]].mean(axis=0) + np.array([0, 0, EYE_DEPTH_MM]) for lids in LIDS]
     skull, skull_faces, skull_place = _skull(neutral)
     mouth_faces = np.array([(0, i + 1, (i + 1) % len(_INNER_LIPS) + 1) for i in range(len(_INNER_LIPS))])
     mouth_place = np.tile(MOUTH_FIELD, (len(_INNER_LIPS) + 1, 1))
@@ -60,14 +74,21 @@ def make_ict_head(model: IctModel, person: IctPerson) -> IctHead:
         (mouth_place, mouth_faces),
         (skull_place, skull_faces),
     ]
+    mouth = np.concatenate([[[0.0, 0.0, 0.0]], neutral[landmarks[list(_INNER_LIPS)]]])
+    shown = [neutral, *(eye + center for center in centers), mouth, skull]
+    if glasses is not None:
+        points = [np.asarray(glasses.points), np.asarray(reflections(glasses, jnp.asarray(_AHEAD, float)))]
+        fields, triangles = (RIM_FIELD, REFLECTION_FIELD), (np.asarray(glasses.faces), reflection_faces())
+        pieces += [
+            (np.tile(field, (len(one), 1)), faces) for field, one, faces in zip(fields, points, triangles, strict=True)
+        ]
+        shown += points
     starts = np.cumsum([0] + [len(places) for places, _ in pieces[:-1]])
     faces = np.concatenate([start + one for start, (_, one) in zip(starts, pieces, strict=True)])
-    balls = np.stack([eye + center for center in centers])
-    mouth = np.concatenate([[[0.0, 0.0, 0.0]], neutral[landmarks[list(_INNER_LIPS)]]])
-    vertices = np.concatenate([neutral, *balls, mouth, skull])
+    balls, vertices = np.stack(shown[1:3]), np.concatenate(shown)
     ordered = mesh_from_trimesh(trimesh.Trimesh(vertices, faces, process=False)).faces
     places = jnp.asarray(np.concatenate([places for places, _ in pieces]), float)
-    return IctHead(ordered, places, jnp.asarray(balls, float), jnp.asarray(skull, float))
+    return IctHead(ordered, places, jnp.asarray(balls, float), jnp.asarray(skull, float), glasses)
 
 
 @jax.jit
@@ -102,7 +123,8 @@ def render_ict(
     """
     skin_points = deformed(model, person, weights)
     lips = skin_points[model.landmarks[jnp.asarray(_INNER_LIPS)]]
-    vertices = jnp.concatenate([skin_points, *head.eyes, _inside(lips), head.skull])
+    worn = [] if head.glasses is None else [head.glasses.points, reflections(head.glasses, pose)]
+    vertices = jnp.concatenate([skin_points, *head.eyes, _inside(lips), head.skull, *worn])
     world = place(vertices, pose)
     to_light = jnp.asarray(light, world.dtype)
     toward = jnp.sum(_normals(world, head.faces) * to_light, axis=-1) / jnp.sqrt(jnp.sum(jnp.square(to_light)))

@@ -16,6 +16,7 @@ from jaxfilters.models.synthetic.face_texture import make_background
 from jaxfilters.models.synthetic.ict_face import IctModel, IctPerson, deformed, make_ict_person, ten_landmarks
 from jaxfilters.models.synthetic.ict_render import IctHead, make_ict_head, render_ict
 from jaxfilters.models.synthetic.ict_skin import Skin, paint_skin
+from jaxfilters.models.synthetic.ict_worn import make_glasses
 from jaxfilters.typing import AnyKey
 
 
@@ -84,6 +85,8 @@ def ict_sequence(
     rig: CameraRig | None = None,
     expressions: Float[np.ndarray, "frames expressions"] | None = None,
     gain: Float[np.ndarray, " frames"] | None = None,
+    has_glasses: bool = False,
+    beard: float = 0.0,
 ) -> IctSequence:
     """A random person along a course of poses, millimetres and radians, at 30 frames a second.
 
@@ -94,18 +97,21 @@ def ict_sequence(
         rig: Cameras; the two of `rig.nominal` if none.
         expressions: Strengths in the order of `model.names`; neutral if none.
         gain: Factor of the light; 1 if none.
+        has_glasses: Whether the person wears a random pair; all else is the same without it.
+        beard: Share of the skin about mouth and jaw that a beard hides; see `paint_skin`.
     """
     rig = nominal() if rig is None else rig
     identity_key, looks, walls, noise = jax.random.split(key, 4)
     person, num_frames = make_ict_person(identity_key, model), len(poses)
     expressions = np.zeros((num_frames, len(model.names))) if expressions is None else expressions
+    glasses = make_glasses(jax.random.fold_in(looks, 2), model, person) if has_glasses else None
     shapes, uv68 = _truth(model, person, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
     return IctSequence(
         key=noise,
         model=model,
         person=person,
-        head=make_ict_head(model, person),
-        skin=paint_skin(looks, model),
+        head=make_ict_head(model, person, glasses),
+        skin=paint_skin(looks, model, beard=beard),
         background=jnp.stack([make_background(wall, rig.shape) for wall in jax.random.split(walls, rig.num_cameras)]),
         rig=rig,
         times=np.arange(num_frames) / FPS,

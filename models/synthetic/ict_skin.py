@@ -1,8 +1,8 @@
 """What the skin of a modelled face looks like: a grey map around the head that moves with the skin.
 
 The map is a cylinder about the y axis of the model's mean face: u = 100 mm times the angle, v = y. Features are painted
-at the landmarks of the mean face, so that they are at those of everybody. Below the skin the map holds three more
-fields: the ball of an eye, the dark of the mouth, hair.
+at the landmarks of the mean face, so that they are at those of everybody. Below the skin the map holds more fields: the
+ball of an eye, the dark of the mouth, hair, the rims of glasses and what their lenses reflect.
 """
 
 from dataclasses import dataclass
@@ -25,6 +25,8 @@ EYE_FIELD, MOUTH_FIELD, HAIR_FIELD = (-120.0, 225.0), (0.0, 225.0), (120.0, 225.
 """Middles (u, v) of the other fields."""
 FIELD_MM = 50.0
 """Half their side."""
+RIM_FIELD, REFLECTION_FIELD = (195.0, 225.0), (-195.0, 225.0)
+"""Middles of two narrow ones, for glasses (`jaxfilters.models.synthetic.ict_worn`)."""
 FRECKLE_WAVELENGTHS_MM = (2.0, 3.5, 6.0, 10.0)
 IRIS_MM, PUPIL_MM = 5.85, 2.6
 """Radii on the ball of the eye: irises of people are 11.7 mm wide (F. Ruefer, A. Schroeder, C. Erb 2005)."""
@@ -50,6 +52,7 @@ class _Looks:
     hair: float
     freckles: float
     iris: float
+    beard: float
 
 
 def map_place(points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*points 2"]:
@@ -57,8 +60,14 @@ def map_place(points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*poi
     return np.stack([RADIUS_MM * np.arctan2(points[..., 0], -points[..., 2]), points[..., 1]], axis=-1)
 
 
-def paint_skin(key: AnyKey, model: IctModel) -> Skin:
-    """The skin of a random person: brows, lids, irises, lips, nostrils, hair, and spots of 2 to 10 mm."""
+def paint_skin(key: AnyKey, model: IctModel, *, beard: float = 0.0) -> Skin:
+    """The skin of a random person: brows, lids, irises, lips, nostrils, hair, and spots of 2 to 10 mm.
+
+    Args:
+        key: Of the person's looks, which do not depend on the beard.
+        model: Of all people.
+        beard: Share of the skin about mouth and jaw that it hides: 0 for none, .4 for stubble, .9 for a full one.
+    """
     draw = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))))
     looks = _Looks(
         skin=draw.uniform(165, 205),
@@ -68,6 +77,7 @@ def paint_skin(key: AnyKey, model: IctModel) -> Skin:
         hair=draw.uniform(30, 75),
         freckles=draw.uniform(3.0, 4.5),
         iris=draw.uniform(40, 90),
+        beard=beard,
     )
     places = map_place(np.asarray(model.neutral, float)[np.asarray(model.landmarks)])
     size = tuple(round((high - low) / PIXEL_MM) for low, high in zip(LOW_MM, HIGH_MM, strict=True))
@@ -77,6 +87,11 @@ def paint_skin(key: AnyKey, model: IctModel) -> Skin:
         grey = features(grey, places, looks, draw)
     grey += sum(_spots(draw, shape, length) for length in FRECKLE_WAVELENGTHS_MM) * looks.freckles
     grey = _fields(grey, looks, draw)
+    grey = np.where(_field(grey.shape, RIM_FIELD, 10.0), draw.uniform(15, 90), grey)
+    if beard:
+        hairs = np.random.default_rng(np.asarray(jax.random.bits(jax.random.fold_in(key, 1), (4,))))
+        grey = _beard(grey, places, looks, hairs)
+    grey = np.where(_field(grey.shape, REFLECTION_FIELD, 10.0), 250.0, grey)
     return Skin(jnp.asarray(np.clip(grey, 5, 250), float))
 
 
@@ -180,14 +195,29 @@ def _lids(grey, places, _looks, _draw):
     return grey
 
 
+def _beard(grey, places, looks, draw):
+    """Hair along the jaw, on the chin, and between nose and mouth; lips stay free."""
+    jaw = places[3:14] + np.outer(np.r_[0, np.full(9, 15), 0], [0, 1])
+    cheeks = np.array([places[54] + [16, -4], places[35] + [5, 5], places[31] + [-5, 5], places[48] + [-16, -4]])
+    mask = _mask(grey.shape, np.concatenate([jaw, cheeks]), 3.0) * (1 - _mask(grey.shape, places[48:60], 1.0))
+    return _toward(grey, looks.beard * mask, looks.hair + 15 * _strands(draw, grey.shape))
+
+
+def _millimetres(shape):
+    """Places (u, v) of the pixels."""
+    v, u = np.indices(shape)
+    return (u + 0.5) * PIXEL_MM + LOW_MM[0], (v + 0.5) * PIXEL_MM + LOW_MM[1]
+
+
+def _field(shape, middle, half_mm):
+    u, v = _millimetres(shape)
+    return (np.abs(u - middle[0]) <= half_mm) & (np.abs(v - middle[1]) <= half_mm)
+
+
 def _fields(grey, looks, draw):
     """The map with eye, mouth and hair in their places."""
-    v, u = np.indices(grey.shape)
-    u, v = (u + 0.5) * PIXEL_MM + LOW_MM[0], (v + 0.5) * PIXEL_MM + LOW_MM[1]
-
-    def field(middle):
-        return (np.abs(u - middle[0]) <= FIELD_MM + 5) & (np.abs(v - middle[1]) <= FIELD_MM + 5)
-
+    u, v = _millimetres(grey.shape)
+    field = lambda middle: _field(grey.shape, middle, FIELD_MM + 5)
     radius = np.hypot(u - EYE_FIELD[0], v - EYE_FIELD[1])
     ring, pupil = (np.clip(0.5 - (radius - reach) / 0.8, 0, 1) for reach in (IRIS_MM, PUPIL_MM))
     eye = _toward(_toward(np.full(grey.shape, 205.0), ring, looks.iris), pupil, 12.0)

@@ -21,6 +21,7 @@ from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame, units
 from jaxfilters.trackers.head.mono.person import Modes, model_of
+from jaxfilters.trackers.head.mono.repetition import likeness, shares, total_information
 from jaxfilters.trackers.head.mono.state import MonoState, Window, reach_of
 
 STEPS = (5, 5)
@@ -81,7 +82,7 @@ def uncertainty(
     response: Float[Array, "m d"],
 ) -> Float[Array, "m m"]:
     """Covariance of what responds to identity and offset, by what is not known of them."""
-    total = known(face, prior, person) + jnp.sum(window.information, axis=0)
+    total = known(face, prior, person) + total_information(face, window)
     root = jnp.linalg.cholesky(total)
     part = jax.scipy.linalg.solve_triangular(root, response.T, lower=True)
     return jnp.matmul(part.T, part, precision="highest")
@@ -94,7 +95,10 @@ def choose(
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
         beside = known(face, prior, person)
-        place, gain = information_gain(window.information, frame.about_person.information, beside, may_go)
+        poses = jnp.concatenate([window.poses, frame.pose[None]])
+        expressions = jnp.concatenate([window.expressions, frame.expression[None]])
+        alike = likeness(face, poses, expressions)
+        place, gain = information_gain(window.information, frame.about_person.information, beside, may_go, alike)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
@@ -151,7 +155,10 @@ def fitted(
     if prior.past is not None:
         prior = prior._replace(past=about_face(prior.past, unknown, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
-    return adjust(face, rig, state.window.views, start, prior, reach_of(options), steps=steps, losses=losses)
+    count = None if options.is_published else shares(face, state.window)
+    return adjust(
+        face, rig, state.window.views, start, prior, reach_of(options), steps=steps, losses=losses, shares=count
+    )
 
 
 def settled(

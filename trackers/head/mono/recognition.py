@@ -22,6 +22,7 @@ from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.adjustment import fitted, informed, known, prior_information, settled
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import units
+from jaxfilters.trackers.head.mono.repetition import total_information
 from jaxfilters.trackers.head.mono.state import MonoState
 
 STEPS = (10, 20)
@@ -114,7 +115,7 @@ def weighed(
     """
     bundle, info = fitted(unknown, face, rig, state, start, options, STEPS)
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    gained = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
+    gained = total_information(face, informed(face, rig, window, bundle.person, state.prior))
     people = Prior(state.prior.weight, state.prior.offset_std, misplaced=state.prior.misplaced)
     before = prior_information(face, bundle.person, people)
     after = known(face, state.prior, bundle.person) + gained
@@ -130,7 +131,7 @@ def as_gallery(unknown: MultilinearFace, face: MultilinearFace, state: MonoState
         face: Whom the state is about: the same, or an enrolled person.
         state: With a window that has been informed of that person.
     """
-    total = known(face, state.prior, state.person) + jnp.sum(state.window.information, axis=0)
+    total = known(face, state.prior, state.person) + total_information(face, state.window)
     unit, count = units(face, state.prior), face.num_identities
     covariance = (unit[:, None] * jnp.linalg.inv(total) * unit)[:count, :count]
     offset = own_offset(state.person, state.prior) + face.mean - unknown.mean

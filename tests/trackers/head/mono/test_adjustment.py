@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.models.face.bundle import Adjustment, Bundle, projected
+from jaxfilters.models.face.bundle import Adjustment, Bundle, adjust, projected
 from jaxfilters.models.face.multilinear import expression_basis, shape
 from jaxfilters.models.face.person_prior import Person
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.face.shape_model import shape as shape_of_model
 from jaxfilters.trackers.head.mono.adjustment import Frame, adjusted, choose, frame_of, informed, uncertainty
 from jaxfilters.trackers.head.mono.config import PUBLISHED, MonoConfig
+from jaxfilters.trackers.head.mono.repetition import shares, total_information
 from jaxfilters.trackers.head.mono.start import Start, begin, detected
-from jaxfilters.trackers.head.mono.state import REACH, Window, prior_of
+from jaxfilters.trackers.head.mono.state import REACH, WIDE_REACH, Window, prior_of
 
 pytestmark = pytest.mark.system
 
@@ -117,6 +118,23 @@ def moved(rig, face, observed):
     return state, jax.jit(lambda state, frame: adjusted(face, face, rig, state, frame, place, USUAL))(state, frame), 3
 
 
+def discounted(face, frames):
+    """Information of frames (pose, expression, information), each divided by how many show the same view."""
+    total = 0.0
+    for pose, expression, information in frames:
+        count = 0.0
+        for other_pose, other_expression, _ in frames:
+            turned = np.degrees(np.linalg.norm(np.subtract(pose, other_pose)[3:])) / 8
+            moved = np.subtract(expression, other_expression) / np.asarray(face.expression_std)
+            count += np.exp(-0.5 * (turned**2 + np.mean(moved**2)))
+        total = total + np.asarray(information, float) / count
+    return total
+
+
+def frames_of(window):
+    return list(zip(window.poses, window.expressions, window.information, strict=True))
+
+
 def gains(window, new, options, face):
     """Of every exchange, in nats, by determinants; the prior is that of the training set and of the offset."""
     std = np.asarray(face.identity_std, float)
@@ -126,10 +144,10 @@ def gains(window, new, options, face):
         weight * std[:, None] * np.linalg.inv(np.asarray(face.identity_covariance, float)) * std
     )
     prior[std.size :, std.size :] += np.eye(face.mean.size)
-    all_of_them = prior + np.asarray(window.information, float).sum(axis=0)
-    log_det = lambda matrix: np.linalg.slogdet(matrix)[1]
-    exchanged = [all_of_them - np.asarray(old, float) + np.asarray(new, float) for old in window.information]
-    return np.array([0.5 * (log_det(matrix) - log_det(all_of_them)) for matrix in exchanged])
+    log_det = lambda frames: np.linalg.slogdet(prior + discounted(face, frames))[1]
+    frames, looks_new = frames_of(window), (window.poses[-1], window.expressions[-1], new)
+    exchanged = [[*frames[:i], *frames[i + 1 :], looks_new] for i in range(NUM)]
+    return np.array([0.5 * (log_det(kept) - log_det(frames)) for kept in exchanged])
 
 
 @pytest.mark.parametrize("landmarks", ["aligned", "recalculated"])
@@ -225,7 +243,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, ob
     known = np.zeros((units.size, units.size))
     known[: len(prior), : len(prior)] = face.identity_std[:, None] * prior * face.identity_std
     known[len(prior) :, len(prior) :] = np.eye(face.mean.size)
-    posterior = np.linalg.inv(known + np.asarray(window.information, float).sum(axis=0))
+    posterior = np.linalg.inv(known + discounted(face, frames_of(window)))
     rng = np.random.default_rng(4)
     persons = rng.normal(size=(num_persons, units.size)) @ np.linalg.cholesky(posterior).T * units
     answers = -np.linalg.lstsq(np.asarray(by_own, float), np.asarray(by_person, float) @ persons.T)[0]
@@ -234,6 +252,28 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, ob
     sample = whitened @ whitened.T / num_persons
     z = (sample - np.eye(m)) / np.sqrt((1 + np.eye(m)) / num_persons)
     assert np.abs(z).max() < 4.5
+
+
+def test_the_same_view_many_times_tells_as_much_as_once(rig, face, observed):
+    """Of one frame alone, and of five copies of it: the same person, and as much about it."""
+    true, views = observed
+    pick = lambda rows: jax.tree.map(lambda leaf: leaf[jnp.asarray(rows)], (views, true.poses, true.expressions))
+    found = []
+    for rows in ([2], [2] * 5):
+        some, poses, expressions = pick(rows)
+        size = face.num_identities + face.mean.size
+        empty = jnp.zeros((len(rows), size, size)), jnp.zeros((len(rows), size))
+        window = Window(some, poses, expressions, jnp.zeros(len(rows), jnp.int32), *empty)
+        window = jax.jit(informed)(face, rig, window, true.person, prior_of(USUAL))
+        start = Bundle(poses, expressions, mean_person(face))
+        bundle, _ = jax.jit(adjust)(face, rig, some, start, prior_of(USUAL), WIDE_REACH, shares=shares(face, window))
+        found.append((bundle.person, total_information(face, window)))
+    (once, information), (often, repeated) = found
+    np.testing.assert_allclose(repeated, information, rtol=1e-4, atol=1e-3 * np.abs(information).max())
+    apart = np.abs(once.identity - mean_person(face).identity) / np.asarray(face.identity_std)
+    assert apart.max() > 0.3
+    np.testing.assert_allclose(often.identity, once.identity, atol=0.01 * float(face.identity_std.max()))
+    np.testing.assert_allclose(often.offset, once.offset, atol=0.01)
 
 
 def test_the_published_person_is_the_mean_of_the_last_identities(rig, face, observed):
