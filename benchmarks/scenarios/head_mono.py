@@ -4,19 +4,20 @@ Tables 4.1 to 4.3 of Sugano's thesis (2007): errors over eight users, of `b_` an
 worst. `a_` knows faces of eleven people, the user among them, and may recognise them; `c_` is `a_` with an adjustment
 at the start alone, `a_strange_` takes everybody for unknown. `b_` does not know the user: its model is of 200 other
 people of the generator, and its gallery is empty; beside its error in depth stands that of the size which the exact
-shapes of the same faces tell, `error_b_z_of_exact_shape`. `b_ten_` has the model of the ten of the eleven who are not
-the user, as in the thesis, and may take the user for one of them. `b_eyes_` is `b_` and knows the distance between the
-user's eyes to a millimetre, `b_past_` keeps the information of frames that leave the window, `b_angles_` and
-`b_latest_` choose frames otherwise, `b_rendered_modelled_` has the model of people of the ICT face model. `_paper` is
-the tracker of the thesis, `_paper_map` the same with priors, `_projected` without measured landmarks. Starts are judged
-by how widely the five heads are turned. Modelled people are followed by two models of faces, by one of them also from
-68 landmarks, `modelled_68_`. Metrics that end in `_modelled` are of the same people from their images alone, as a
-detector finds their landmarks, beside `solvePnP` on the same landmarks (`pnp_`); in `_modelled_rendered` with the model
-of the package, in `_mediapipe` with MediaPipe's mesh where it is installed, in `_modelled_glasses` and
-`_modelled_beard` with the model of the package and what these people then wear. They need `ict_face_model`,
-`biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos `talking_face_video`; what is
-missing is said and left out. All of it takes hours: with `--out`, a run that was cut off goes on after the last user
-and the last part that it had finished.
+shapes of the same faces tell, `error_b_z_of_exact_shape`; `error_modelled_z_of_` is that of people of the ICT face
+model from their ten or 68 landmarks or points of their skin, with and without errors. `b_ten_` has the model of the ten
+of the eleven who are not the user, as in the thesis, and may take the user for one of them. `b_eyes_` is `b_` and knows
+the distance between the user's eyes to a millimetre, `b_past_` keeps the information of frames that leave the window,
+`b_angles_` and `b_latest_` choose frames otherwise, `b_rendered_modelled_` has the model of people of the ICT face
+model. `_paper` is the tracker of the thesis, `_paper_map` the same with priors, `_projected` without measured
+landmarks. Starts are judged by how widely the five heads are turned. Modelled people are followed by two models of
+faces, by one of them also from 68 landmarks, `modelled_68_`. Metrics that end in `_modelled` are of the same people
+from their images alone, as a detector finds their landmarks, beside `solvePnP` on the same landmarks (`pnp_`); in
+`_modelled_rendered` with the model of the package, in `_mediapipe` with MediaPipe's mesh where it is installed, in
+`_modelled_glasses` and `_modelled_beard` with the model of the package and what these people then wear. They need
+`ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos
+`talking_face_video`; what is missing is said and left out. All of it takes hours: with `--out`, a run that was cut off
+goes on after the last user and the last part that it had finished.
 """
 
 import sys
@@ -31,7 +32,7 @@ from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._mono_detected import people_metrics
-from jaxfilters.benchmarks.scenarios._mono_floor import size_errors
+from jaxfilters.benchmarks.scenarios._mono_floor import modelled_size_metrics, size_errors
 from jaxfilters.benchmarks.scenarios._mono_real import cross_model, modelled_metrics, video_metrics
 from jaxfilters.benchmarks.scenarios._mono_runs import (
     Contender,
@@ -80,6 +81,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     metrics = experiment_metrics(users, QUICK_NUM_FRAMES if quick else NUM_FRAMES, seed, quick, kept)
     parts = {
         "floor": lambda: _floor(users),
+        "modelled_floor": lambda: modelled_size_metrics(seed, DISTANCE_MM),
         "starts": lambda: start_metrics(learnt_from(people_but(None), 10, seed).face, seed, 2 if quick else 40),
         "speed": lambda: speed_metrics(seed, 3 if quick else 25),
         "modelled": lambda: modelled_metrics(quick, seed),

@@ -91,7 +91,6 @@ def adjust(
     *,
     steps: tuple[int, int] = (5, 5),
     losses: tuple[Loss, Loss] = (huber, cauchy),
-    shares: Float[Array, " n"] | None = None,
 ) -> tuple[Bundle, Adjustment]:
     """The bundle of least energy within its box, by at most so many steps for the poses and for everything.
 
@@ -105,7 +104,6 @@ def adjust(
         steps: Of both stages, static ([4.29], [4.32]).
         losses: Of the landmarks' distances in both stages. Far from the solution every landmark should pull, however
             wrong it seems; `square` in both is as published.
-        shares: By how much each frame counts, at most 1; all of them if none.
     """
     units = _units(face, start, prior)
     low, high = box(face, start, prior, reach)
@@ -113,11 +111,10 @@ def adjust(
     whole = lambda y: jax.tree.map(lambda v, s, u: s + u * v, y, start, units)
     bounds = jax.tree.map(jnp.minimum, scaled(low), scaled(high)), jax.tree.map(jnp.maximum, scaled(low), scaled(high))
     zero = jax.tree.map(lambda v, a, b: jnp.clip(jnp.zeros_like(v), a, b), start, *bounds)
-    residuals = lambda y, _: all_residuals(face, rig, views, whole(y), prior, loss=losses[1], shares=shares)
+    residuals = lambda y, _: all_residuals(face, rig, views, whole(y), prior, loss=losses[1])
 
     def of_poses(poses: Array, _: None) -> Array:
-        posed = whole(zero._replace(poses=poses))
-        return all_residuals(face, rig, views, posed, prior, loss=losses[0], shares=shares)
+        return all_residuals(face, rig, views, whole(zero._replace(poses=poses)), prior, loss=losses[0])
 
     posed, _ = _solved(of_poses, zero.poses, bounds[0].poses, bounds[1].poses, steps[0])
     y, taken = _solved(residuals, zero._replace(poses=posed), *bounds, steps[1])
@@ -159,17 +156,10 @@ def projected(face: MultilinearFace, rig: CameraRig, bundle: Bundle) -> Float[Ar
 
 
 def all_residuals(
-    face: MultilinearFace,
-    rig: CameraRig,
-    views: Views,
-    bundle: Bundle,
-    prior: Prior,
-    *,
-    loss: Loss = cauchy,
-    shares: Float[Array, " n"] | None = None,
+    face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior, *, loss: Loss = cauchy
 ) -> Float[Array, " rows"]:
     """Residuals in standard deviations: of the frames (`frame_residuals`), and of the person (`person_prior`)."""
-    of_frames = frame_residuals(face, rig, views, bundle, prior.weight, loss=loss, shares=shares)
+    of_frames = frame_residuals(face, rig, views, bundle, prior.weight, loss=loss)
     return jnp.concatenate([of_frames, person_prior.residuals(face, bundle.person, bundle.expressions, prior)])
 
 
@@ -181,7 +171,6 @@ def frame_residuals(
     weight: Float[ArrayLike, ""],
     *,
     loss: Loss = cauchy,
-    shares: Float[Array, " n"] | None = None,
 ) -> Float[Array, " rows"]:
     """Residuals in standard deviations: of the landmarks ([4.18]) and of the expressions.
 
@@ -194,14 +183,9 @@ def frame_residuals(
         bundle: Where they are.
         weight: Of the expressions; 1 is Bayes' rule.
         loss: Of distances.
-        shares: By how much each frame counts; its likelihood, pose and expression integrated out, to this power.
     """
     held = weight * person_prior.expression_residuals(face, bundle.person.identity, bundle.expressions)
-    observed = _of_views(face, rig, views, bundle, loss)
-    if shares is not None:
-        root = jnp.sqrt(shares)[:, None]
-        observed, held = root[..., None] * observed, root * held
-    return jnp.concatenate([observed.ravel(), held.ravel()])
+    return jnp.concatenate([_of_views(face, rig, views, bundle, loss).ravel(), held.ravel()])
 
 
 def _of_views(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, loss: Loss) -> Array:

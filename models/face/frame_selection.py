@@ -41,11 +41,7 @@ def by_angles(
 
 
 def information_gain(
-    information: Float[Array, "n d d"],
-    new: Float[Array, "d d"],
-    prior: Float[Array, "d d"],
-    may_go: Bool[Array, " n"],
-    likeness: Float[Array, "n+1 n+1"] | None = None,
+    information: Float[Array, "n d d"], new: Float[Array, "d d"], prior: Float[Array, "d d"], may_go: Bool[Array, " n"]
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The frame that the new one replaces for the least uncertainty of the identity, and what is gained, in nats.
 
@@ -57,25 +53,12 @@ def information_gain(
         new: Of the new frame.
         prior: Before all frames.
         may_go: Frames that may be replaced.
-        likeness: Of all frames and the new one, which is the last, from 0 to 1; several that are alike tell what one of
-            them does. The identity if none.
     """
-    n = len(information)
-    likeness = jnp.eye(n + 1, dtype=new.dtype) if likeness is None else likeness
-    every = jnp.concatenate([information, new[None]])
-
-    def log_det(gone: Array) -> Array:
-        """Of what all frames but one tell, each divided by how many are like it."""
-        kept = jnp.ones(n + 1, new.dtype).at[gone].set(0.0)
-        count = jnp.matmul(likeness, kept, precision="highest")
-        shares = kept / jnp.where(kept > 0, count, 1.0)
-        total = prior + jnp.einsum("n,nde->de", shares, every, precision="highest")
-        return 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(total))))
-
+    total = prior + jnp.sum(information, axis=0)
+    log_det = lambda matrix: 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
     # One by one: batches of factorisations can stand still on two cores.
-    after = jax.lax.map(log_det, jnp.arange(n + 1))
-    after, before = after[:-1], after[-1]
-    gains = jnp.where(may_go & jnp.isfinite(after), 0.5 * (after - before), -jnp.inf)
+    after = jax.lax.map(lambda old: log_det(total - old + new), information)
+    gains = jnp.where(may_go & jnp.isfinite(after), 0.5 * (after - log_det(total)), -jnp.inf)
     best = jnp.argmax(gains)
     return best, gains[best]
 

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxfilters.benchmarks.scenarios import _mono_floor
 from jaxfilters.benchmarks.scenarios._mono_floor import size_errors
 from jaxfilters.models.synthetic.face import make_identity
 
@@ -16,6 +17,24 @@ def test_sizes_of_other_people_are_told_better_than_by_guessing():
     sizes = np.linalg.norm(shapes, axis=(1, 2))
     assert np.std(errors) < 0.95 * np.std(np.log(sizes))
     assert abs(np.mean(errors)) < 5 * np.std(errors) / np.sqrt(500)
+
+
+def test_shapes_with_errors_tell_less_of_the_size_and_a_shape_that_gives_it_away_tells_all():
+    """Faces whose proportions are a function of their size, and others whose size is independent of them."""
+    draw, count = np.random.default_rng(0), _mono_floor.NUM_MODELLED + 200
+    size = np.exp(0.05 * draw.normal(size=count))[:, None, None]
+    one, other = draw.normal(size=(2, 8, 3))
+    telling, silent = (
+        size * (one + 2 * (size - 1) * other),
+        size * (one + 0.1 * draw.normal(size=(count, 1, 1)) * other),
+    )
+    spread = lambda shapes, noise: np.std(
+        _mono_floor._size_errors_of_others(shapes, shapes + draw.normal(0, noise, shapes.shape))
+    )
+    assert spread(telling, 0.0) < 0.003
+    assert spread(telling, 0.0) < spread(telling, 0.1) < 0.05
+    logarithms = np.log(np.linalg.norm(silent - silent.mean(axis=1, keepdims=True), axis=(1, 2)))
+    assert spread(silent, 0.0) > 0.8 * np.std(logarithms)
 
 
 @pytest.mark.system

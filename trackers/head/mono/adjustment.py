@@ -21,7 +21,7 @@ from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame, units
 from jaxfilters.trackers.head.mono.person import Modes, model_of
-from jaxfilters.trackers.head.mono.repetition import likeness, shares, total_information
+from jaxfilters.trackers.head.mono.repetition import total_information
 from jaxfilters.trackers.head.mono.state import MonoState, Window, reach_of
 
 STEPS = (5, 5)
@@ -95,10 +95,7 @@ def choose(
     may_go = (jnp.arange(len(window.poses)) > 0) | options.is_published
     if options.selection == "information":
         beside = known(face, prior, person)
-        poses = jnp.concatenate([window.poses, frame.pose[None]])
-        expressions = jnp.concatenate([window.expressions, frame.expression[None]])
-        alike = likeness(face, poses, expressions)
-        place, gain = information_gain(window.information, frame.about_person.information, beside, may_go, alike)
+        place, gain = information_gain(window.information, frame.about_person.information, beside, may_go)
         return place, gain > LEAST_GAIN
     if options.selection == "angles":
         place, _ = by_angles(window.poses[:, 4:], frame.pose[4:], window.ages, may_go)
@@ -155,10 +152,7 @@ def fitted(
     if prior.past is not None:
         prior = prior._replace(past=about_face(prior.past, unknown, face))
     losses = (square, square) if options.is_published else (huber, cauchy)
-    count = None if options.is_published else shares(face, state.window)
-    return adjust(
-        face, rig, state.window.views, start, prior, reach_of(options), steps=steps, losses=losses, shares=count
-    )
+    return adjust(face, rig, state.window.views, start, prior, reach_of(options), steps=steps, losses=losses)
 
 
 def settled(

@@ -6,7 +6,6 @@ from jaxtyping import Array, Float, Int
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior, parameters
 from jaxfilters.models.face.square_root_prior import SquareRootPrior, of_energy, shifted
-from jaxfilters.trackers.head.mono.repetition import shares
 from jaxfilters.trackers.head.mono.state import Window
 
 
@@ -35,9 +34,7 @@ def marginalize_frame(
         prior: What holds the person.
     """
     person = person._replace(offset=person.offset + face.mean - unknown.mean)
-    share = shares(face, window)[place]
-    information, gradient = share * window.information[place], share * window.gradient[place]
-    return of_energy(information, gradient, parameters(person), units(face, prior))
+    return of_energy(window.information[place], window.gradient[place], parameters(person), units(face, prior))
 
 
 def about_face(past: SquareRootPrior, unknown: MultilinearFace, face: MultilinearFace) -> SquareRootPrior:

@@ -115,7 +115,7 @@ def weighed(
     """
     bundle, info = fitted(unknown, face, rig, state, start, options, STEPS)
     window = state.window._replace(poses=bundle.poses, expressions=bundle.expressions)
-    gained = total_information(face, informed(face, rig, window, bundle.person, state.prior))
+    gained = jnp.sum(informed(face, rig, window, bundle.person, state.prior).information, axis=0)
     people = Prior(state.prior.weight, state.prior.offset_std, misplaced=state.prior.misplaced)
     before = prior_information(face, bundle.person, people)
     after = known(face, state.prior, bundle.person) + gained

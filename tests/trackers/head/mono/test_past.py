@@ -16,7 +16,6 @@ from jaxfilters.models.synthetic.face_training import generator_shapes, people_o
 from jaxfilters.trackers.head.mono.adjustment import informed
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.past import about_face, marginalize_frame
-from jaxfilters.trackers.head.mono.repetition import shares
 from jaxfilters.trackers.head.mono.state import Window, prior_of
 
 NUM, KEPT = 8, 5
@@ -41,8 +40,8 @@ def scene(rig):
 
 
 @jax.jit
-def best(face, rig, views, start, prior, count):
-    return adjust(face, rig, views, start, prior, REACH, steps=(20, 80), shares=count)[0]
+def best(face, rig, views, start, prior):
+    return adjust(face, rig, views, start, prior, REACH, steps=(20, 80))[0]
 
 
 def window_of(face, rig, views, bundle, prior):
@@ -64,19 +63,15 @@ def test_the_best_face_stays_the_best_when_frames_leave(x64, rig, scene, who):
     unknown, known, views, truth = scene
     face = unknown if who == "unknown" else known
     prior = prior_of(OPTIONS)
-    # As often as frames count where they leave, though their poses are not yet adjusted.
-    count = shares(face, window_of(face, rig, views, truth, prior))
-    for _ in range(2):
-        together = best(face, rig, views, truth, prior, count)
-        window = window_of(face, rig, views, together, prior)
-        count = shares(face, window)
+    together = best(face, rig, views, truth, prior)
+    window = window_of(face, rig, views, together, prior)
     left = partial(marginalize_frame, unknown, face, window, together.person)
     gone = [left(jnp.asarray(i), prior_of(OPTIONS)) for i in range(KEPT, NUM)]
     past = about_face(joined(joined(*gone[:2]), gone[2]), unknown, face)
     few = jax.tree.map(lambda leaf: leaf[:KEPT], views)
     start = together._replace(poses=together.poses[:KEPT], expressions=together.expressions[:KEPT])
-    with_past = best(face, rig, few, start, prior._replace(past=past), count[:KEPT])
-    without = best(face, rig, few, start, prior, count[:KEPT])
+    with_past = best(face, rig, few, start, prior._replace(past=past))
+    without = best(face, rig, few, start, prior)
     unit = np.asarray(unknown.identity_std)
     moved = lambda bundle: np.abs(np.asarray(bundle.person.identity - together.person.identity)) / unit
     assert moved(with_past).max() < 5e-3
