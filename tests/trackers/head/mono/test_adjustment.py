@@ -124,8 +124,8 @@ def discounted(face, frames):
     for pose, expression, information in frames:
         count = 0.0
         for other_pose, other_expression, _ in frames:
-            turned = np.degrees(np.linalg.norm(np.subtract(pose, other_pose)[3:])) / 8
-            moved = np.subtract(expression, other_expression) / np.asarray(face.expression_std)
+            turned = np.degrees(np.linalg.norm(np.subtract(pose, other_pose)[3:])) / 20
+            moved = np.subtract(expression, other_expression) / np.asarray(face.expression_std) / 2
             count += np.exp(-0.5 * (turned**2 + np.mean(moved**2)))
         total = total + np.asarray(information, float) / count
     return total
@@ -257,7 +257,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, ob
 def test_the_same_view_many_times_tells_as_much_as_once(rig, face, observed):
     """What copies of one frame tell, beside those of another view that stand at right angles to it."""
     true, views = observed
-    far = true._replace(poses=true.poses.at[:, 3:].set(0.0).at[0, 4].set(0.9))
+    far = true._replace(poses=true.poses.at[:, 3:].set(0.0).at[0, 4].set(1.5))
     pick = lambda rows: jax.tree.map(lambda leaf: leaf[jnp.asarray(rows)], (views, far.poses, far.expressions))
 
     def told(rows):
