@@ -7,7 +7,7 @@ those whom the detectors' errors were measured on (`jaxfilters fit face-detector
 """
 
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ from jaxfilters.trackers.io.face_models import people_face_model
 
 SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
 """Of the metrics, by detector."""
-WORN = {"glasses": {"has_glasses": True}, "beard": {"beard": 0.9}}
+WORN: dict[str, dict[str, Any]] = {"glasses": {"has_glasses": True}, "beard": {"beard": 0.9}}
 """What the same people wear besides, in runs of their own with the model of the package."""
 AXES = {"x": 0, "y": 1, "z": 2, "roll": 3, "yaw": 4, "pitch": 5}
 EVERY = 3
@@ -85,7 +85,7 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         made = filmed(model, turns[stretch], speech, person + seed, num_frames)
         for kind, face in faces.items():
             follow(made, kind, face, person)
-        for worn, how in () if quick else WORN.items():
+        for worn, how in ({} if quick else WORN).items():
             made = filmed(model, turns[stretch], speech, person + seed, num_frames, **how)
             follow(made, f"modelled_{worn}", faces["modelled_rendered"], person)
     metrics: dict[str, Metric] = {}
