@@ -51,8 +51,8 @@ _WINDOW = (2, 4)
 LEAST_CELLS = 1024
 """A room of 90 square metres."""
 MOST_LOG_ODDS = 8.0
-HIDDEN_SHARE = 0.2
-"""Below this share of the silhouette there is nothing to see of a person."""
+HIDDEN_SHARE = 0.1
+"""Below this share of the silhouette there is nothing to see of a person; a head and shoulders over a wall are more."""
 HIDDEN_COST = 0.5
 """Log odds per second lost by a person of whom nothing is visible: people can be hidden, but not for ever."""
 LEAST_SURPLUS = 0.5

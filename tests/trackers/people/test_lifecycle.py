@@ -10,8 +10,8 @@ from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.lifecycle import Birth, stride
-from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, PeopleConfig, nobody
-from jaxfilters.trackers.people.tracker import people_scene
+from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, CameraFrame, PeopleConfig, nobody
+from jaxfilters.trackers.people.tracker import people_scene, step
 
 SLOTS = 4
 CONFIG = PeopleConfig(capacity=SLOTS, cell_m=2.0)
@@ -80,6 +80,26 @@ def test_somebody_hidden_is_believed_in_for_a_while_then_remembered_then_forgott
     assert evaluated(scene, people, hidden, frames=31).mode[0] == DORMANT
     assert evaluated(scene, people, hidden, frames=79).mode[0] == DORMANT
     assert evaluated(scene, people, hidden, frames=81).mode[0] == FREE
+
+
+@pytest.mark.system
+def test_whoever_shows_a_little_over_a_wall_is_followed_for_as_long_as_it_shows(camera, draw, floor):
+    """A sixth of the pixels of a silhouette shows, for twice as long as hidden people are believed to be there."""
+    mask, _ = draw(camera, ((0.0, 1.0, 1.7, 0.45),))
+    shown = np.cumsum((mask > 0).sum(axis=1)) / (mask > 0).sum()
+    over = np.arange(len(mask)) < np.searchsorted(shown, 1 / 6)
+    wall = np.where(over, np.inf, 0.5)[:, None] * np.ones(mask.shape[1])
+    scene = people_scene([camera], floor, furniture=[wall], config=CONFIG)
+    people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0], identity=[7, -1, -1, -1])
+    mean = people.belief.mean.at[0, 1].set(1.0).at[0, 5].set(0.45)
+    people = people._replace(belief=Gaussian(mean, people.belief.covariance))
+    shows = np.where(over[:, None], mask, 0).astype(np.uint8)
+    frame = CameraFrame(shows, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True))
+    for _ in range(60):
+        people, report = step(scene, people, (frame,), np.float32(0.1))
+    assert report.mode.tolist() == [TRACKED, FREE, FREE, FREE]
+    assert report.identity[0] == 7
+    assert np.linalg.norm(report.xy[0] - np.array([0.0, 1.0])) < 0.5
 
 
 def test_without_an_image_nothing_is_learnt_but_time_passes(scene):
