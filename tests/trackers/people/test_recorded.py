@@ -61,7 +61,8 @@ def test_whoever_is_given_up_leaves_nothing():
 
 
 @pytest.mark.parametrize(
-    ("share", "depth", "mode"), [(0.1, True, "hidden"), (0.9, False, "no_depth"), (0.9, True, "tracked")]
+    ("share", "depth", "mode"),
+    [(0.05, True, "hidden"), (0.15, True, "tracked"), (0.9, False, "no_depth"), (0.9, True, "tracked")],
 )
 def test_what_cannot_be_measured_is_said(share, depth, mode):
     ((_, sighting),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
