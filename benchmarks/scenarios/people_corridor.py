@@ -70,12 +70,12 @@ def annotated(path: Path, camera: FloorCamera) -> FloorTracks:
         for one in frame.iter("object")
         for box in one.iter("box")
     ]
-    frame, who, u, v, width, height = np.array(boxes).T
+    frame, identity, u, v, width, height = np.array(boxes).T
     feet = np.stack([u, v + height / 2], axis=-1)
     xy, depth = (np.asarray(a) for a in camera.floor_points(jnp.asarray(feet)))
     shows = (feet[:, 1] < camera.shape[0] - BORDER_PX) & (height > LEAST_HEIGHT_PX) & (width > LEAST_WIDTH_PX)
     inside = np.all((xy > FLOOR.min(axis=0)) & (xy < FLOOR.max(axis=0)), axis=-1) & (depth > 0)
-    return floor_tracks(frame, who, xy, in_area=shows & inside)
+    return floor_tracks(frame, identity, xy, in_area=shows & inside)
 
 
 def _scores(true: FloorTracks, found: FloorTracks, camera_xy_m: np.ndarray) -> dict[str, Metric]:

@@ -100,8 +100,8 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
     for time_s, observed in moments():
         now = people.step(observed, time_s)
         confirmed += [
-            (now.frame, who, float(sighting.mean[0]), float(sighting.mean[1]))
-            for who, sighting in now.added
+            (now.frame, identity, float(sighting.mean[0]), float(sighting.mean[1]))
+            for identity, sighting in now.added
             if sighting.frame == now.frame
         ]
         tracking.append(now.seconds)
@@ -134,8 +134,8 @@ def read_truth(path: Path, pets: Pets) -> FloorTracks:
 def positions(tracks: dict[int, list[Sighting]]) -> list[tuple[int, int, float, float]]:
     """Frame, identity, X and Y of everybody."""
     return [
-        (sighting.frame, who, float(sighting.mean[0]), float(sighting.mean[1]))
-        for who, track in tracks.items()
+        (sighting.frame, identity, float(sighting.mean[0]), float(sighting.mean[1]))
+        for identity, track in tracks.items()
         for sighting in track
     ]
 
@@ -157,14 +157,14 @@ def score_metrics(scores: MultiObjectScores, suffix: str) -> dict[str, Metric]:
 
 def write_tracks(path: Path, tracks: dict[int, list[Sighting]]) -> None:
     """`frame,id,x_m,y_m,height_m,score,mode` of all sightings, by frame."""
-    rows = sorted((sighting.frame, who, sighting) for who, track in tracks.items() for sighting in track)
+    rows = sorted((sighting.frame, identity, sighting) for identity, track in tracks.items() for sighting in track)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("frame", "id", "x_m", "y_m", "height_m", "score", "mode"))
-        for frame, who, sighting in rows:
+        for frame, identity, sighting in rows:
             x, y, *_, height, _ = sighting.mean
             writer.writerow(
-                (frame, who, f"{x:.3f}", f"{y:.3f}", f"{height:.3f}", f"{sighting.score:.3f}", sighting.mode)
+                (frame, identity, f"{x:.3f}", f"{y:.3f}", f"{height:.3f}", f"{sighting.score:.3f}", sighting.mode)
             )
 
 

@@ -154,7 +154,7 @@ def crossing_metrics(seeds: range, rooms: dict[str, Rooms]) -> dict[str, Metric]
     """E3: mean errors of two people of whom one passes behind the other, and how often they were exchanged."""
     metrics: dict[str, Metric] = {}
     for camera, room in rooms.items():
-        truth = _ways(CROSSING_M)[None]
+        truth = _paths(CROSSING_M)[None]
         runs = room.simulate_moving(seeds, "crossing", truth, LOOKS["shadow"], sizes_m=CROSSING_SIZES_M)
         for suffix, track in room.trackers(height_m=None).items():
             estimates = track(runs)
@@ -174,7 +174,7 @@ def gap_metrics(seeds: range, rooms: Rooms, gaps: tuple[float, ...]) -> dict[str
     confused: dict[str, list[float]] = {}
     for gap in gaps:
         near, far = GAP_Y_M, GAP_Y_M + gap
-        truth = _ways((((-1.9, near), (-0.1, near)), ((-0.1, far), (-1.9, far))))[None]
+        truth = _paths((((-1.9, near), (-0.1, near)), ((-0.1, far), (-1.9, far))))[None]
         runs = rooms.simulate_moving(seeds, f"gap {gap}", truth, LOOKS["holes"], sizes_m=CROSSING_SIZES_M)
         for suffix, track in rooms.trackers(height_m=None).items():
             confused.setdefault(suffix, []).append(float(_confused(runs, track(runs)).mean()))
@@ -187,7 +187,7 @@ def gap_metrics(seeds: range, rooms: Rooms, gaps: tuple[float, ...]) -> dict[str
     return metrics
 
 
-def _ways(ends) -> np.ndarray:
+def _paths(ends) -> np.ndarray:
     """(frames, people, 2) of people who walk straight from a place to another."""
     share = np.linspace(0, 1, CROSSING_FRAMES)[:, None, None]
     first, last = np.moveaxis(np.asarray(ends), 1, 0)

@@ -126,7 +126,7 @@ def test_depth_cannot_be_seen_where_head_and_feet_are_hidden(first):
 @pytest.mark.system
 def test_a_crossing_pair_keeps_its_identities(first):
     """Section 4, E3: mean error within 0.10 m for both, no exchange (prototype .070, .056)."""
-    truth = people_static._ways(people_static.CROSSING_M)[None]
+    truth = people_static._paths(people_static.CROSSING_M)[None]
     sizes = people_static.CROSSING_SIZES_M
     runs = first.simulate_moving(range(1), "crossing", truth, LOOKS["shadow"], sizes_m=sizes)
     estimates = static.run_paper(first.paper, runs)

@@ -102,8 +102,12 @@ PIECES = {
 @pytest.mark.system
 @pytest.mark.parametrize("name", PIECES)
 def test_frames_one_by_one_give_the_track_of_all_at_once(name, monkeypatch):
-    """To the rounding of programs of other shapes."""
+    """To the rounding of programs of other shapes, which the processor's vector width changes too.
+
+    Lengths are metres for hands, and millimetres for heads: five micrometres there, at a distance of 0.6 m.
+    """
     whole, pieces = PIECES[name](monkeypatch)
+    atol = 5e-3 if name.startswith("head") else 1e-3
     assert set(np.unique(whole.status)) & {1, 2}
     for field in whole._fields:
-        np.testing.assert_allclose(getattr(pieces, field), getattr(whole, field), rtol=1e-3, atol=1e-3, err_msg=field)
+        np.testing.assert_allclose(getattr(pieces, field), getattr(whole, field), rtol=1e-3, atol=atol, err_msg=field)

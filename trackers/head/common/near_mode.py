@@ -88,7 +88,7 @@ def anywhere(
 
 
 def looked_for(
-    way: Callable[..., Alignment],
+    aligner: Callable[..., Alignment],
     state: Looks,
     model: FaceModel,
     images: Float[Array, "C rows cols"],
@@ -99,7 +99,7 @@ def looked_for(
     """Landmarks in the images, which of them look as registered, and which are followed from the last frame.
 
     Args:
-        way: `align` or `anywhere`.
+        aligner: `align` or `anywhere`.
         state: Before this frame.
         model: Of the face.
         images: Grey levels.
@@ -109,7 +109,7 @@ def looked_for(
     """
     M = shape(model, x[POSE:])
     uv, _ = project_shape(rig, M, x[:POSE])
-    found = way(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
+    found = aligner(state.registered.patches, state.slopes, images, uv, M, x[:POSE], rig)
     anchored = recent.is_anchored(found)
     found, is_followed = recent.followed(state.recent, found, state.slopes, images, uv, M, x[:POSE], rig)
     drifted = recent.drifted(state.recent, is_followed, drift)[..., None, None] * jnp.eye(2)

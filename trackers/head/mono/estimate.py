@@ -82,8 +82,8 @@ def aligned(
 
     def looked(x: Array, is_last: Array) -> tuple[Array, tuple[Alignment, Array, Array, Refined]]:
         """Landmarks near a state, in the last look also from elsewhere, and the fit to them."""
-        way = partial(anywhere, beyond=is_last)
-        found, anchored, is_followed = looked_for(way, state, state.model, images, rig, x, drift)
+        aligner = partial(anywhere, beyond=is_last)
+        found, anchored, is_followed = looked_for(aligner, state, state.model, images, rig, x, drift)
         fit = refine(prior, found, state.slopes, state.model, loose, rig, x, ~is_followed)
         return fit.belief.mean, (found, anchored, is_followed, fit)
 

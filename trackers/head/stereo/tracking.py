@@ -132,7 +132,7 @@ def advance(
 def _step(
     rig: CameraRig, searches: Searches, state: HeadState, images: Array, time: Array, options: HeadConfig
 ) -> tuple[HeadState, HeadTrack]:
-    way = VARIANTS[options.variant]
+    variant = VARIANTS[options.variant]
     images = images.astype(state.belief.mean.dtype)
     key, search_key, lost_key = jax.random.split(state.key, 3)
     state = at_last_good(lost_key, state)
@@ -140,7 +140,7 @@ def _step(
     deforms = options.learn & (rig.num_cameras > 1) & (state.age >= options.rigid_frames)
     model = _usable(state, deforms)
     moved = state.search.velocity * steps
-    templates, looks = way.templates(state, model, rig, moved)
+    templates, looks = variant.templates(state, model, rig, moved)
 
     def run(filter: Filter, deviation: Array) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
         filter = at(filter, model, looks, deviation)
@@ -148,8 +148,8 @@ def _step(
         search = filter.predict(filter.params, predict_key, state.search, steps)
         return filter.update(filter.params, update_key, search, images, steps)
 
-    search, info = way.search(run, searches, model)
-    estimate, search = way.estimate(search, state, model, images, rig, moved, steps, options)
+    search, info = variant.search(run, searches, model)
+    estimate, search = variant.estimate(search, state, model, images, rig, moved, steps, options)
     belief = _held(estimate, search, model, state)
     score = score_at(model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(model, looks, rig, belief.mean, images))
@@ -157,9 +157,9 @@ def _step(
     num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
-    state = _learned(way, state, model, search, belief, estimate, score, missed, images, rig, options)
+    state = _learned(variant, state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
-    due &= way.sharpens
+    due &= variant.sharpens
     state = jax.lax.cond(due, partial(_sharpened, rig), lambda state: state, state)
     state = state._replace(
         last_good=jnp.where(missed, state.last_good, state.belief.mean),
@@ -209,7 +209,7 @@ def _held(estimate: Estimate, search: AdaptiveDiffusionState, model: FaceModel, 
 
 
 def _learned(
-    way: Variant,
+    variant: Variant,
     state: HeadState,
     usable: FaceModel,
     search: AdaptiveDiffusionState,
@@ -227,8 +227,8 @@ def _learned(
     learner, model = state.learner, state.model
     if options.learn and rig.num_cameras > 1:
         is_measured = found & learning.measurable(belief.mean[:POSE], score)
-        measured, windows = way.measured(state, estimate, images, rig, is_measured)
-        learner, model = learning.learned(learner, model, measured, windows, is_measured, way.follow, way.still)
+        measured, windows = variant.measured(state, estimate, images, rig, is_measured)
+        learner, model = learning.learned(learner, model, measured, windows, is_measured, variant.follow, variant.still)
     search, belief = _carried(search, belief, usable, model)
     # A face that is not found is not headed anywhere.
     search = search._replace(velocity=jnp.where(found, search.velocity, 0.5 * search.velocity))
