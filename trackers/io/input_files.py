@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -48,6 +49,15 @@ def read_bytes(path: Path, wanted: str, most: int = MOST_BYTES) -> bytes:
         raise InputError(f"{path}: larger than {most >> 20} MiB; {wanted}.")
     try:
         return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {wanted}.") from None
+
+
+def open_bytes(path: Path, wanted: str) -> BinaryIO:
+    """A file of any size, open for reading, of which only parts are read; arguments and errors as of `read_bytes`."""
+    check_regular(path, wanted)
+    try:
+        return path.open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {wanted}.") from None
 

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.images import images_in
+from jaxfilters.trackers.io.input_files import open_bytes
 
 QUICKTIME_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 """In a video's or a track's metadata: an integer, or text such as `26.00mm` (Apple, "QuickTime metadata keys")."""
@@ -43,7 +44,7 @@ def equivalent_focal_mm(path: Path) -> float | None:
     """
     try:
         file = images_in(path)[0] if path.is_dir() else path
-        with file.open("rb") as stream:
+        with open_bytes(file, "expected a video or a picture") as stream:
             start = stream.read(12)
             stream.seek(0)
             found = _of_movie(stream) if start[4:8] == b"ftyp" else _of_picture(stream.read(_MOST_BYTES))
