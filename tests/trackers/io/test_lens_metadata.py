@@ -6,10 +6,9 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxfilters.trackers.io.lens_metadata import QUICKTIME_KEY, equivalent_focal_mm, focal_px
-
-Image = pytest.importorskip("PIL.Image")
 
 
 def write_picture(path, focal=None):

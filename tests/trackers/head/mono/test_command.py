@@ -9,6 +9,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxfilters.models.face.gallery import Gallery
 from jaxfilters.models.face.landmarks import NAMES
@@ -167,13 +168,12 @@ def test_the_focal_length_is_said_if_asked_for(pictures, fake, tmp_path, capsys)
 
 
 def test_the_focal_length_is_that_of_the_metadata_or_of_the_camera_file(fake, tmp_path, capsys):
-    image_module = pytest.importorskip("PIL.Image")
     folder = tmp_path / "pictures"
     folder.mkdir()
-    exif = image_module.Exif()
+    exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 26
     for i in range(FRAMES):
-        image_module.fromarray(np.full((ROWS, COLS, 3), 100 + i, np.uint8)).save(folder / f"{i:03d}.jpg", exif=exif)
+        Image.fromarray(np.full((ROWS, COLS, 3), 100 + i, np.uint8)).save(folder / f"{i:03d}.jpg", exif=exif)
     assert run(folder, "--out", tmp_path / "a", "--no-video") == 0
     focal = 26 / FILM_MM * np.hypot(COLS, ROWS)
     np.testing.assert_allclose(fake[0].rig.focal, [[focal, focal]], rtol=1e-5)
