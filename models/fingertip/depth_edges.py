@@ -32,6 +32,8 @@ UNIT_STEP = 8
 def check_depth(depth: np.ndarray, mask: np.ndarray) -> None:
     """Refuse a depth image that does not belong to the mask, or is not in metres.
 
+    Only every few pixels are looked at here; `readings` takes the rest where hands are found.
+
     Args:
         depth: (rows, cols) metres along the optical axis; what is not finite or not positive is no reading.
         mask: (rows, cols) of the hands, in the same pixels.
@@ -47,7 +49,6 @@ def check_depth(depth: np.ndarray, mask: np.ndarray) -> None:
     median = float(np.median(inside)) if inside.size else NEAREST_M
     if not NEAREST_M <= median <= FARTHEST_M:
         raise ValueError(f"depth must be in metres; got a median of {median:.3g} in the mask of the hands.")
-    # What is left of the image is read where hands are found, see `readings`.
 
 
 def readings(

@@ -193,10 +193,10 @@ def _adjusted(
     unknown, face, rig = system[:3]
     frame = adjustment.frame_of(face, rig, estimate.view, state.person, state.belief.mean, state.modes, state.prior)
     _, response, _, by_focal = frame.about_person
-    is_told = ~missed & jnp.all(jnp.isfinite(response)) & jnp.all(jnp.isfinite(by_focal))
+    is_informed = ~missed & jnp.all(jnp.isfinite(response)) & jnp.all(jnp.isfinite(by_focal))
     state = state._replace(
-        response=jnp.where(is_told, response, state.response),
-        by_focal=jnp.where(is_told, by_focal, state.by_focal),
+        response=jnp.where(is_informed, response, state.response),
+        by_focal=jnp.where(is_informed, by_focal, state.by_focal),
     )
     if not options.adjust:
         return state, jnp.zeros((), bool)
