@@ -5,6 +5,7 @@ import os
 import resource
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,9 @@ import pytest
 # of a program compiled in parallel take a fifth longer where no core is idle. Threads of OpenBLAS spin while they wait,
 # on the core of the other worker.
 assert "jax" not in sys.modules, "JAX was imported before tests/conftest.py could set how its programs are compiled."
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
+# From 0.11 on there is no older emitter, and XLA ends a process that names a flag which it does not know.
+OLDER_EMITTERS = "--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else ""
+os.environ.setdefault("XLA_FLAGS", f"{OLDER_EMITTERS}--xla_cpu_parallel_codegen_split_count=1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -6,9 +6,12 @@ gradients. `*_ms_N` is the median time of a call of size N, compilation excluded
 are XLA's count of arithmetic and of bytes, the body of a loop times its steps, over that time; `*_mb_N` is the memory
 of the program. On a device whose limits are known, `*_share_N` is the larger of both rates as a share of its limit.
 `ratio_*` compare with smcx, blackjax, dynamax and cuthbert on the same device, in turns. A task ends with the size that
-takes longer than ten seconds.
+takes longer than two seconds.
 
-    jaxfilters bench accelerator --json accelerator.json
+With `--out DIR` a run that was cut off goes on after the last task that it had finished, and on a GPU
+`DIR/profile.txt` has the kernels in which each task spends its time, at the largest size that takes less than .1 s.
+
+    jaxfilters bench accelerator --json accelerator.json --out DIR
 """
 
 import sys
@@ -19,12 +22,16 @@ from typing import Any, NamedTuple
 
 import jax
 
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.scenarios import _accelerator_profile as profile
 from jaxfilters.benchmarks.scenarios._accelerator_tasks import Task, Work, tasks
 from jaxfilters.benchmarks.timing import interleaved, spent
 
 ROUNDS, QUICK_ROUNDS = 9, 1
-LONGEST_S = 10.0
+LONGEST_S = 2.0
+PROFILED_S = 0.1
+"""Longer programs are not profiled: a trace has every launch."""
 LIMITS = {
     "H200": (67e12, 4.8e12),
     "H100": (67e12, 3.35e12),
@@ -48,18 +55,19 @@ class Counted(NamedTuple):
 
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
-    """Measure every task; `out` is not used."""
-    del out
+    """Measure every task, and write profiles of a GPU into `out`."""
+    kept = Finished(out, scenario="accelerator", quick=quick, seed=seed)
     found: dict[str, Metric] = {}
     for name, task in tasks(seed).items():
         with jax.enable_x64(task.float64):
-            found |= measured(name, task, quick=quick)
+            found |= kept.metrics(name, partial(measured, name, task, quick=quick, out=out))
     return found
 
 
-def measured(name: str, task: Task, *, quick: bool) -> dict[str, Metric]:
-    """Metrics of one task, up to the size that takes too long."""
+def measured(name: str, task: Task, *, quick: bool, out: Path | None = None) -> dict[str, Metric]:
+    """Metrics of one task, up to the size that takes too long; on a GPU its kernels are written into `out`."""
     found: dict[str, Metric] = {}
+    profiled: tuple[str, Callable[[], Any]] | None = None
     for size in (task.quick,) if quick else task.sizes:
         work = task.work(size)
         program = counted(work)
@@ -71,8 +79,12 @@ def measured(name: str, task: Task, *, quick: bool) -> dict[str, Metric]:
         for peer in calls.keys() - {"ours"}:
             found[f"ratio_{name}_{size}_to_{peer}"] = Metric(seconds["ours"] / seconds[peer], "", "lower")
         sys.stderr.write(f"  {name} {size}: {1e3 * seconds['ours']:.3g} ms\n")
+        if first < PROFILED_S:
+            profiled = f"{name} {size}", program.call
         if first > LONGEST_S:
             break
+    if out is not None and profiled is not None and jax.default_backend() == "gpu":
+        profile.append(out / "profile.txt", profiled[0], profile.kernels(profiled[1]))
     return found
 
 
