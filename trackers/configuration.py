@@ -7,6 +7,7 @@ here and `jaxfilters.trackers.app.options.add_config` read them.
 import ast
 import dataclasses
 import inspect
+import textwrap
 from collections.abc import Mapping
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
@@ -74,7 +75,7 @@ def check(config: Any, *, at_least: Mapping[str, int | float] | None = None) -> 
 
 def _docstrings(config: type) -> dict[str, str]:
     """The string under each field, which Python itself does not keep."""
-    (body,) = ast.parse(inspect.cleandoc(inspect.getsource(config))).body
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
     assert isinstance(body, ast.ClassDef)
     found = {}
     for field, after in zip(body.body, body.body[1:], strict=False):

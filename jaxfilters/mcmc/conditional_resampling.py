@@ -131,5 +131,5 @@ def _positions(log_weights: Array, count: int) -> tuple[Array, Array]:
 def _filled(whole: Array, fraction: Array, offset: Array, count: int) -> Int32[Array, " count"]:
     """The ancestor of each of `count` places, which lie at `offset` in the intervals between integers."""
     ends = (whole + (fraction > offset)).reshape(-1)
-    ended = jnp.zeros(ends.size, jnp.int32).at[ends].add(1, mode="drop", indices_are_sorted=True)
+    ended = jnp.zeros(ends.size, jnp.int32).at[ends].add(1, mode="drop")
     return prefix.running_count(prefix.in_rows(ended)).reshape(-1)[:count]
