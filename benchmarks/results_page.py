@@ -76,9 +76,11 @@ def results_page(documents: Sequence[Mapping[str, Any]], descriptions: Mapping[s
     parts = [_INTRODUCTION]
     parts += [_of_systems(document["metrics"]) for document in documents if document["scenario"] == "systems"]
     for document in documents:
-        name = document["scenario"]
+        name, machine = document["scenario"], document["environment"]
         described = f"{descriptions.get(name, '')}\n\n`jaxfilters bench {name}`"
-        parts.append(f"## {name}\n\n{described}. {_conditions(document['environment'])}\n")
+        if machine.get("backend", "cpu") != "cpu":
+            name = f"{name} on {machine['device']}"
+        parts.append(f"## {name}\n\n{described}. {_conditions(machine)}\n")
         ordered = sorted(document["metrics"].items(), key=lambda item: _group(item[0]))
         for index, metrics in groupby(ordered, key=lambda item: _group(item[0])):
             title, _, note = _GROUPS[index]

@@ -65,6 +65,17 @@ def test_files_of_runs_become_a_page(tmp_path, capsys):
     assert "| `seed_given` | 0 | - | higher |" in page
 
 
+def test_runs_on_a_cpu_and_on_a_gpu_stand_apart(tmp_path, capsys):
+    assert main(["two-numbers", "--json", str(tmp_path / "r.json")]) == 0
+    document = json.loads((tmp_path / "r.json").read_text())
+    document["environment"] |= {"backend": "gpu", "device": "NVIDIA H200"}
+    (tmp_path / "r-h200.json").write_text(json.dumps(document))
+    capsys.readouterr()
+    assert main(["--report", str(tmp_path)]) == 0
+    headings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("## two")]
+    assert sorted(headings) == ["## two-numbers", "## two-numbers on NVIDIA H200"]
+
+
 def test_a_page_of_nothing_or_of_other_files_is_refused(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (tmp_path / "other.json").write_text("[1, 2]")
