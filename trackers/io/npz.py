@@ -3,6 +3,7 @@
 import errno
 import math
 import warnings
+import weakref
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -147,6 +148,8 @@ class ArrayStream:
             _check_entry(self._path, entry, self._wanted)
             # The stream keeps the file open after the archive is closed.
             self._stream = archive.open(entry)
+            # Whoever stops reading in the middle, as where a disk is full, has nothing to close.
+            weakref.finalize(self, self._stream.close)
             self.header = _checked_header(self._stream, entry)
             self._first_byte = self._stream.tell()
 

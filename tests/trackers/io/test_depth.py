@@ -1,5 +1,9 @@
+import gc
 import json
+import os
+import warnings
 import zipfile
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -7,6 +11,7 @@ import pytest
 
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.npz import ArrayStream
 
 
 def expected_metres(depth_mm):
@@ -196,3 +201,21 @@ def test_a_real_recording_opens_with_its_truth(data_dir):
     assert abs(lengths.mean() - 0.0943) < 0.0038
     observed = sequence[0][np.isfinite(sequence[0])]
     assert 0.3 < observed.min() < np.median(observed) < 0.9
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs the list of open files that Linux keeps")
+def test_a_recording_that_is_left_in_the_middle_leaves_no_file_open(tmp_path):
+    """Even within a cycle of references, as the traceback of an error makes one."""
+    np.savez(tmp_path / "a.npz", depth=np.ones((3, 4, 5), np.float32))
+    stream = ArrayStream(tmp_path / "a.npz", "depth", "expected depth images")
+    stream.read(0)
+    descriptors = lambda: [os.readlink(one) for one in Path("/proc/self/fd").iterdir() if one.exists()]
+    assert any(name.endswith("a.npz") for name in descriptors())
+    cycle = [stream]
+    cycle.append(cycle)
+    del stream, cycle
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ResourceWarning)
+        gc.collect()
+    assert not caught
+    assert not any(name.endswith("a.npz") for name in descriptors())
