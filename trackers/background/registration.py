@@ -104,6 +104,10 @@ class Registration:
         self.most_px = max(self.most_px, moved)
         return self._turned(image, self._rotation), self._blank(image.shape[:2], self._rotation)
 
+    def as_last(self, image: np.ndarray) -> np.ndarray:
+        """Another image (rows, cols[, 3]) of the moment that was straightened last, as from the reference pose."""
+        return self._turned(image, self._rotation)
+
     def refer_to(self, image: np.ndarray) -> None:
         """Take corners from another image in the reference pose, as from a background that follows the light."""
         self._reference = _small_grey(image)

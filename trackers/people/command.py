@@ -25,6 +25,7 @@ from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.drawing import write_plan
 from jaxfilters.trackers.people.files import by_frame, write_coco, write_mot
+from jaxfilters.trackers.people.options import DEFAULT_BACKGROUND
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.run import PeopleStream
 from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleSession
@@ -42,7 +43,7 @@ class Setup(NamedTuple):
     demo: DemoRoom | None
     """The synthetic room, with its truth; None for real cameras."""
     detected: list[DetectedForeground]
-    """Foreground from the boxes of a detector, one a camera; empty for background subtraction."""
+    """Foreground from the boxes of a detector, one a camera; empty without a detector."""
 
 
 def track(options: argparse.Namespace) -> str:
@@ -55,7 +56,7 @@ def track(options: argparse.Namespace) -> str:
     """
     check_unused(options)
     setup = _setup(options)
-    session = as_input_error(lambda: PeopleSession(setup.scene, setup.detected or options.background))
+    session = as_input_error(lambda: _session(setup, options))
     total = max((getattr(source, "frames", 0) for source in setup.sources), default=0) or None
     moments = straightened(together(setup.sources), setup.undistortions)
     spec = StreamSpec(
@@ -70,6 +71,12 @@ def track(options: argparse.Namespace) -> str:
     )
     with closing(StreamRun(options, spec)) as run:
         return _tracked(setup, options, session, run)
+
+
+def _session(setup: Setup, options: argparse.Namespace) -> PeopleSession:
+    if setup.detected and options.background is None:
+        return PeopleSession(setup.scene, setup.detected)
+    return PeopleSession(setup.scene, options.background or DEFAULT_BACKGROUND, setup.detected)
 
 
 def _tracked(setup: Setup, options: argparse.Namespace, session: PeopleSession, run: StreamRun) -> str:
@@ -101,11 +108,18 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
         "input": [source.name for source in setup.sources],
         "image_sizes": [list(source.image_size) for source in setup.sources],
         "seed": options.seed,
-        "background": options.background,
+        "background": _foreground_of(setup, options),
         "detections": [str(path) for path in options.detections],
         "version": version("jaxfilters"),
         **{f"config.{name}": value for name, value in json.loads(json.dumps(asdict(setup.scene.config))).items()},
     }
+
+
+def _foreground_of(setup: Setup, options: argparse.Namespace) -> str:
+    """What decides where foreground is, for the report."""
+    if not setup.detected:
+        return options.background or DEFAULT_BACKGROUND
+    return "detections" if options.background is None else f"detections, {options.background}"
 
 
 def _setup(options: argparse.Namespace) -> Setup:
@@ -185,7 +199,7 @@ def _report(
         "interrupted": result.interrupt is not None,
         "trouble": result.trouble,
         "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
-        "background": "detections" if setup.detected else options.background,
+        "background": _foreground_of(setup, options),
         "config": asdict(setup.scene.config),
         "versions": versions(),
     }

@@ -12,6 +12,28 @@ _BOX_WIDTH = 0.5 / max(part.radius for part in PARTS)
 _SHARPNESS = 12
 """Exponent of the squared distance in units of an outline. Soft edges of `PARTS` are those of a population; where every
 single silhouette has them, the most likely body is larger, and too near."""
+_MISSED = 0.2
+"""Probability that a detector has no box where a person shows, at least; also that of a pixel of foreground there."""
+_RELIABLE = 0.95
+"""Largest probability of foreground, and 1 minus the smallest, that either sensor alone can claim for a pixel."""
+
+
+def combined(subtracted: np.ndarray, detected: np.ndarray) -> np.ndarray:
+    """Probability of foreground from two sensors that err independently, by the product of their odds.
+
+    Where both agree the result is more certain than either. Foreground that no box holds (a shadow, a reflection, a
+    door) counts less, and a box in which nothing differs from the background counts less as well.
+
+    Args:
+        subtracted: Probability of foreground by subtraction of the background, (rows, cols) from 0 to 1.
+        detected: The same by the boxes of a detector.
+
+    Returns:
+        Probability of foreground, (rows, cols) float32.
+    """
+    s, d = np.clip(subtracted, 1 - _RELIABLE, _RELIABLE), np.clip(detected, _MISSED, _RELIABLE)
+    foreground = s * d
+    return (foreground / (foreground + (1 - s) * (1 - d))).astype(np.float32, copy=False)
 
 
 class DetectedForeground:

@@ -6,6 +6,8 @@ from pathlib import Path
 from jaxfilters.trackers.app.options import add_config, add_results_options, add_resume, add_seed, add_video_options
 from jaxfilters.trackers.people.config import PeopleConfig
 
+DEFAULT_BACKGROUND = "median"
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options to the parser of the command."""
@@ -27,8 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--background",
         choices=("median", "mog2", "knn"),
-        default="median",
-        help="background subtraction (default: %(default)s)",
+        help=f"background subtraction (default: {DEFAULT_BACKGROUND}; none with --detections, unless it is given)",
     )
     parser.add_argument(
         "--detections",
@@ -36,7 +37,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="boxes of any detector (MOT text or COCO .json) in place of background subtraction, one for each source",
+        help="boxes of any detector (MOT text or COCO .json), one for each source; in place of background subtraction, "
+        "or beside it with --background",
     )
     add_config(parser, PeopleConfig, "capacity", "height_m", "height_sd_m", "memory_s", "hidden_s", "calibration_error")
     add_video_options(parser)

@@ -14,6 +14,7 @@ from jaxfilters.trackers.background.choice import Background, background
 from jaxfilters.trackers.background.median import MedianBackground, evenly
 from jaxfilters.trackers.background.registration import Registration, intrinsics
 from jaxfilters.trackers.people.config import PeopleConfig
+from jaxfilters.trackers.people.detected import DetectedForeground, combined
 from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
 from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
@@ -49,7 +50,8 @@ def track(
     scene: PeopleScene,
     config: PeopleConfig | None = None,
     *,
-    subtraction: str = "median",
+    subtraction: str | Sequence[Background] = "median",
+    detected: Sequence[DetectedForeground] = (),
 ) -> dict[int, list[Sighting]]:
     """Everybody's smoothed track in recorded images, by identity.
 
@@ -59,18 +61,19 @@ def track(
         times_s: Seconds, strictly increasing.
         scene: Cameras, floor and furniture, as `people_scene` makes them.
         config: Constants in place of those of the scene.
-        subtraction: Of the background: `median`, `mog2` or `knn`.
+        subtraction: As for `PeopleSession`.
+        detected: As for `PeopleSession`.
 
     Returns:
         The tracks: positions and velocities in metres with their covariances, one `Sighting` a frame.
 
     Raises:
-        ValueError: As for `checked_times`; or there is no such method.
+        ValueError: As for `checked_times` and `PeopleSession`.
     """
     seconds = checked_times(times_s, len(images))
     if config is not None:
         scene = people_scene(scene.cameras, scene.floor, furniture=scene.furniture, config=config)
-    session = PeopleSession(scene, subtraction)
+    session = PeopleSession(scene, subtraction, detected)
     every = max(1, len(images) // PRIMING_IMAGES)
     session.prime([[one for one in views[::every] if one is not None] for views in zip(*images, strict=True)])
     for views, time_s in zip(images, seconds - seconds[0], strict=True):
@@ -133,22 +136,27 @@ class PeopleTracks:
 class PeopleSession:
     """The tracker over images."""
 
-    def __init__(self, scene: PeopleScene, subtraction: str | Sequence[Background] = "median"):
+    def __init__(
+        self,
+        scene: PeopleScene,
+        subtraction: str | Sequence[Background] = "median",
+        detected: Sequence[DetectedForeground] = (),
+    ):
         """Nobody yet, and backgrounds of which nothing is known: `prime` them with images of a recording.
 
         Args:
             scene: Cameras, floor and furniture.
-            subtraction: `median`, `mog2` or `knn`, or one object for each camera that gives the foreground of its
-                images, such as `DetectedForeground`.
+            subtraction: Of the background: `median`, `mog2` or `knn`, or one object for each camera that gives the
+                foreground of its images, such as `DetectedForeground`.
+            detected: For each camera, boxes of a detector, which decide together with `subtraction` what is foreground.
 
         Raises:
             ValueError: if there is no such method, or not one object for each camera.
         """
-        if not isinstance(subtraction, str) and len(subtraction) != len(scene.cameras):
-            raise ValueError(
-                f"subtraction: expected one for each of {len(scene.cameras)} cameras; got {len(subtraction)}."
-            )
-        self.tracks = PeopleTracks(scene)
+        _check_count("subtraction", subtraction, len(scene.cameras))
+        if detected:
+            _check_count("detected", detected, len(scene.cameras))
+        self.tracks, self._detected = PeopleTracks(scene), list(detected)
         self._backgrounds: list[Background] = (
             [background(subtraction) for _ in scene.cameras] if isinstance(subtraction, str) else list(subtraction)
         )
@@ -228,6 +236,7 @@ class PeopleSession:
         return self.tracks.state() | {
             "backgrounds": [model.state() for model in self._backgrounds],
             "registrations": [one.state() for one in self._registrations],
+            "detected": [one.state() for one in self._detected],
         }
 
     def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
@@ -237,6 +246,8 @@ class PeopleSession:
             model.restore(saved)
         for registration, saved in zip(self._registrations, state["registrations"], strict=True):
             registration.restore(saved)
+        for one, saved in zip(self._detected, state["detected"], strict=True):
+            one.restore(saved)
         people = jax.device_get(self.tracks.people)
         self._outlines = _on_host(outlines(self.tracks.scene, people))
 
@@ -246,11 +257,14 @@ class PeopleSession:
             return CameraFrame(np.zeros(last.shape[:2], np.uint8), last, np.bool_(False))
         if self._registrations and self.tracks.frames % REFERENCE_EVERY == REFERENCE_EVERY - 1:
             self._renew_reference(camera)
+        boxes = self._detected[camera].apply(image) if self._detected else None
         image, blank = self._registrations[camera].straightened(image) if self._registrations else (image, None)
         self._images[camera], keep = image, self._occupied(camera)
         if blank is not None:
             keep = blank if keep is None else keep | blank
         probability = self._backgrounds[camera].apply(image, keep=keep)
+        if boxes is not None:
+            probability = combined(probability, boxes if blank is None else self._registrations[camera].as_last(boxes))
         if blank is not None:
             probability = np.where(blank > 0, np.float32(0.5), probability)
         return CameraFrame(cv2.convertScaleAbs(probability, alpha=255.0), image, np.bool_(True))
@@ -274,6 +288,11 @@ class PeopleSession:
             v = np.clip(np.round([low[1], high[1]]), 0, shape[0]).astype(int)
             mask[v[0] : v[1], u[0] : u[1]] = 255
         return mask
+
+
+def _check_count(name: str, given: str | Sequence, cameras: int) -> None:
+    if not isinstance(given, str) and len(given) != cameras:
+        raise ValueError(f"{name}: expected one for each of {cameras} cameras; got {len(given)}.")
 
 
 def _on_host(found: tuple[Outline, ...]) -> list[Outline]:

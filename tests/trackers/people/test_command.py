@@ -77,13 +77,16 @@ def test_every_output_can_be_read(results):
 
 
 @pytest.mark.system
-def test_boxes_of_a_detector_replace_silhouettes(recording, results, tmp_path):
+@pytest.mark.parametrize("background", [None, "median"])
+def test_boxes_of_a_detector_replace_silhouettes_or_join_them(recording, results, tmp_path, background):
     """The boxes that the first run wrote are where the people are; so are the tracks of the second run, from them."""
     folder, room = recording
     places = ["--camera", str(folder / "camera.json"), "--scene", str(folder / "scene.json")]
     boxes = ["--detections", str(results / "tracks_mot.txt"), "--no-video"]
+    boxes += [] if background is None else ["--background", background]
     assert main(["track", "people", str(folder / "room.mp4"), *places, *boxes, "--out", str(tmp_path)]) == 0
-    assert json.loads((tmp_path / "report.json").read_text())["background"] == "detections"
+    used = json.loads((tmp_path / "report.json").read_text())["background"]
+    assert used == ("detections" if background is None else "detections, median")
     with (tmp_path / "track.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len({row["id"] for row in rows}) >= 2

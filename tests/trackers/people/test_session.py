@@ -5,11 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import session
 from jaxfilters.trackers.people.demo_room import demo_room
+from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.recorded import as_arrays, from_arrays
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, PeopleConfig, Report
 from jaxfilters.trackers.people.tracker import people_scene
+
+
+NO_BOXES = DetectedForeground({}, Undistortion((120, 160)))
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +66,18 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
     room = demo_room(0, frames=30)
     scene = people_scene(room.cameras, room.floor, furniture=room.furniture, config=PeopleConfig(capacity=6))
     images = [[room.image(0, i)] for i in range(30)]
-    primed = session.PeopleSession(scene)
+    boxes = {i: np.array([[10.0 + 4 * i, 20, 34 + 4 * i, 90, 0.9]]) for i in range(30)}
+    with_boxes = lambda: session.PeopleSession(
+        scene, detected=[DetectedForeground(boxes, Undistortion(room.cameras[0].shape))]
+    )
+    primed = with_boxes()
     primed.prime([[image for (image,) in images[::3]]])
     before = primed.state()
     for i in range(20):
         primed.process(images[i], i / room.fps)
     state = primed.state()
     tracks = [(who, one) for who, track in primed.tracks.recorder.tracks.items() for one in track]
-    restored = session.PeopleSession(scene)
+    restored = with_boxes()
     restored.restore(
         state | {"unconfirmed": as_arrays(from_arrays(state["unconfirmed"]))}, from_arrays(as_arrays(tracks))
     )
@@ -81,6 +90,36 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
     assert {who: len(track) for who, track in restored.tracks.recorder.tracks.items()} == {
         who: len(track) for who, track in primed.tracks.recorder.tracks.items()
     }
+
+
+def test_foreground_without_a_box_and_a_box_without_foreground_count_less(scene, given, monkeypatch):
+    """A patch that differs from the background holds 0.95 alone; the numbers are Bayes' theorem over both answers."""
+    room = np.full((120, 160, 3), 90, np.uint8)
+    image = room.copy()
+    image[30:90, 20:40] = image[30:90, 100:120] = 240
+    boxes = {0: np.array([(94.0, 28, 126, 92, 1.0), (52.0, 28, 84, 92, 1.0)])}
+    frames = []
+    step = session.step
+    monkeypatch.setattr(
+        session, "step", lambda s, p, observed, dt: (frames.append(observed), step(s, p, observed, dt))[1]
+    )
+    one = session.PeopleSession(scene, detected=[DetectedForeground(boxes, Undistortion((120, 160)))])
+    one.prime([[room] * 10])
+    one.process([image], 0.0)
+    ((frame,),) = frames
+    alone, both, box, neither = frame.foreground[[60, 60, 60, 10], [30, 110, 68, 5]] / 255
+    bayes = lambda s, d: s * d / (s * d + (1 - s) * (1 - d))
+    np.testing.assert_allclose(
+        [alone, both, box, neither],
+        [bayes(0.95, 0.2), bayes(0.95, 0.95), bayes(0.05, 0.95), bayes(0.05, 0.2)],
+        atol=0.003,
+    )
+
+
+@pytest.mark.parametrize(("argument", "given"), [("subtraction", []), ("detected", [NO_BOXES] * 2)])
+def test_one_object_for_each_camera_is_expected(scene, argument, given):
+    with pytest.raises(ValueError, match=f"{argument}: expected one for each of 1 cameras; got {len(given)}"):
+        session.PeopleSession(scene, **{argument: given})
 
 
 @pytest.mark.system
