@@ -12,9 +12,9 @@ _BOX_WIDTH = 0.5 / max(part.radius for part in PARTS)
 _SHARPNESS = 12
 """Exponent of the squared distance in units of an outline. Soft edges of `PARTS` are those of a population; where every
 single silhouette has them, the most likely body is larger, and too near."""
-_MISSED = 0.2
+_MISSED = 0.1
 """Probability that a detector has no box where a person shows, at least; also that of a pixel of foreground there."""
-_RELIABLE = 0.95
+_RELIABLE = 0.99
 """Largest probability of foreground, and 1 minus the smallest, that either sensor alone can claim for a pixel."""
 
 

@@ -93,7 +93,7 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
 
 
 def test_foreground_without_a_box_and_a_box_without_foreground_count_less(scene, given, monkeypatch):
-    """A patch that differs from the background holds 0.95 alone; the numbers are Bayes' theorem over both answers."""
+    """A patch that differs from the background holds 0.99 alone; the numbers are Bayes' theorem over both answers."""
     room = np.full((120, 160, 3), 90, np.uint8)
     image = room.copy()
     image[30:90, 20:40] = image[30:90, 100:120] = 240
@@ -111,7 +111,7 @@ def test_foreground_without_a_box_and_a_box_without_foreground_count_less(scene,
     bayes = lambda s, d: s * d / (s * d + (1 - s) * (1 - d))
     np.testing.assert_allclose(
         [alone, both, box, neither],
-        [bayes(0.95, 0.2), bayes(0.95, 0.95), bayes(0.05, 0.95), bayes(0.05, 0.2)],
+        [bayes(0.99, 0.1), bayes(0.99, 0.99), bayes(0.01, 0.99), bayes(0.01, 0.1)],
         atol=0.003,
     )
 
