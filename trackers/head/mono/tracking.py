@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import facing
-from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import stretch, turned
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
@@ -22,6 +21,7 @@ from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import adjustment
+from jaxfilters.trackers.head.mono.claims import pose_variance
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
@@ -225,10 +225,12 @@ def _track(
     uv, _ = project_shape(rig, M, x[:POSE])
     of_person = adjustment.uncertainty(face, state.window, state.prior, state.person, state.response)
     is_sure = num_sure >= FEWEST_SURE
-    # Landmarks that are followed from frame to frame are wrong together: only those that look as registered count.
-    wider = jnp.where(is_sure, 1.0, jnp.square(NUM_LANDMARKS / jnp.maximum(num_sure, FEWEST_ANCHORED)))
-    variance = wider * jnp.diagonal(state.belief.covariance)[:POSE] + jnp.diagonal(of_person)[:POSE]
-    variance += jnp.square(system.focal_log_std * state.by_focal[:POSE])
+    variance = pose_variance(
+        jnp.diagonal(state.belief.covariance)[:POSE],
+        jnp.diagonal(of_person)[:POSE],
+        jnp.square(system.focal_log_std * state.by_focal[:POSE]),
+        num_sure,
+    )
     expression = state.modes.expression(face, x[POSE:])
     return MonoTrack(
         pose=known(x[:POSE]),
