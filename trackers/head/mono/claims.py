@@ -1,4 +1,4 @@
-"""Variances of a pose that are reported: of the frame, of the person, and of landmarks that look otherwise than known."""
+"""Variances of a pose that are reported: of the frame, the person, the lens, and landmarks that have changed."""
 
 import jax.numpy as jnp
 import numpy as np
