@@ -12,8 +12,8 @@ CHANGED_STD = np.array([0.9, 2.1, 0.0, *np.radians([3.2, 7.5, 7.5])])
 """Standard deviation of the error of a pose in which no landmark looks as registered, millimetres and radians.
 
 Where all of them do, the errors of a recording are as large as what is not known of the person. Where some do not, they
-are followed from the last frame or left out, and the pose is off for a second or two, as long as the head is turned so:
-an error of the view, which more frames do not reduce. Each coordinate has the likeliest of some thirty values, by the log
+are followed from the last frame or left out, and the pose is off for a second or two while the head is turned so: an
+error of the view, which more frames do not reduce. Each coordinate has the likeliest of some thirty values, by the log
 score of the true poses of people 0 to 3 of the ICT face model, with two models of faces (2192 frames); that of the
 depth is zero.
 """
