@@ -8,6 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 
 STEEP = np.cos(np.deg2rad(10.0))
@@ -67,7 +68,7 @@ class FloorCamera:
 
     def project(self, points: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
         """Pixels (u, v) of world points, and their depths; the pixels mean nothing where the depth is not positive."""
-        homogeneous = points @ self.P[:, :3].T + self.P[:, 3]
+        homogeneous = dot(points, self.P[:, :3].T) + self.P[:, 3]
         depth = homogeneous[..., 2]
         safe = jnp.where(jnp.abs(depth) > 1e-9, depth, 1e-9)
         return homogeneous[..., :2] / safe[..., None], depth
@@ -83,7 +84,7 @@ class FloorCamera:
     def rays(self, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3"]:
         """World directions through pixels, whose parameter is the depth along the optical axis."""
         inverse = jnp.linalg.inv(self.P[:, :3])
-        return uv @ inverse[:, :2].T + inverse[:, 2]
+        return dot(uv, inverse[:, :2].T) + inverse[:, 2]
 
     def floor_axes(self) -> Float[Array, "2 2"]:
         """Rows: unit vectors on the floor along the optical axis and at right angles to it, to the right.

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxfilters._full_precision import einsum
 from jaxfilters.diagnostics.consistency import Band, between
 from jaxfilters.diagnostics.innovations import autocorrelation
 from jaxfilters.gaussian import checks
@@ -96,7 +97,7 @@ def cluster_interval(
         )
     chosen = jax.random.randint(key, (num_draws, count), 0, count)
     weights = counts[chosen]
-    total = jnp.einsum("bi,bi...->b...", weights, means[chosen])
+    total = einsum("bi,bi...->b...", weights, means[chosen])
     drawn = total / jnp.sum(weights, axis=1).reshape((num_draws,) + (1,) * (means.ndim - 1))
     tail = 0.5 * (1 - probability)
     return Band(jnp.quantile(drawn, tail, axis=0), jnp.quantile(drawn, 1 - tail, axis=0))

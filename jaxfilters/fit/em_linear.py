@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxfilters._full_precision import einsum, tensordot
 from jaxfilters.filter import Filter
 from jaxfilters.fit.em_moments import (
     Imputed,
@@ -87,7 +88,7 @@ def _vectors(value: Any, found: Moments) -> Array | None:
 
 def _transitions(found: Moments) -> Pairs:
     weight = found.inside.ravel().astype(found.mean.dtype)
-    total = lambda each: jnp.tensordot(weight, _flat(each), axes=1)
+    total = lambda each: tensordot(weight, _flat(each), axes=1)
     P, cross = found.covariance, total(found.cross).T
     earlier, later = _flat(found.mean[:, :-1]), _flat(found.mean[:, 1:])
     return Pairs(weight, earlier, later, total(P[:, :-1]), cross, total(P[:, 1:]))
@@ -96,13 +97,13 @@ def _transitions(found: Moments) -> Pairs:
 def _observations(model: Kalman, found: Moments, is_partial: bool) -> Pairs:
     y, read, x, P = (_flat(each) for each in (found.y, found.read, found.mean[:, 1:], found.covariance[:, 1:]))
     weight = jnp.any(read, axis=1).astype(x.dtype)
-    covariance, (k, n) = jnp.tensordot(weight, P, axes=1), jnp.shape(_as_array(model.H))
+    covariance, (k, n) = tensordot(weight, P, axes=1), jnp.shape(_as_array(model.H))
     if not is_partial:
         return Pairs(weight, x, y, covariance, jnp.zeros((k, n), x.dtype), jnp.zeros((k, k), x.dtype))
     full = _imputed(model, found, y, read)
-    target = full.g + jnp.einsum("fkn,fn->fk", full.G, x, precision="highest")
-    cross = jnp.einsum("f,fkn,fnm->fkm", weight, full.G, P, precision="highest")
-    spread = jnp.einsum("fkn,fln->kl", cross, full.G, precision="highest") + jnp.tensordot(weight, full.C, axes=1)
+    target = full.g + einsum("fkn,fn->fk", full.G, x)
+    cross = einsum("f,fkn,fnm->fkm", weight, full.G, P)
+    spread = einsum("fkn,fln->kl", cross, full.G) + tensordot(weight, full.C, axes=1)
     return Pairs(weight, x, target, covariance, cross.sum(axis=0), spread)
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._full_precision import einsum, tensordot
 from jaxfilters.filter import Filter
 from jaxfilters.fit.em_linear import as_covariance, from_covariance, start
 from jaxfilters.fit.em_moments import Moments, imputation
@@ -84,7 +85,7 @@ def _transition_step(model, found, free):
     if "process_noise" not in free:
         return transition, model.process_noise
     errors = _residuals(transition, residual, pairs, inputs)
-    Q = jnp.einsum("f,fpk,fpl->kl", weight, errors, errors, precision="highest") / (weight.sum() * pairs.shape[1])
+    Q = einsum("f,fpk,fpl->kl", weight, errors, errors) / (weight.sum() * pairs.shape[1])
     return transition, from_covariance(model.prior, Q)
 
 
@@ -109,8 +110,8 @@ def _observation_step(model, found, free):
     if "observation_noise" not in free:
         return observe, model.observation_noise
     errors = _residuals(observe, residual, points, data)
-    total = jnp.einsum("f,fpk,fpl->kl", weight, errors, errors, precision="highest") / points.shape[1]
-    R = (total + jnp.tensordot(weight, C, axes=1)) / weight.sum()
+    total = einsum("f,fpk,fpl->kl", weight, errors, errors) / points.shape[1]
+    R = (total + tensordot(weight, C, axes=1)) / weight.sum()
     return observe, from_covariance(model.prior, R)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.math import linalg
 
@@ -53,7 +54,7 @@ class Gaussian:
         known, rest = _split(indices, self.mean.size)
         L = linalg.cholesky(self.covariance[np.ix_(known, known)])
         gain_root = linalg.solve_triangular(L, self.covariance[np.ix_(known, rest)])
-        shift = gain_root.T @ linalg.solve_triangular(L, values - self.mean[known])
+        shift = dot(gain_root.T, linalg.solve_triangular(L, values - self.mean[known]))
         return Gaussian(
             self.mean[rest] + shift, self.covariance[np.ix_(rest, rest)] - linalg.matmul(gain_root.T, gain_root)
         )
@@ -96,7 +97,7 @@ class GaussianRoot:
         k = known.size
         L = linalg.tria(self.root[np.concatenate([known, rest])])
         whitened = linalg.solve_triangular(L[:k, :k], values - self.mean[known])
-        return GaussianRoot(self.mean[rest] + L[k:, :k] @ whitened, L[k:, k:])
+        return GaussianRoot(self.mean[rest] + dot(L[k:, :k], whitened), L[k:, k:])
 
 
 def logpdf(deviation: Float[Array, " n"], root: Float[Array, "n n"]) -> Float[Array, ""]:

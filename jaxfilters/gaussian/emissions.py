@@ -30,6 +30,7 @@ import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic import factor
@@ -155,7 +156,7 @@ class _Categorical:
 def _others(eta: Array) -> Array:
     """Probability of all classes but each, without the cancellation of 1 - p."""
     p = jax.nn.softmax(eta)
-    return ((1 - jnp.eye(eta.size, dtype=eta.dtype)) @ p)[:-1]
+    return dot(1 - jnp.eye(eta.size, dtype=eta.dtype), p)[:-1]
 
 
 def poisson(log_rate: Callable) -> Emission:

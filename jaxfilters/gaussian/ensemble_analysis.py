@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.gaussian.localization import Localization
 from jaxfilters.math.linalg import cholesky, matmul, safe_sqrt, solve_triangular
@@ -198,7 +199,7 @@ def serial(key: AnyKey, forecast: Forecast) -> Float[Array, "n k"]:
         mean, deviations = carry
         j, y, observed, variance, nearness = inputs
         spread = deviations[n + j]
-        total = jnp.dot(spread, spread) / (count - 1) + variance
+        total = dot(spread, spread) / (count - 1) + variance
         gain = jnp.matmul(deviations, spread, precision="highest") / ((count - 1) * total)
         gain = jnp.where(observed, gain if local is None else nearness * gain, 0.0)
         shrink = 1 / (1 + jnp.sqrt(variance / total))

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, DTypeLike, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
@@ -242,7 +243,7 @@ def _merged(model: Any, parts: Gaussian, weights: Float[Array, " k"]) -> Gaussia
     """One Gaussian with the moments of all; on a manifold the tangent spaces at the means are taken to be one."""
     reference = parts.mean[jnp.argmax(weights)]
     apart = jax.vmap(model.manifold.local, (None, 0))(reference, parts.mean)
-    mean = weights @ apart
+    mean = dot(weights, apart)
     # Not by the root of the weights, whose derivative is infinite where one underflows.
     weighted, apart = weights[:, None] * (apart - mean), apart - mean
     covariance = jnp.tensordot(weights, parts.covariance, 1, precision="highest") + factor.inner(weighted, apart)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters import weights
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 
 # Below this squared tangent of half the angle, the first neglected term of the series is less than float64 rounding.
@@ -256,8 +257,8 @@ def _top_eigenvector_jvp(primals, tangents):
     values, vectors = jnp.linalg.eigh(moment)
     top = vectors[:, -1]
     others = vectors[:, :-1]
-    along = others.T @ (0.5 * (d_moment + d_moment.T) @ top) / (values[-1] - values[:-1])
-    return top, others @ along
+    along = dot(others.T, dot(0.5 * (d_moment + d_moment.T), top)) / (values[-1] - values[:-1])
+    return top, dot(others, along)
 
 
 @pytree_dataclass

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.gaussian.belief import Gaussian
@@ -83,7 +84,7 @@ class LinearizedProposal:
     def _linearized(self, predicted, y, inputs, center, spread):
         """The posterior with the observation linearised about `ahead + root @ center`, for that spread about it."""
         ahead, root = predicted
-        about = Gaussian(ahead + root @ center, matmul(spread, spread.T))
+        about = Gaussian(ahead + dot(root, center), matmul(spread, spread.T))
         linear = self.linearize(lambda state: self.observe(state, inputs), about)
         checks.check_shape("the result of observe", linear.value, y.shape, "that of the observation")
         R = self.observation_noise + matmul(linear.residual_root, linear.residual_root.T)
@@ -93,12 +94,12 @@ class LinearizedProposal:
         noise_root = cholesky(R)
         slope = solve_triangular(noise_root, jnp.where(read[:, None], matmul(linear.F, root), 0.0))
         error = solve_triangular(noise_root, jnp.where(read, jnp.where(read, y, 0.0) - linear.value, 0.0))
-        error = error + slope @ center
+        error = error + dot(slope, center)
         precision_root = cholesky(jnp.eye(ahead.size, dtype=ahead.dtype) + matmul(slope.T, slope))
-        half = solve_triangular(precision_root, slope.T @ error)
+        half = solve_triangular(precision_root, dot(slope.T, error))
         mean = solve_triangular(precision_root, half, transpose=True)
         # The same as error^T (I + W W^T)^-1 error, without the difference of two large numbers.
-        misfit = jnp.sum((error - slope @ mean) ** 2) + jnp.sum(mean**2)
+        misfit = jnp.sum((error - dot(slope, mean)) ** 2) + jnp.sum(mean**2)
         log_scale = jnp.sum(jnp.where(read, jnp.log(jnp.diagonal(noise_root)) + _HALF_LOG_2_PI, 0.0))
         log_evidence = -0.5 * misfit - log_scale - jnp.sum(jnp.log(jnp.diagonal(precision_root)))
         return Whitened(ahead, root, mean, precision_root), log_evidence
@@ -130,7 +131,7 @@ class LaplaceProposal:
         """The Gaussian at the mode of the posterior of one particle, and Laplace's approximation of its evidence."""
         ahead, root = prediction(self, x, inputs)
         log_likelihood = checks.checked_log_likelihood(self.log_likelihood)
-        fit = lambda z: log_likelihood(ahead + root @ z, y, inputs)
+        fit = lambda z: log_likelihood(ahead + dot(root, z), y, inputs)
 
         def newton(_, z: Array) -> Array:
             precision_root = _precision_root(fit, z)
@@ -303,7 +304,7 @@ def draw_whitened(
     if randomness.size > center.size:
         plain = jax.scipy.stats.norm.cdf(randomness[-1]) < prior_share
         z = jnp.where(plain, noise, z)
-        log_guided = log_determinant - 0.5 * jnp.sum((precision_root.T @ (z - center)) ** 2)
+        log_guided = log_determinant - 0.5 * jnp.sum(dot(precision_root.T, z - center) ** 2)
         log_prior = -0.5 * jnp.sum(z**2)
         log_density = jnp.logaddexp(jnp.log(prior_share) + log_prior, jnp.log1p(-prior_share) + log_guided)
     # From a density of z to that of x, over the directions with noise: those without have the same in the transition.
@@ -311,4 +312,4 @@ def draw_whitened(
     fixed = diagonal == 0
     unscaled = jnp.sum(jnp.where(fixed, -0.5 * z**2 - _HALF_LOG_2_PI, 0.0))
     log_scale = jnp.sum(jnp.where(fixed, 0.0, jnp.log(jnp.where(fixed, 1.0, diagonal))))
-    return ahead + root @ z, log_density - center.size * _HALF_LOG_2_PI - log_scale - unscaled
+    return ahead + dot(root, z), log_density - center.size * _HALF_LOG_2_PI - log_scale - unscaled

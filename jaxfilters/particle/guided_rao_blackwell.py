@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.filter import Filter
@@ -150,7 +151,7 @@ def _update(
     delta, log_ratio = draw(key, predicted.spread, guidance.information, towards, model.prior_share)
     ensemble = ensemble._replace(
         particles=jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)(predicted.origin, predicted.drift + delta),
-        linear_mean=ensemble.linear_mean + predicted.gain @ (delta - predicted.delta),
+        linear_mean=ensemble.linear_mean + dot(predicted.gain, delta - predicted.delta),
     )
     ensemble, info = rao_blackwell.update_ensemble(model.inner, ensemble, observation, inputs, log_ratio)
     return GuidedState(ensemble, predicted._replace(delta=delta)), info
@@ -182,17 +183,17 @@ def draw(
     choice_key, noise_key = jax.random.split(key)
     noise = standard_normal(noise_key, towards.shape)
     root = cholesky(spread)
-    precision_root = cholesky(jnp.eye(root.shape[0], dtype=root.dtype) + root.T @ information @ root)
+    precision_root = cholesky(jnp.eye(root.shape[0], dtype=root.dtype) + dot(dot(root.T, information), root))
 
     # LAPACK solves for many right-hand sides with threads of its own, which compete with a likelihood that keeps all
     # cores busy: 30 ms for 512 particles, against 0.1 ms for a product with the inverse. The diagonal of the root is at
     # least one, so that its inverse is well conditioned.
     inverse_root = solve_triangular(precision_root, jnp.eye(root.shape[0], dtype=root.dtype))
-    center = matmul(inverse_root.T, matmul(inverse_root, root.T @ (information @ towards)))
+    center = matmul(inverse_root.T, matmul(inverse_root, dot(root.T, dot(information, towards))))
     plain = jax.random.uniform(choice_key, noise.shape[-1:]) < prior_share
     whitened = jnp.where(plain, noise, center + matmul(inverse_root.T, noise))
     log_prior = -0.5 * jnp.sum(whitened**2, axis=0)
-    log_guided = -0.5 * jnp.sum((precision_root.T @ (whitened - center)) ** 2, axis=0)
+    log_guided = -0.5 * jnp.sum(dot(precision_root.T, whitened - center) ** 2, axis=0)
     log_guided = log_guided + jnp.log(jnp.diagonal(precision_root)).sum()
     log_mixture = jnp.logaddexp(math.log(prior_share) + log_prior, math.log1p(-prior_share) + log_guided)
-    return root @ whitened, log_prior - log_mixture
+    return dot(root, whitened), log_prior - log_mixture

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian, logpdf
@@ -112,7 +113,7 @@ class AdditiveGaussian:
     def sample_transition(self, noise: Float[Array, " n"], x: Float[Array, " n"], inputs: PyTree) -> Float[Array, " n"]:
         """One step of the model."""
         ahead, root = prediction(self.proposal, x, inputs)
-        return ahead + root @ noise
+        return ahead + dot(root, noise)
 
     def log_transition(self, x_next: Float[Array, " n"], x: Float[Array, " n"], inputs: PyTree) -> Float[Array, ""]:
         """Log density of a step, over the directions in which it has noise."""

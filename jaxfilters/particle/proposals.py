@@ -16,6 +16,7 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.math.linalg import cholesky, solve_triangular
 from jaxfilters.particle.gaussian_proposals import laplace as laplace
 from jaxfilters.particle.gaussian_proposals import linearized as linearized
@@ -42,7 +43,7 @@ def exact(
         (2.0, 0.0)
     """
     del Q_n
-    return cholesky(N) @ noise, jnp.zeros((), noise.dtype)
+    return dot(cholesky(N), noise), jnp.zeros((), noise.dtype)
 
 
 def plug_in(
@@ -61,7 +62,7 @@ def plug_in(
         (1.0, 0.0)
     """
     del N
-    return cholesky(Q_n) @ noise, jnp.zeros((), noise.dtype)
+    return dot(cholesky(Q_n), noise), jnp.zeros((), noise.dtype)
 
 
 def plug_in_corrected(
@@ -78,9 +79,9 @@ def plug_in_corrected(
         0.5
     """
     root_Q, root_N = cholesky(Q_n), cholesky(N)
-    delta = root_Q @ noise
+    delta = dot(root_Q, noise)
     whitened = solve_triangular(root_N, delta)
-    log_ratio = 0.5 * (noise @ noise - whitened @ whitened) + _half_log_det(root_Q) - _half_log_det(root_N)
+    log_ratio = 0.5 * (dot(noise, noise) - dot(whitened, whitened)) + _half_log_det(root_Q) - _half_log_det(root_N)
     return delta, log_ratio
 
 

@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int32, PyTree
 
 from jaxfilters import weights
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla import last_axis
 from jaxfilters._xla.last_axis import batch_last
@@ -263,7 +264,7 @@ def condition_on_increment(covariance: Float[Array, "l l"], step: MixedDynamics)
 def propagate(belief: Gaussian, delta: Float[Array, " n"], step: MixedDynamics) -> Gaussian:
     r"""Belief about the linear state one step later, given the deviation $\delta = z - A_n m$ of the increment."""
     _, gain, covariance = condition_on_increment(belief.covariance, step)
-    return Gaussian(step.f_l + step.A_l @ belief.mean + gain @ delta, covariance)
+    return Gaussian(step.f_l + dot(step.A_l, belief.mean) + dot(gain, delta), covariance)
 
 
 def init(model: RaoBlackwell, key: AnyKey) -> RaoBlackwellState:
@@ -312,8 +313,8 @@ def predict_ensemble(
     def advance(step: MixedDynamics, mean: Array, covariance: Array, noise: Array) -> tuple:
         spread, gain, covariance = condition_on_increment(covariance, step)
         delta, log_correction = model.proposal(noise, spread, step.Q_n)
-        drift = step.A_n @ mean
-        mean = step.f_l + step.A_l @ mean + gain @ delta
+        drift = dot(step.A_n, mean)
+        mean = step.f_l + dot(step.A_l, mean) + dot(gain, delta)
         x = checks.like("the result of retract", model.retract(step.f_n, drift + delta), step.f_n, "x")
         return x, mean, covariance, log_correction, Increments(step.f_n, drift, delta, spread, gain)
 
@@ -396,5 +397,5 @@ def _by_linear_observation(
 
 
 def _condition(belief: Gaussian, y: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
-    found = arithmetic.joseph.condition(belief.covariance, C, R, y - C @ belief.mean)
+    found = arithmetic.joseph.condition(belief.covariance, C, R, y - dot(C, belief.mean))
     return Gaussian(belief.mean + found.shift, found.covariance), found.log_density

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxfilters import weights
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.filter import Filter, run
@@ -117,16 +118,16 @@ class _Twisted:
         offset = ahead - r
         precision = jnp.eye(x.size, dtype=x.dtype) + matmul(root.T, matmul(A, root))
         precision_root = cholesky(0.5 * (precision + precision.T))
-        half = solve_triangular(precision_root, root.T @ (b - A @ offset))
+        half = solve_triangular(precision_root, dot(root.T, b - dot(A, offset)))
         center = solve_triangular(precision_root, half, transpose=True)
-        log_constant = c + b @ offset - 0.5 * offset @ (A @ offset) + 0.5 * jnp.sum(half**2)
+        log_constant = c + dot(b, offset) - dot(0.5 * offset, dot(A, offset)) + 0.5 * jnp.sum(half**2)
         log_constant = log_constant - jnp.sum(jnp.log(jnp.diagonal(precision_root)))
         return Whitened(ahead, root, center, precision_root), log_constant
 
     def sample_transition(self, noise: Array, x: Array, step: _StepInputs) -> Array:
         """One step of the model."""
         ahead, root = self.prediction(x, step)
-        return ahead + root @ noise
+        return ahead + dot(root, noise)
 
     def log_transition(self, x_next: Array, x: Array, step: _StepInputs) -> Float[Array, ""]:
         """Its log density, over the directions with noise."""
@@ -285,8 +286,8 @@ def _regression(x: Float[Array, "n count"], values: Float[Array, " count"], prio
     scores = jnp.where(usable, values, -jnp.inf)
     power = weights.temper_exponent(scores, jnp.zeros_like(scores), _SHARE_FITTED * count)
     share = weights.linear(power * scores)
-    center = x @ share
-    spread = jnp.sqrt(((x - center[:, None]) ** 2) @ share)
+    center = dot(x, share)
+    spread = jnp.sqrt(dot((x - center[:, None]) ** 2, share))
     spread = jnp.where(spread > 0, spread, 1.0)
     s = (x - center[:, None]) / spread[:, None]
     level = jnp.sum(jnp.where(usable, values, 0.0) * share)
@@ -296,7 +297,7 @@ def _regression(x: Float[Array, "n count"], values: Float[Array, " count"], prio
     found = jnp.linalg.lstsq((features * root).T, jnp.where(usable, values - level, 0.0) * root)[0]
     upper = jnp.zeros((size, size), x.dtype).at[rows, columns].set(found[1 + size :])
     eigenvalues, vectors = jnp.linalg.eigh(-(upper + upper.T))
-    slope = vectors.T @ found[1 : 1 + size]
+    slope = dot(vectors.T, found[1 : 1 + size])
     # Along a direction in which it is not concave the function would grow without bound: there it is constant.
     concave = eigenvalues > 0
     eigenvalues, slope = jnp.where(concave, eigenvalues, 0.0), jnp.where(concave, slope, 0.0)
@@ -308,7 +309,7 @@ def _regression(x: Float[Array, "n count"], values: Float[Array, " count"], prio
     curvature = matmul(scaled * eigenvalues, scaled.T)
     log_mean = jax.nn.logsumexp(scores) - math.log(count)
     log_floor = jnp.log(prior_share) + jnp.where(jnp.isfinite(log_mean), log_mean, 0.0)
-    return Twisting(center, curvature, scaled @ slope, found[0] + level, log_floor)
+    return Twisting(center, curvature, dot(scaled, slope), found[0] + level, log_floor)
 
 
 def _length(observations: Any, inputs: Any) -> int:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import gaussian_sum
@@ -265,14 +266,15 @@ def turned(hand: ArticulatedHand, before: Float[Array, " n"], after: Gaussian) -
     mean = after.mean.at[block].set(stretch * new_axis)
     # The rotation in the plane of the two axes that takes one to the other.
     middle = axis + new_axis
-    turn = jnp.eye(4, dtype=q.dtype) - jnp.outer(middle, middle) / (1 + axis @ new_axis) + 2 * jnp.outer(new_axis, axis)
+    scale = 1 + dot(axis, new_axis)
+    turn = jnp.eye(4, dtype=q.dtype) - jnp.outer(middle, middle) / scale + 2 * jnp.outer(new_axis, axis)
     whole = jnp.eye(after.mean.size, dtype=q.dtype).at[block, block].set(turn)
     return Gaussian(mean, linalg.matmul(linalg.matmul(whole, after.covariance), whole.T))
 
 
 def _within_gate(model, belief, look, H, at):
     predicted = jnp.sum(linalg.matmul(H, belief.covariance) * H, axis=1) + look.std**2
-    innovation = model.hand.residual(look.y, model.hand.observe(at)) + H @ (at - belief.mean)
+    innovation = model.hand.residual(look.y, model.hand.observe(at)) + dot(H, at - belief.mean)
     return innovation**2 <= model.gate**2 * predicted
 
 
@@ -293,7 +295,7 @@ def laplace_log_evidence(
     counts = jnp.diagonal(root) > 0
     missed = jnp.where(counts, hand.residual(look.y, hand.observe(posterior.mean)) / look.std, 0.0)
     pull = linalg.solve_triangular(root, linalg.solve_triangular(root, info.innovation), transpose=True)
-    correction = jnp.sum(jnp.where(counts, pull * (H @ (posterior.mean - prior.mean)), 0.0))
+    correction = jnp.sum(jnp.where(counts, pull * dot(H, posterior.mean - prior.mean), 0.0))
     scale = jnp.log(jnp.where(counts, jnp.diagonal(root), 1.0)) + 0.5 * math.log(2 * math.pi)
     log_scale = jnp.sum(jnp.where(counts, scale, 0.0))
     value = -0.5 * (jnp.sum(missed**2) + correction) - log_scale
@@ -332,5 +334,5 @@ def _same(hand: ArticulatedHand, heavier: _State, lighter: _State) -> Bool[Array
     spread = sum(jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance)[layout.angles], 0.0)) for belief in (a, b))
     apart = jnp.abs(a.mean[layout.angles] - b.mean[layout.angles]) > 0.5 * spread + math.radians(0.5)
     p, q = a.mean[layout.quaternion], b.mean[layout.quaternion]
-    aligned = jnp.abs(p @ q) / (linalg.safe_norm(p) * linalg.safe_norm(q)) > math.cos(math.radians(5.0))
+    aligned = jnp.abs(dot(p, q)) / (linalg.safe_norm(p) * linalg.safe_norm(q)) > math.cos(math.radians(5.0))
     return ~jnp.any(apart) & aligned

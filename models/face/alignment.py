@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import einsum
 from jaxfilters.models.face.correlation import score_map
 from jaxfilters.models.face.patches import (
     SIZE,
@@ -76,11 +77,11 @@ def align(
     is_facing = facing(patches, by_shape)
     affine = jnp.where(is_facing[..., None, None], affine, jnp.eye(2))
     by_shape = jnp.where(is_facing[..., None, None], by_shape, 0.0)
-    offsets = jnp.einsum("ckij,pj->ckpi", affine, window_grid()) + bend(patches, slopes, by_shape)
+    offsets = einsum("ckij,pj->ckpi", affine, window_grid()) + bend(patches, slopes, by_shape)
 
     def iterate(_: Array | int, uv: Array) -> Array:
         shift = _look(patches, images, uv[:, :, None] + offsets)[0]
-        step = -jnp.einsum("ckij,ckj->cki", affine, shift)
+        step = -einsum("ckij,ckj->cki", affine, shift)
         length = jnp.linalg.norm(step, axis=-1, keepdims=True)
         return uv + step * jnp.minimum(1.0, MOST_STEP_PX / jnp.maximum(length, 1e-6))
 
@@ -161,7 +162,7 @@ def _look(patches: Patches, images: Array, points: Array) -> tuple[Array, Array,
     product = jnp.sum(window * template, axis=2)
     gain = jnp.maximum(product / energy, 1e-3)
     residual = window / gain[..., None] - template
-    shift = jnp.einsum("ckij,ckpj,ckp->cki", patches.inverse, patches.gradient, residual)
+    shift = einsum("ckij,ckpj,ckp->cki", patches.inverse, patches.gradient, residual)
     score = product / jnp.sqrt(jnp.maximum(energy * jnp.sum(window * window, axis=2), 1e-6))
     return shift, residual, score
 
@@ -176,28 +177,28 @@ def _covariance(patches: Patches, residual: Array, affine: Array) -> tuple[Array
     C, K, pixels = residual.shape
     square = residual.reshape(C, K, SIZE, SIZE)
     correlation = lagged(square, square) / pixels
-    moments = jnp.einsum("ckvu,ckvuij->ckij", correlation, patches.overlap)
+    moments = einsum("ckvu,ckvuij->ckij", correlation, patches.overlap)
     moments += 1e-6 * jnp.linalg.inv(patches.inverse)
-    per_moment = jnp.einsum("ckij,ckjl->ckil", affine, patches.inverse)
-    covariance = jnp.einsum("ckij,ckjl,ckml->ckim", per_moment, moments, per_moment)
-    return covariance, 0.5 * jnp.einsum("ckij,ckji->ck", patches.inverse, moments)
+    per_moment = einsum("ckij,ckjl->ckil", affine, patches.inverse)
+    covariance = einsum("ckij,ckjl,ckml->ckim", per_moment, moments, per_moment)
+    return covariance, 0.5 * einsum("ckij,ckji->ck", patches.inverse, moments)
 
 
 def _slopes(
     patches: Patches, terms: int, residual: Array, variance: Array, affine: Array, by_shape: Array, teaching: Array
 ) -> tuple[Array, Array, Array]:
     """Effect of the slopes on the place, and what the residual says of them once the shift has had its part."""
-    rising = jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)
+    rising = einsum("ckix,ckx->cki", by_shape, patches.lift)
     rising = jnp.linalg.solve(affine, rising[..., None])[..., 0]
     # Gain and offset explain some of the picture's change, but only once every pixel has changed as far as it rises.
-    along = jnp.einsum("ckpi,cki->ckp", slope_of_grey(patches), rising)
+    along = einsum("ckpi,cki->ckp", slope_of_grey(patches), rising)
     columns = without_light(patches.template, -along[..., None] * relief(patches, terms))
-    shift = jnp.einsum("ckij,ckpj,ckps->ckis", patches.inverse, patches.gradient, columns)
-    left = columns - jnp.einsum("ckpi,ckis->ckps", patches.gradient, shift)
+    shift = einsum("ckij,ckpj,ckps->ckis", patches.inverse, patches.gradient, columns)
+    left = columns - einsum("ckpi,ckis->ckps", patches.gradient, shift)
     per_variance = jnp.where(teaching, 1 / variance, 0.0)
-    information = jnp.einsum("ck,ckps,ckpr->ksr", per_variance, left, left)
-    score = jnp.einsum("ck,ckps,ckp->ks", per_variance, left, residual)
-    return -jnp.einsum("ckij,ckjs->ckis", affine, shift), information, score
+    information = einsum("ck,ckps,ckpr->ksr", per_variance, left, left)
+    score = einsum("ck,ckps,ckp->ks", per_variance, left, residual)
+    return -einsum("ckij,ckjs->ckis", affine, shift), information, score
 
 
 def facing(patches: Patches, by_shape: Float[Array, "C K 2 3"]) -> Bool[Array, "C K"]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from jaxfilters._full_precision import einsum
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.correlation import cut
 from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
@@ -117,7 +118,7 @@ def patches_of(
     frame = jnp.concatenate([by_shape, jnp.broadcast_to(unit[None, :, None], (*wide.shape[:2], 1, 3))], axis=2)
     # Two columns keep within the plane; the third, of no pixels, goes along the line of sight.
     columns = jnp.linalg.inv(frame)
-    plan = jnp.einsum("kxi,ckxj->ckij", _within(unit), columns[..., :2])
+    plan = einsum("kxi,ckxj->ckij", _within(unit), columns[..., :2])
     return Patches(wide, template, gradient, inverse, overlap, columns[..., :2], columns[..., 2], plan, unit)
 
 
@@ -152,8 +153,8 @@ def learn_slopes_again(
     eye = jnp.eye(score.shape[-1], dtype=information.dtype)
     prior = jnp.linalg.inv(before.covariance)
     covariance = jnp.linalg.inv(prior + information)
-    pull = score + jnp.einsum("kij,kj->ki", prior, before.mean - assumed.mean)
-    mean = assumed.mean + jnp.einsum("kij,kj->ki", covariance, pull)
+    pull = score + einsum("kij,kj->ki", prior, before.mean - assumed.mean)
+    mean = assumed.mean + einsum("kij,kj->ki", covariance, pull)
     # Everything that follows is relative: slopes and curvatures have units of their own.
     least = _of_terms(LEAST_SLOPE_STD, LEAST_CURVATURE_STD, mean)
     most = _of_terms(STEEPEST, MOST_CURVED, mean)
@@ -163,20 +164,20 @@ def learn_slopes_again(
 
 def stretch(patches: Patches, slopes: Slopes, by_shape: Float[Array, "C K 2 3"]) -> Float[Array, "C K 2 2"]:
     """Pixels of an image for each pixel of the template, for a head whose pixels have the derivatives `by_shape`."""
-    rise = jnp.einsum("ki,ckij->ckj", slopes.mean[:, :2], patches.plan)
+    rise = einsum("ki,ckij->ckj", slopes.mean[:, :2], patches.plan)
     tangents = patches.tangents + patches.lift[..., None] * rise[:, :, None]
-    return jnp.einsum("ckix,ckxj->ckij", by_shape, tangents)
+    return einsum("ckix,ckxj->ckij", by_shape, tangents)
 
 
 def bend(patches: Patches, slopes: Slopes, by_shape: Float[Array, "C K 2 3"]) -> Float[Array, "C K TT 2"]:
     """Pixels by which the curvatures move what each pixel of the template shows, beyond the affine `stretch`."""
-    rise = jnp.einsum("ks,ckps->ckp", slopes.mean[:, 2:], relief(patches, slopes.mean.shape[1])[..., 2:])
-    return rise[..., None] * jnp.einsum("ckix,ckx->cki", by_shape, patches.lift)[:, :, None]
+    rise = einsum("ks,ckps->ckp", slopes.mean[:, 2:], relief(patches, slopes.mean.shape[1])[..., 2:])
+    return rise[..., None] * einsum("ckix,ckx->cki", by_shape, patches.lift)[:, :, None]
 
 
 def relief(patches: Patches, terms: int) -> Float[Array, "C K TT S"]:
     """Millimetres that the skin rises at each pixel of the template for a unit of each of the first `terms` slopes."""
-    a, b = jnp.moveaxis(jnp.einsum("ckij,pj->ckpi", patches.plan, window_grid()), -1, 0)
+    a, b = jnp.moveaxis(einsum("ckij,pj->ckpi", patches.plan, window_grid()), -1, 0)
     return jnp.stack([a, b, 0.5 * a * a, a * b, 0.5 * b * b][:terms], axis=-1)
 
 
@@ -191,7 +192,7 @@ def turned(patches: Patches, affine: Float[Array, "C K 2 2"]) -> Float[Array, "C
     usable = jnp.abs(jnp.linalg.det(affine)) > 0.05
     inverse = jnp.linalg.inv(jnp.where(usable[..., None, None], affine, jnp.eye(2)))
     middle = (WIDE_SIZE - 1) / 2
-    points = jnp.clip(jnp.einsum("ckij,pj->ckpi", inverse, window_grid()) + middle, 0.0, WIDE_SIZE - 1.001)
+    points = jnp.clip(einsum("ckij,pj->ckpi", inverse, window_grid()) + middle, 0.0, WIDE_SIZE - 1.001)
     corner = jnp.floor(points)
     a, b = points[..., 0] - corner[..., 0], points[..., 1] - corner[..., 1]
     flat = patches.wide.reshape(*patches.wide.shape[:2], -1)
@@ -210,7 +211,7 @@ def without_light(template: Float[Array, "C K TT"], columns: Float[Array, "C K T
     """What another gain and another offset of the template, itself of mean 0, do not explain of each column."""
     columns = columns - jnp.mean(columns, axis=2, keepdims=True)
     energy = jnp.maximum(jnp.sum(template * template, axis=2), 1e-6)
-    gain = jnp.einsum("ckp,ckpi->cki", template, columns) / energy[..., None]
+    gain = einsum("ckp,ckpi->cki", template, columns) / energy[..., None]
     return columns - template[..., None] * gain[:, :, None]
 
 
@@ -233,7 +234,7 @@ def _moments(window: Array, gradient: Array) -> tuple[Array, Array, Array, Array
     C, K, size = window.shape[:3]
     flat = (window - jnp.mean(window, axis=(2, 3), keepdims=True)).reshape(C, K, size * size)
     columns = without_light(flat, gradient)
-    inverse = jnp.linalg.inv(jnp.einsum("ckpi,ckpj->ckij", columns, columns) + 1e-3 * jnp.eye(2))
+    inverse = jnp.linalg.inv(einsum("ckpi,ckpj->ckij", columns, columns) + 1e-3 * jnp.eye(2))
     squares = lambda a: a.reshape(*a.shape[:2], size, size, -1).transpose(0, 1, 4, 2, 3)
     slopes = squares(columns)
     weight = 1 - np.abs(np.arange(1 - REACH_PX, REACH_PX)) / REACH_PX
@@ -251,8 +252,8 @@ def _moments(window: Array, gradient: Array) -> tuple[Array, Array, Array, Array
         )
     )
     whole = lagged(slopes[:, :, :, None], slopes[:, :, None])
-    taken = jnp.einsum("ckij,ckijvu->ckvu", inverse, whole) + jnp.sum(lagged(light, light), axis=2)
-    share = jnp.einsum("ckvu,ckvuij,ckji->ck", taken / size**2, overlap, inverse) / 2
+    taken = einsum("ckij,ckijvu->ckvu", inverse, whole) + jnp.sum(lagged(light, light), axis=2)
+    share = einsum("ckvu,ckvuij,ckji->ck", taken / size**2, overlap, inverse) / 2
     return flat, columns, inverse, overlap / jnp.maximum(1 - share, 0.3)[..., None, None, None, None]
 
 

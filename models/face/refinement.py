@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.patches import Slopes
@@ -89,20 +90,20 @@ def refine(
     def pieces(x):
         M = shape(model, x[6:])
         residual, H, S, by_shape = _rows(x, M, found, slopes, observed, model, model_variance, rig)
-        distance = jnp.einsum("ki,ki->k", residual, _solve(S, residual))
+        distance = einsum("ki,ki->k", residual, _solve(S, residual))
         trust = (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + distance)
         return residual, H, S, by_shape, distance, trust
 
     def iterate(_, x):
         residual, H, S, _, _, trust = pieces(x)
         SH = _solve(S, H)
-        gradient = jnp.einsum("k,kia,ki->a", trust, SH, residual) + precision @ (prior.mean - x)
-        return x + jnp.linalg.solve(precision + jnp.einsum("k,kia,kib->ab", trust, SH, H), gradient)
+        gradient = einsum("k,kia,ki->a", trust, SH, residual) + dot(precision, prior.mean - x)
+        return x + jnp.linalg.solve(precision + einsum("k,kia,kib->ab", trust, SH, H), gradient)
 
     x = jax.lax.fori_loop(0, ITERATIONS, iterate, start)
     residual, H, S, by_shape, distance, trust = pieces(x)
     SH = _solve(S, H)
-    information = precision + jnp.einsum("k,kia,kib->ab", trust, SH, H)
+    information = precision + einsum("k,kia,kib->ab", trust, SH, H)
     covariance = _covariance(precision, information, trust, per_landmark, SH, H)
     log_evidence = jnp.sum(_log_t(distance, per_landmark, S, observed)) + _laplace(
         x - prior.mean, precision, information
@@ -124,15 +125,15 @@ def refine(
 
 def _laplace(off, precision, information):
     """What the prior and the width of the posterior add to the log evidence."""
-    return 0.5 * (jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - off @ precision @ off)
+    return 0.5 * (jnp.linalg.slogdet(precision)[1] - jnp.linalg.slogdet(information)[1] - dot(dot(off, precision), off))
 
 
 def _covariance(precision, information, trust, per_landmark, SH, H):
     """Of the mode: inverse expected information, and a bias that is common to all landmarks of one image."""
     expected = trust * (DEGREES_OF_FREEDOM + per_landmark) / (DEGREES_OF_FREEDOM + per_landmark + 2)
-    covariance = jnp.linalg.inv(precision + jnp.einsum("k,kia,kib->ab", expected, SH, H))
-    by_bias = jnp.linalg.solve(information, jnp.einsum("k,kia->ai", trust, SH))
-    covariance += COMMON_BIAS_PX**2 * by_bias @ by_bias.T
+    covariance = jnp.linalg.inv(precision + einsum("k,kia,kib->ab", expected, SH, H))
+    by_bias = jnp.linalg.solve(information, einsum("k,kia->ai", trust, SH))
+    covariance += dot(COMMON_BIAS_PX**2 * by_bias, by_bias.T)
     return 0.5 * (covariance + covariance.T)
 
 
@@ -144,13 +145,13 @@ def _misfit(own, residual, S, SH, trust, information):
     """
     C = own.shape[0]
     white = jnp.moveaxis(_solve(S, residual).reshape(-1, C, 2), 1, 0)
-    square = jnp.einsum("k,cki,ckij,ckj->", trust, white, own, white)
+    square = einsum("k,cki,ckij,ckj->", trust, white, own, white)
     inverse = jnp.linalg.inv(S)
     block = lambda c: slice(2 * c, 2 * c + 2)
     blocks = jnp.stack([inverse[:, block(c), block(c)] for c in range(C)])
-    expected = jnp.einsum("ckij,ckji->", blocks, own)
+    expected = einsum("ckij,ckji->", blocks, own)
     by_rows = jnp.moveaxis(SH.reshape(-1, C, 2, SH.shape[-1]), 1, 0)
-    taken = jnp.einsum("k,ckia,ckij,ckjb->ab", trust, by_rows, own, by_rows)
+    taken = einsum("k,ckia,ckij,ckjb->ab", trust, by_rows, own, by_rows)
     left = expected - jnp.trace(jnp.linalg.solve(information, taken))
     rows = 2.0 * jnp.sum(own[..., 0, 0] > 0)
     return square / jnp.maximum(left, 0.1 * expected + 1e-6), expected / jnp.maximum(rows, 1.0)
@@ -208,7 +209,7 @@ def displaced(
     M = shape(model, x[6:])
     residual, _, S, by_shape = _rows(x, M, found, slopes, observed, model, model_variance, rig)
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(len(M), -1, 3)
-    return M + jnp.einsum("kxy,kiy,ki->kx", model_variance, stacked, _solve(S, residual))
+    return M + einsum("kxy,kiy,ki->kx", model_variance, stacked, _solve(S, residual))
 
 
 def _rows(x, M, found, slopes, observed, model, model_variance, rig):
@@ -217,15 +218,15 @@ def _rows(x, M, found, slopes, observed, model, model_variance, rig):
     uv, _ = project_shape(rig, M, x[:6])
     by_shape, by_pose = jacobian(rig, M, x[:6])
     modes = model.basis.reshape(K, 3, -1)
-    by_state = jnp.concatenate([by_pose, jnp.einsum("ckix,kxb->ckib", by_shape, modes)], axis=-1)
+    by_state = jnp.concatenate([by_pose, einsum("ckix,kxb->ckib", by_shape, modes)], axis=-1)
     mask = observed[..., None, None]
     by_state, by_shape = (jnp.where(mask, J, 0.0) for J in (by_state, by_shape))
     residual = jnp.where(observed[..., None], found.uv - uv, 0.0)
     noise = jnp.where(mask, found.covariance + PIXEL_FLOOR**2 * jnp.eye(2), UNSEEN**2 * jnp.eye(2))
     stacked = jnp.moveaxis(by_shape, 1, 0).reshape(K, 2 * C, 3)
-    S = jnp.einsum("kix,kxy,kjy->kij", stacked, model_variance, stacked)
+    S = einsum("kix,kxy,kjy->kij", stacked, model_variance, stacked)
     inclined = jnp.moveaxis(jnp.where(mask, found.by_slope, 0.0), 1, 0).reshape(K, 2 * C, -1)
-    S += jnp.einsum("kix,kxy,kjy->kij", inclined, slopes.covariance, inclined)
+    S += einsum("kix,kxy,kjy->kij", inclined, slopes.covariance, inclined)
     for camera in range(C):
         rows = slice(2 * camera, 2 * camera + 2)
         S = S.at[:, rows, rows].add(noise[camera])

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxfilters._full_precision import PRECISION, dot
 from jaxfilters.typing import AnyKey
 
 WIDTH = 64
@@ -104,14 +105,20 @@ def _logits(params: tuple[Any, Any], windows: Float[Array, "n t f"], key: AnyKey
     values = windows
     for i, ((kernel, bias), dilation) in enumerate(zip(layers, DILATIONS, strict=True)):
         found = jax.lax.conv_general_dilated(
-            values, kernel, (1,), "SAME", rhs_dilation=(dilation,), dimension_numbers=("NWC", "WIO", "NWC")
+            values,
+            kernel,
+            (1,),
+            "SAME",
+            rhs_dilation=(dilation,),
+            dimension_numbers=("NWC", "WIO", "NWC"),
+            precision=PRECISION,
         )
         found = jax.nn.gelu(found + bias)
         if key is not None:
             kept = jax.random.bernoulli(jax.random.fold_in(key, i), 1 - DROPOUT, (len(found), 1, WIDTH))
             found = jnp.where(kept, found / (1 - DROPOUT), 0.0)
         values = found if i == 0 else values + found
-    logits: Array = values @ weights + offset
+    logits: Array = dot(values, weights) + offset
     return logits
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
@@ -79,7 +80,7 @@ def isolate(
     points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
     outside = jnp.sum((points - center) ** 2, axis=-1) > (scale * REACH) ** 2
     behind = observed > center[2] + scale * REACH
-    arm = (points - wrist) @ rotation[:, 1] > scale * FOREARM_BEGINS
+    arm = dot(points - wrist, rotation[:, 1]) > scale * FOREARM_BEGINS
     kept = jnp.where(outside | arm, jnp.nan, observed)
     return jnp.where(behind, jnp.inf, kept)
 

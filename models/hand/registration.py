@@ -23,6 +23,7 @@ import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.limits import SOFTNESS, limit_excess
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, local, retract
@@ -127,9 +128,9 @@ def gauss_newton(
     stiffness = jnp.concatenate([jnp.zeros(6), jnp.where(excess != 0, 1.0, 0.0)]) / SOFTNESS**2
     # In coordinates whitened by the prior the units of metres and radians no longer matter to float32.
     whitened = solve_triangular(root, local(prior.mean, pose), lower=True)
-    slope = root.T @ (gradient + beyond) + whitened
-    curvature = root.T @ (information + jnp.diag(stiffness)) @ root + jnp.eye(TANGENT_SIZE, dtype=root.dtype)
-    step = -root @ cho_solve(cho_factor(curvature, lower=True), slope)
+    slope = dot(root.T, gradient + beyond) + whitened
+    curvature = dot(dot(root.T, information + jnp.diag(stiffness)), root) + jnp.eye(TANGENT_SIZE, dtype=root.dtype)
+    step = dot(-root, cho_solve(cho_factor(curvature, lower=True), slope))
     shortening = jnp.minimum(1.0, jnp.min(LARGEST_STEP / jnp.maximum(jnp.abs(step), 1e-9)))
     return retract(pose, shortening * step), information
 
@@ -159,7 +160,7 @@ def normal_equations(
     residual, jacobian, weight = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
     count = jnp.maximum(hand.sum(), 1)
     weighted = jacobian * (weight * config.independent_pixels / (count * config.noise_std**2))[:, None]
-    return weighted.T @ residual, weighted.T @ jacobian
+    return dot(weighted.T, residual), dot(weighted.T, jacobian)
 
 
 class _Motion(NamedTuple):
@@ -201,7 +202,7 @@ def _contact(points: Float[Array, "m 3"], capsules: Capsules, motion: _Motion) -
 
 
 def _surface_terms(visible: _Contact, hand: Bool[Array, " m"], width: Array) -> tuple[Array, Array, Array]:
-    jacobian = -jnp.einsum("mi,mij->mj", visible.normal, visible.jacobian)
+    jacobian = -einsum("mi,mij->mj", visible.normal, visible.jacobian)
     return visible.distance, jacobian, jnp.where(hand, _robust(visible.distance, width), 0.0)
 
 
@@ -220,7 +221,7 @@ def _front_terms(
     shown: _Contact, gap: Float[Array, "m 3"], both: Bool[Array, " m"], width: Array, weight: float
 ) -> tuple[Array, Array, Array]:
     residual = jnp.sum(shown.normal * gap, axis=-1)
-    jacobian = jnp.einsum("mi,mij->mj", shown.normal, shown.jacobian)
+    jacobian = einsum("mi,mij->mj", shown.normal, shown.jacobian)
     in_front = both & (gap[:, 2] < 0)
     return residual, jacobian, jnp.where(in_front, weight * _robust(residual, width), 0.0)
 

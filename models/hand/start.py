@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._full_precision import dot
 from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed
@@ -334,12 +335,12 @@ def explained(
     """
     wrist, away = pose[:3], quaternion_to_matrix(quaternion_normalize(pose[3:7]))[:, 1]
     points = camera.rays() * jnp.where(jnp.isfinite(observed), observed + FOREARM_DEPTH, 0.0)[..., None] - wrist
-    beyond = jnp.isfinite(observed) & (points @ away > 0.01)
+    beyond = jnp.isfinite(observed) & (dot(points, away) > 0.01)
     count = jnp.sum(beyond)
     mean = jnp.sum(jnp.where(beyond[..., None], points, 0.0), axis=(0, 1)) / jnp.maximum(count, 1)
     direction = jnp.where(count > FEWEST_ARM_PIXELS, mean / jnp.maximum(jnp.linalg.norm(mean), 1e-6), away)
     radius = FOREARM_RADIUS * scale
-    length = jnp.max(jnp.where(beyond, points @ direction, 0.0)) - radius
+    length = jnp.max(jnp.where(beyond, dot(points, direction), 0.0)) - radius
     end = wrist + jnp.where(count > FEWEST_ARM_PIXELS, jnp.maximum(length, 1e-3), 1e-3) * direction
     inner = jnp.where(length > 0, radius, 0.5 * radius)
     limbs = Capsules(
@@ -364,7 +365,7 @@ def _near(camera: Pinhole, observed: Float[Array, "rows cols"], center: Float[Ar
 def _without_arm(camera: Pinhole, observed: Float[Array, "rows cols"], pose: Float[Array, " 22"]) -> Target:
     """The image without what lies beyond the wrist of a pose, which would pull the palm down the arm."""
     points = camera.rays() * jnp.where(jnp.isfinite(observed), observed, 0.0)[..., None]
-    along = (points - pose[:3]) @ quaternion_to_matrix(quaternion_normalize(pose[3:7]))[:, 1]
+    along = dot(points - pose[:3], quaternion_to_matrix(quaternion_normalize(pose[3:7]))[:, 1])
     arm = jnp.isfinite(observed) & (along > 0.02)
     return target_from_image(camera, jnp.where(arm, jnp.nan, observed))
 

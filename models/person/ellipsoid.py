@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 
 VISIBLE, INSIDE, BEHIND, CROSSING = 0, 1, 2, 3
@@ -71,7 +72,7 @@ def outline(P: Float[Array, "3 4"], body: Ellipsoid) -> Outline:
     With the pixel origin moved to the image of the centre, `Q*` comes to `N - h^2 e3 e3^T` with `N = M diag(r^2) M^T`:
     nothing large is subtracted from anything large, which single precision would not survive.
     """
-    homogeneous = P[:, :3] @ body.center + P[:, 3]
+    homogeneous = dot(P[:, :3], body.center) + P[:, 3]
     depth = homogeneous[2]
     reach = jnp.sum((P[2, :3] * body.semi_axes) ** 2)
     code = _code(P, body, depth, reach)
@@ -79,8 +80,8 @@ def outline(P: Float[Array, "3 4"], body: Ellipsoid) -> Outline:
     at = homogeneous[:2] / jnp.where(visible, depth, 1.0)
     M = (P[:2, :3] - at[:, None] * P[2, :3]) * body.semi_axes
     beyond = jnp.where(visible, depth**2 - reach, 1.0)
-    shift = -(M @ (P[2, :3] * body.semi_axes)) / beyond
-    shape = (M @ M.T) / beyond + jnp.outer(shift, shift)
+    shift = -dot(M, P[2, :3] * body.semi_axes) / beyond
+    shape = dot(M, M.T) / beyond + jnp.outer(shift, shift)
     return Outline(at + shift, jnp.where(visible, shape, jnp.eye(2, dtype=shape.dtype)), depth, code)
 
 
@@ -94,7 +95,7 @@ def _position(P):
     """Of the camera, metres; by Cramer's rule, which needs no call for every body."""
     first, second, third = P[:, :3]
     adjugate = jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)])
-    return -(P[:, 3] @ adjugate) / (first @ adjugate[0])
+    return -dot(P[:, 3], adjugate) / dot(first, adjugate[0])
 
 
 @jax.jit  # traced once for each shape, though called at many places of a program
@@ -135,7 +136,7 @@ def conic_to_ellipse(dual_conic: Float[Array, "3 3"]) -> Ellipse:
 def dual_quadric(body: Ellipsoid) -> Float[Array, "4 4"]:
     """`Q*`, all planes tangent to the ellipsoid: `T diag(r^2, -1) T^T`."""
     T = jnp.eye(4).at[:3, 3].set(body.center)
-    return T @ jnp.diag(jnp.append(body.semi_axes**2, -1.0)) @ T.T
+    return dot(dot(T, jnp.diag(jnp.append(body.semi_axes**2, -1.0))), T.T)
 
 
 def outline_coefficients(P: Float[Array, "3 4"], body: Ellipsoid) -> Float[Array, " 6"]:
@@ -147,9 +148,9 @@ def outline_coefficients(P: Float[Array, "3 4"], body: Ellipsoid) -> Float[Array
     D = jnp.linalg.inv(jnp.concatenate([P, jnp.array([[0.0, 0.0, 0.0, 1.0]], P.dtype)]))
     weights = jnp.stack([Rb2, Rb2, Ra2])
     directions, away = D[:3, :3], D[:3, 3] - body.center
-    a = directions.T @ (weights[:, None] * directions)
-    b = directions.T @ (weights * away)
-    c = away @ (weights * away) - Ra2 * Rb2
+    a = dot(directions.T, weights[:, None] * directions)
+    b = dot(directions.T, weights * away)
+    c = dot(away, weights * away) - Ra2 * Rb2
     K = jnp.outer(b, b) - a * c
     return jnp.stack([K[0, 0], K[1, 1], 2 * K[0, 1], 2 * K[0, 2], 2 * K[1, 2], K[2, 2]])
 
@@ -157,10 +158,10 @@ def outline_coefficients(P: Float[Array, "3 4"], body: Ellipsoid) -> Float[Array
 def near_depth(P: Float[Array, "3 4"], body: Ellipsoid, uv: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
     """Depth of the nearer side of the ellipsoid at pixels, metres; outside the outline, where rays pass it nearest."""
     inverse = jnp.linalg.inv(P[:, :3])
-    v = (uv @ inverse[:, :2].T + inverse[:, 2]) / body.semi_axes
-    away = (-inverse @ P[:, 3] - body.center) / body.semi_axes
-    A, B = jnp.sum(v * v, axis=-1), v @ away
-    discriminant = B**2 - A * (away @ away - 1)
+    v = (dot(uv, inverse[:, :2].T) + inverse[:, 2]) / body.semi_axes
+    away = (dot(-inverse, P[:, 3]) - body.center) / body.semi_axes
+    A, B = jnp.sum(v * v, axis=-1), dot(v, away)
+    discriminant = B**2 - A * (dot(away, away) - 1)
     root = jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0))
     return (-B - jnp.where(discriminant > 0, root, 0.0)) / A
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.models.person.ellipsoid import Ellipsoid, grown, outline, outline_radius
 
 CLUTTER = 0.02
@@ -157,9 +158,9 @@ def quadratic_fit(values: Float[Array, " points"], steps: Float[Array, " n"]) ->
     if len(values) != 3**n:
         raise ValueError(f"values must be those on lattice({n}), {3**n} of them; got {len(values)}.")
     x = lattice(n)
-    gradient = 3.0 ** (1 - n) / 2 * (values @ x)
-    mixed = 3.0 ** (2 - n) / 4 * jnp.einsum("p,pi,pj->ij", values, x, x)
-    squares = 3.0 ** (1 - n) / 2 * (values @ (3 * x**2 - 2))
+    gradient = 3.0 ** (1 - n) / 2 * dot(values, x)
+    mixed = 3.0 ** (2 - n) / 4 * einsum("p,pi,pj->ij", values, x, x)
+    squares = 3.0 ** (1 - n) / 2 * dot(values, 3 * x**2 - 2)
     second = jnp.where(jnp.eye(n, dtype=bool), 2 * squares, mixed)
     value = jnp.mean(values) - jnp.sum(squares) * 2 / 3
     return Quadratic(value, gradient / steps, -second / jnp.outer(steps, steps))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import pixel_grid
@@ -33,12 +34,12 @@ def _nearest(camera, patches, per_depth):
     def one(nearest, patch):
         corner, first, second = patch
         normal = jnp.cross(first, second)
-        facing = rays @ normal
-        depth = ((corner - origin) @ normal) / jnp.where(facing == 0, 1.0, facing)
+        facing = dot(rays, normal)
+        depth = dot(corner - origin, normal) / jnp.where(facing == 0, 1.0, facing)
         on_plane = origin + depth[..., None] * rays - corner
-        squared = normal @ normal
-        along = jnp.cross(on_plane, second) @ normal / squared
-        across = jnp.cross(first, on_plane) @ normal / squared
+        squared = dot(normal, normal)
+        along = dot(jnp.cross(on_plane, second), normal) / squared
+        across = dot(jnp.cross(first, on_plane), normal) / squared
         inside = (along >= 0) & (along <= 1) & (across >= 0) & (across <= 1)
         hit = inside & (depth > 0) & (facing != 0)
         return jnp.minimum(nearest, jnp.where(hit, depth * per_depth, jnp.inf)), None
@@ -58,7 +59,7 @@ def mesh_depth(camera: FloorCamera, vertices: np.ndarray, triangles: np.ndarray)
     pinhole = Pinhole.from_intrinsics(float(max(rows, cols)), ((cols - 1) / 2, (rows - 1) / 2), camera.shape)
     # Any projection matrix is this pinhole after a linear map of space, which leaves triangles and depths as they are.
     P = np.linalg.solve(np.asarray(pinhole.matrix(), float), np.asarray(camera.P, float))
-    observed = vertices @ P[:, :3].T + P[:, 3]
+    observed = dot(vertices, P[:, :3].T) + P[:, 3]
     return render_mesh(pinhole, Mesh(jnp.asarray(observed, jnp.float32), jnp.asarray(triangles, jnp.int32)))
 
 
@@ -66,8 +67,8 @@ def upright_depth(camera: FloorCamera, xy: Float[Array, " 2"]) -> Float[Array, "
     """Depth of the vertical plane through a floor point that faces the camera: of thin things outlined in the image."""
     rays, origin = camera.rays(pixel_grid(camera.shape)), camera.position()
     away = xy - origin[:2]
-    towards = rays[..., :2] @ away
-    return jnp.where(towards > 0, away @ away / jnp.where(towards > 0, towards, 1.0), jnp.inf)
+    towards = dot(rays[..., :2], away)
+    return jnp.where(towards > 0, dot(away, away) / jnp.where(towards > 0, towards, 1.0), jnp.inf)
 
 
 @jax.jit

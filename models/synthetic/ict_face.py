@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._full_precision import tensordot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.typing import AnyKey
@@ -107,14 +108,14 @@ def ict_model(points: dict[str, np.ndarray], surface: dict[str, np.ndarray]) -> 
 def make_ict_person(key: AnyKey, model: IctModel) -> IctPerson:
     """A random person: standard normal weights of all modes of identity."""
     weights = jax.random.normal(key, (model.identity.shape[0],), model.neutral.dtype)
-    neutral = model.neutral + jnp.tensordot(weights, model.identity, 1)
+    neutral = model.neutral + tensordot(weights, model.identity, 1)
     return IctPerson(neutral - jnp.mean(ten_landmarks(model, neutral), axis=0))
 
 
 @jax.jit
 def deformed(model: IctModel, person: IctPerson, weights: Float[Array, " expressions"]) -> Float[Array, "V 3"]:
     """Vertices of a person with an expression, millimetres about the centroid of the ten *neutral* landmarks."""
-    return person.neutral + jnp.tensordot(weights, model.expression, 1)
+    return person.neutral + tensordot(weights, model.expression, 1)
 
 
 def ten_landmarks(model: IctModel, vertices: Float[Array, "V 3"]) -> Float[Array, "10 3"]:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.rendering.geometry import Ellipsoids
 
@@ -72,7 +73,7 @@ def body(walker: Walker) -> Ellipsoids:
     center = jnp.stack(centers) * size
     cos, sin = jnp.cos(walker.heading), jnp.sin(walker.heading)
     turn = jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
-    center = jnp.concatenate([center[:, :2] @ turn.T + walker.xy, center[:, 2:]], axis=1)
+    center = jnp.concatenate([dot(center[:, :2], turn.T) + walker.xy, center[:, 2:]], axis=1)
     return Ellipsoids(center, _quaternions(walker.heading, jnp.stack(tilts)), jnp.array(radii) * size)
 
 

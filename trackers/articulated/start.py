@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.gaussian.constraints import LinearConstraints
 from jaxfilters.math.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.anatomy import PALM_WIDTH, relaxed_angles, template_shape
@@ -127,7 +128,7 @@ def starts_from_points(
 def _apart(layout: Layout, means: Array, costs: Array) -> Array:
     """Costs with those of poses set back that a better one is close to."""
     q = means[:, layout.quaternion]
-    alike = jnp.abs(q @ q.T) > math.cos(0.5 * SAME_POSE)
+    alike = jnp.abs(dot(q, q.T)) > math.cos(0.5 * SAME_POSE)
     better = (costs[None] < costs[:, None]) | ((costs[None] == costs[:, None]) & jnp.tri(len(costs), k=-1, dtype=bool))
     return costs + jnp.where(jnp.any(alike & better, axis=1), _SET_BACK, 0.0)
 
@@ -166,11 +167,11 @@ def _laid_over(hand: ArticulatedHand, x: Array, target: Array, observed: Array) 
     square = jnp.maximum(jnp.sum(weight * a * a), 1e-6)
     angle, scale = jnp.arctan2(sin, cos), jnp.maximum(jnp.sqrt(cos**2 + sin**2) / square, 1e-3)
     turned = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
-    misfit = jnp.sum(weight * (b - scale * a @ turned.T) ** 2)
+    misfit = jnp.sum(weight * (b - dot(scale * a, turned.T)) ** 2)
     z = jnp.eye(3, dtype=x.dtype)[2]
     q = quaternion_multiply(so3_exp(angle * z), x[layout.quaternion])
     origin = hand.projection.image_points(hand.projection.camera_points(x, layout, jnp.zeros(3, x.dtype)))
-    wrist = there + scale * turned @ (origin - here)
+    wrist = there + dot(scale * turned, origin - here)
     if isinstance(hand.projection, Perspective):
         camera = hand.projection.camera
         ray = jnp.append((wrist - camera.center) / camera.focal, 1.0)
@@ -210,7 +211,7 @@ def _fitted(
         parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]
         parts += [p[rotation:angles] / size.std] if in_space else []
         if limits is not None:
-            value = limits.normals @ x
+            value = dot(limits.normals, x)
             outside = jnp.maximum(value - limits.upper, 0.0) + jnp.maximum(limits.lower - value, 0.0)
             moves = jnp.any(limits.normals[:, layout.angles] != 0, axis=1)
             parts.append(jnp.where(moves, outside / LIMIT_STD, 0.0))
@@ -219,8 +220,8 @@ def _fitted(
     def step(carry: tuple, _: None) -> tuple[tuple, None]:
         p, cost, damping = carry
         r, J = deviations(p), jax.jacfwd(deviations)(p)
-        A = J.T @ J
-        change = jnp.linalg.solve(A + damping * jnp.diag(jnp.diagonal(A) + 1e-3), -J.T @ r)
+        A = dot(J.T, J)
+        change = jnp.linalg.solve(A + damping * jnp.diag(jnp.diagonal(A) + 1e-3), dot(-J.T, r))
         tried = p + change
         after = 0.5 * jnp.sum(deviations(tried) ** 2)
         better = after < cost

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters import weights
+from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
@@ -75,7 +76,7 @@ def standard_deviations(pose: Float[Array, " 22"], covariance: Float[Array, "21 
     """Of the tangent coordinates of a pose: those of the ensemble and `MODEL_ERROR` together."""
     model = jnp.asarray(MODEL_ERROR**2, covariance.dtype)
     palm = quaternion_to_matrix(quaternion_normalize(pose[3:7]))
-    model = jnp.concatenate([palm**2 @ model[:3], model[3:]])
+    model = jnp.concatenate([dot(palm**2, model[:3]), model[3:]])
     return jnp.sqrt(jnp.diagonal(covariance) + model)
 
 

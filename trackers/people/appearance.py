@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
@@ -91,7 +92,7 @@ def _histogram(colors, weight, upper):
     # Equal steps of the square root: clothes are mostly dark.
     bins = jax.nn.one_hot((BINS * jnp.sqrt(colors / 256)).astype(jnp.int32), BINS)
     sizes = jnp.sum(halves, axis=1)
-    histogram = jnp.einsum("hs,scb->hcb", halves, bins) / jnp.maximum(sizes, 1e-6)[:, None, None]
+    histogram = einsum("hs,scb->hcb", halves, bins) / jnp.maximum(sizes, 1e-6)[:, None, None]
     return histogram.ravel(), jnp.all(sizes > LEAST_PIXELS)
 
 

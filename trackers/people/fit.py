@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
@@ -120,10 +121,10 @@ def fit_people(
             mine = shifted(unshifted, shifts[k])
 
         def best(place, offsets):
-            candidates = place + offsets @ axes[k]
+            candidates = place + dot(offsets, axes[k])
             scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
             away = candidates - start[k]
-            total = scores - jnp.einsum("ci,ij,cj->c", away, prior[k], away) / 2
+            total = scores - einsum("ci,ij,cj->c", away, prior[k], away) / 2
             # Where candidates are equal, the one that moves least: the middle of the lattice comes first.
             nearest_first = jnp.argsort(jnp.sum(offsets**2, axis=-1))
             return candidates[nearest_first[jnp.argmax(total[nearest_first])]]
@@ -145,7 +146,7 @@ def _lattices():
 
     All are as many, so that one program serves them: the wide one has its middle three times.
     """
-    wide, narrow = (foreground.lattice(n, reach) @ jnp.eye(n, 4) for n, reach in ((2, 2), (3, 1)))
+    wide, narrow = (dot(foreground.lattice(n, reach), jnp.eye(n, 4)) for n, reach in ((2, 2), (3, 1)))
     middle = jnp.zeros((len(narrow) - len(wide), 4))
     return jnp.stack([jnp.concatenate([wide, middle]), narrow / 2, narrow / 4])
 
@@ -165,7 +166,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        candidates = places[k] + jnp.concatenate([around * steps[k], -away, away]) @ axes[k]
+        candidates = places[k] + dot(jnp.concatenate([around * steps[k], -away, away]), axes[k])
         values = by_reading(scene, candidates, mine, contrasts)
         scores = jnp.sum(values, axis=0) / scene.config.independent_patches
         fit = Fit(
@@ -210,7 +211,7 @@ def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
         others = active.at[k].set(False).at[senior].set(False)
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])
-        offsets = (foreground.lattice(2) @ jnp.eye(2, 4)) * steps[senior] @ axes[senior]
+        offsets = dot(dot(foreground.lattice(2), jnp.eye(2, 4)) * steps[senior], axes[senior])
         candidates = places[senior] + (between[:, None] + offsets).reshape(-1, 4)
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
@@ -241,9 +242,9 @@ def as_measurement(fit: Fit, silhouette_sd: float) -> Readings:
         observed = eigenvalues > LEAST_CURVATURE
         curvature = jnp.where(observed, eigenvalues, 1.0)
         limit = jnp.maximum(jnp.linalg.norm(steps), jnp.minimum(1 / jnp.sqrt(curvature), MOST_SHIFT_M))
-        shift = jnp.clip((quadratic.gradient @ vectors) / curvature, -limit, limit)
-        H = vectors.T @ axes
-        return Readings(H @ place + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed)
+        shift = jnp.clip(dot(quadratic.gradient, vectors) / curvature, -limit, limit)
+        H = dot(vectors.T, axes)
+        return Readings(dot(H, place) + shift, H, jnp.diag(1 / curvature + silhouette_sd**2), observed)
 
     if fit.quadratic.value.shape[1] == 1:
         alone = jax.vmap(one)(fit.place, fit.axes, fit.steps, jax.tree.map(lambda leaf: leaf[:, 0], fit.quadratic))
@@ -255,7 +256,7 @@ def _observed_covariance(scene, predicted):
     """Of what the silhouettes show: places and their displacements by the biases."""
     factors = jax.vmap(bias_factor, in_axes=(None, 0))(scene, predicted.mean)
     shows = jnp.broadcast_to(jnp.eye(STATE)[jnp.array(PLACE)], (len(factors), 4, STATE)).at[:, :, BIAS].set(factors)
-    return jnp.einsum("kpi,kij,kqj->kpq", shows, predicted.covariance, shows)
+    return einsum("kpi,kij,kqj->kpq", shows, predicted.covariance, shows)
 
 
 def _axes(scene, place):
@@ -282,7 +283,7 @@ def _foot_pixel_m(scene, places):
 
 
 def _reach(scene, places, covariance, axes):
-    along = jnp.einsum("kai,kij,kaj->ka", axes[:, :2, :2], covariance[:, :2, :2], axes[:, :2, :2])
+    along = einsum("kai,kij,kaj->ka", axes[:, :2, :2], covariance[:, :2, :2], axes[:, :2, :2])
     most = jnp.full((len(places), 2), MOST_REACH_M).at[:, 0].max(REACH_FOOT_PX * _foot_pixel_m(scene, places))
     return jnp.clip(2 * jnp.sqrt(jnp.maximum(along, 0.0)), LEAST_REACH_M, most)
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
 from jaxfilters.trackers.people.silhouette_bias import pixel_m
@@ -89,6 +90,6 @@ def displacement_by_shift(camera: FloorCamera, xy: Float[Array, " 2"], height: F
         return camera.project(jnp.stack([jnp.append(place[:2], 0.0), place]))[0].ravel()
 
     by_place = jax.jacfwd(ends)(jnp.append(xy, height))
-    normal = by_place.T @ by_place
+    normal = dot(by_place.T, by_place)
     ridge = _RIDGE * jnp.trace(normal) * jnp.eye(3)
-    return jnp.linalg.solve(normal + ridge, by_place.T @ jnp.tile(jnp.eye(2), (2, 1)))
+    return jnp.linalg.solve(normal + ridge, dot(by_place.T, jnp.tile(jnp.eye(2), (2, 1))))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
@@ -149,7 +150,7 @@ def _look(camera, furniture, config, xy):
     def one(xy):
         contour = outline(camera.P, standing(xy, config.height_m, config.width_m))
         # Ellipse coordinates along the image of the vertical axis and across, so that feet are below.
-        uv = contour.center + offsets @ jnp.linalg.cholesky(contour.shape[::-1, ::-1])[::-1, ::-1].T
+        uv = contour.center + dot(offsets, jnp.linalg.cholesky(contour.shape[::-1, ::-1])[::-1, ::-1].T)
         u, v = jnp.round(uv[:, 0] / step).astype(jnp.int32), jnp.round(uv[:, 1] / step).astype(jnp.int32)
         inside = (u >= 0) & (u < reduced_cols) & (v >= 0) & (v < reduced_rows) & (contour.code == VISIBLE)
         u, v = jnp.clip(u, 0, reduced_cols - 1), jnp.clip(v, 0, reduced_rows - 1)
@@ -256,7 +257,7 @@ def _is_away(scene: PeopleScene, belief: Gaussian) -> Bool[Array, " slots"]:
     beyond = xy - nearest_on_border(scene.floor, xy)
     distance = jnp.linalg.norm(beyond, axis=-1)
     normal = beyond / jnp.maximum(distance, 1e-6)[:, None]
-    sd = jnp.sqrt(jnp.einsum("ki,kij,kj->k", normal, belief.covariance[:, :2, :2], normal))
+    sd = jnp.sqrt(einsum("ki,kij,kj->k", normal, belief.covariance[:, :2, :2], normal))
     return ~walkable(scene.floor, xy) & (distance > AWAY_SD * sd)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.people.state import BIAS, HEIGHT, NUM_BIASES, PeopleScene
 
@@ -54,7 +55,7 @@ def edge_covariance(
         jacobian = _silhouette_jacobian(camera.position(), xy, height)
         spread = edge_px * jnp.where(counts, pixel_m(camera, xy), 0.0)
         variance = scene.config.silhouette_bias_m**2 + spread**2
-        information += counts * jacobian.T @ jacobian / variance
+        information += dot(counts * jacobian.T, jacobian) / variance
     return jnp.linalg.inv(information)
 
 
@@ -73,7 +74,7 @@ def bias_factor(scene: PeopleScene, mean: Float[Array, " state"]) -> Float[Array
 
 def displacement(scene: PeopleScene, mean: Float[Array, " state"]) -> Float[Array, " 4"]:
     """By how much X, Y, height and width of the silhouette are believed to differ from those of the person, metres."""
-    return bias_factor(scene, mean) @ mean[BIAS]
+    return dot(bias_factor(scene, mean), mean[BIAS])
 
 
 def _has_middle(camera, xy, height):

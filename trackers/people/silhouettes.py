@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import (
@@ -98,7 +99,7 @@ def view_of(
 ) -> View:
     """The window in which a person is searched for: as far as `reach` along the first two `axes`, and a margin."""
     corners = jnp.array([[i, j, 0.0, 0.0] for i in (-1, 1) for j in (-1, 1)]) * jnp.append(reach, jnp.zeros(2))
-    bodies = jax.vmap(body_of)(place + corners @ axes)
+    bodies = jax.vmap(body_of)(place + dot(corners, axes))
     contour = jax.vmap(outline, in_axes=(None, 0))(camera.P, bodies)
     boxes = jax.vmap(lambda one: ellipse_of(one).box)(contour)
     box = jnp.concatenate([jnp.min(boxes[:, :2], axis=0), jnp.max(boxes[:, 2:], axis=0)])

@@ -12,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.consider import consider
@@ -144,7 +145,7 @@ def _observed_places(scene: PeopleScene, people: People) -> Array:
 
 def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
     covariance = people.belief.covariance[:, :2, :2]
-    variance = jnp.einsum("kai,kij,kaj->ka", fit.axes[:, :2, :2], covariance, fit.axes[:, :2, :2])
+    variance = einsum("kai,kij,kaj->ka", fit.axes[:, :2, :2], covariance, fit.axes[:, :2, :2])
     radial, lateral = jnp.sqrt(jnp.maximum(variance, 0.0)).T
     return Report(
         people.identity,
@@ -204,13 +205,13 @@ def updated(
 
 def _of_one(scene, camera, belief, reading, whole, frames):
     in_state = jnp.eye(STATE)[jnp.array(PLACE)]
-    H = (reading.H @ in_state).at[:, HEIGHT].multiply(stature(belief.mean))
-    H, R = H.at[:, BIAS].set(reading.H @ bias_factor(scene, belief.mean)), reading.R
+    H = dot(reading.H, in_state).at[:, HEIGHT].multiply(stature(belief.mean))
+    H, R = H.at[:, BIAS].set(dot(reading.H, bias_factor(scene, belief.mean))), reading.R
     if camera:
         height = jnp.maximum(belief.mean[HEIGHT], _LEAST_HEIGHT_M)
         by_shift = displacement_by_shift(scene.cameras[camera], belief.mean[:2], height)
-        loading = shift_sd(scene)[camera] * reading.H[:, :3] @ by_shift
-        R += frames * loading @ loading.T
+        loading = dot(shift_sd(scene)[camera] * reading.H[:, :3], by_shift)
+        R += dot(frames * loading, loading.T)
     after, info = joseph.update(belief, reading.y, H, R, mask=reading.observed)
     size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
     return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis

@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int32
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.person.ellipsoid import CROSSING, Ellipsoid, ellipse_mask, outline, standing
 from jaxfilters.models.person.foreground import lattice, quadratic_fit
 from jaxfilters.models.person.scene import walkable
@@ -93,7 +94,7 @@ def candidate_positions(
     offsets = lattice(2)
     # The first of equal scores is taken: it moves least.
     nearest_first = offsets[jnp.argsort(jnp.sum(offsets**2, axis=-1))]
-    return xy + step * nearest_first @ axes
+    return xy + dot(step * nearest_first, axes)
 
 
 @jax.jit
@@ -171,15 +172,15 @@ def _profile(scene, state, mask, looks):
         away = state.xy[k] - scene.camera.position()[:2]
         x, y = away / jnp.maximum(jnp.linalg.norm(away), 1e-6)
         axes = jnp.stack([jnp.stack([x, y]), jnp.stack([y, -x])])
-        bodies = _bodies(state.xy[k] + offsets @ axes, state.size[k])
+        bodies = _bodies(state.xy[k] + dot(offsets, axes), state.size[k])
         masks, _ = jax.vmap(_drawn, in_axes=(None, 0))(scene, bodies)
         others = jnp.any(drawn.at[k].set(False), axis=0)
         counted = scene.config.region(scene.camera, bodies, scene.config.ring_px)
         scores = jnp.maximum(_together(scene.config, masks, others, real, counted), -1.0)
         fit = quadratic_fit(scores[:9], jnp.full(2, CURVATURE_STEP_M))
         curvature, vectors = jnp.linalg.eigh(fit.curvature)
-        roots = vectors.T @ axes / jnp.sqrt(looks * jnp.maximum(curvature, LEAST_CURVATURE))[:, None]
-        return Profile(scores[4] - jnp.max(scores[9:]), roots.T @ roots)
+        roots = dot(vectors.T, axes) / jnp.sqrt(looks * jnp.maximum(curvature, LEAST_CURVATURE))[:, None]
+        return Profile(scores[4] - jnp.max(scores[9:]), dot(roots.T, roots))
 
     return jax.lax.map(one, jnp.arange(len(searched)))
 

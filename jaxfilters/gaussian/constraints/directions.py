@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfilters._full_precision import dot
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.math import linalg
 
@@ -50,17 +51,17 @@ def along(belief: Gaussian | GaussianRoot, normal: Float[Array, " n"]) -> Direct
         deviation, deviations = linalg.safe_norm(turned), linalg.safe_norm(belief.root)
     else:
         turned = jnp.matmul(belief.covariance, normal, precision="highest")
-        deviation = linalg.safe_sqrt(normal @ turned)
+        deviation = linalg.safe_sqrt(dot(normal, turned))
         deviations = linalg.safe_sqrt(jnp.diagonal(belief.covariance))
-    floor = resolution(belief) * (abs(normal) @ deviations)
+    floor = resolution(belief) * dot(abs(normal), deviations)
     certain = deviation <= floor
     weight = turned * jnp.where(certain, 0.0, 1 / jnp.where(certain, 1.0, deviation))
     gain = jnp.sum(belief.root * weight, axis=1) if isinstance(belief, GaussianRoot) else weight
-    rounding = floor + _rounding(belief) * (abs(normal) @ abs(belief.mean))
+    rounding = floor + _rounding(belief) * dot(abs(normal), abs(belief.mean))
     share = floor / jnp.where(certain, 1.0, deviation)
     noise = 2 * share if isinstance(belief, GaussianRoot) else share**2
     axis = (normal != 0) & (jnp.sum(normal != 0) == 1) & ~certain
-    return Direction(normal @ belief.mean, deviation, gain, weight, certain, rounding, noise, axis)
+    return Direction(dot(normal, belief.mean), deviation, gain, weight, certain, rounding, noise, axis)
 
 
 def component(belief: GaussianRoot, index: Int[Array, ""]) -> Direction:
@@ -99,7 +100,7 @@ def reshape(belief: Belief, direction: Direction, shift: Float[Array, ""], ratio
 
 def image(belief: Belief, normals: Float[Array, "k n"]) -> Belief:
     """Belief in `normals x`, (k,), for normals (k, n)."""
-    mean = normals @ belief.mean
+    mean = dot(normals, belief.mean)
     if isinstance(belief, GaussianRoot):
         return GaussianRoot(mean, linalg.matmul(normals, belief.root))
     return Gaussian(mean, linalg.matmul(linalg.matmul(normals, belief.covariance), normals.T))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import dot, tensordot
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment, align
 from jaxfilters.models.face.patches import Slopes, learn_slopes
@@ -109,9 +110,9 @@ def refined(
     fits = jax.lax.map(fit, jnp.asarray(STRENGTHS, x.dtype))
     rest, rest_belief = _at_rest(prior, found, state, model, rig, x, ~is_followed)
     resting, among = _shares(rest, fits)
-    average = lambda values: jnp.tensordot(among, values, 1)
+    average = lambda values: tensordot(among, values, 1)
     is_unknown = jnp.asarray(STRENGTHS) > 0
-    doubt = ALIKE_ANEW * (1 - resting) * jnp.tensordot(among * is_unknown, fits.belief.covariance, 1)[:POSE, :POSE]
+    doubt = ALIKE_ANEW * (1 - resting) * tensordot(among * is_unknown, fits.belief.covariance, 1)[:POSE, :POSE]
     alike = jnp.where(is_unknown, ALIKE, 1.0)[:, None, None]
     free = _mixed(among, Gaussian(fits.belief.mean, alike * fits.belief.covariance))
     M = resting * state.registered.shape + (1 - resting) * shape(model, free.mean[POSE:])
@@ -166,7 +167,7 @@ def _at_rest(
     covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
     prior = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
     rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0), is_own)
-    a = model.basis.T @ (state.registered.shape - model.mean).ravel()
+    a = dot(model.basis.T, (state.registered.shape - model.mean).ravel())
     return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
 
 
@@ -179,14 +180,14 @@ def _with_gauge(belief: Gaussian, deformation: Array, state: HeadState, model: F
     R = rotation(belief.mean[3:POSE])
     to_angles = jnp.linalg.solve(turning_axes(belief.mean[3:POSE]).T, R)
     turn = jnp.zeros((POSE, POSE), R.dtype).at[:3, :3].set(R).at[3:, 3:].set(to_angles)
-    extra = share * turn @ motion_covariance(model.mean) @ turn.T
-    extra = extra.at[:3, :3].add(R @ state.registered.alike @ R.T)
+    extra = dot(dot(share * turn, motion_covariance(model.mean)), turn.T)
+    extra = extra.at[:3, :3].add(dot(dot(R, state.registered.alike), R.T))
     return Gaussian(belief.mean, belief.covariance.at[:POSE, :POSE].add(extra))
 
 
 def _mixed(shares: Array, each: Gaussian) -> Gaussian:
     """One Gaussian with the moments of several."""
-    mean = shares @ each.mean
+    mean = dot(shares, each.mean)
     off = each.mean - mean
     spread = each.covariance + off[:, :, None] * off[:, None]
-    return Gaussian(mean, jnp.tensordot(shares, spread, 1))
+    return Gaussian(mean, tensordot(shares, spread, 1))

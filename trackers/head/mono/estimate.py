@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.bundle import Views
@@ -95,9 +96,9 @@ def aligned(
     drifted = recent.drifted(state.recent, is_followed, drift)
     observed = recent.as_observed(found, anchored, M, pose, images, rig, drifted)
     by_shape = jnp.where(found.observed[..., None, None], jacobian(rig, M, pose)[0], 0.0)
-    by_slope = jnp.einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
+    by_slope = einsum("ckij,kjl,cknl->ckin", found.by_slope, state.slopes.covariance, found.by_slope)
     variance = state.model_variance + UNMODELLED_MM**2
-    spread = jnp.einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
+    spread = einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
     covariance = found.covariance + by_slope + spread + PIXEL_FLOOR**2 * jnp.eye(2)
     return Estimate(
         fit.belief,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import align
@@ -207,11 +208,11 @@ class _HeadTracker:
 def _with_known_face(state: HeadState, old: HeadState) -> tuple[HeadState, bool]:
     """The new state with the deformations of before, if the face is that of before."""
     R, t = align(old.registered.shape, state.registered.shape)
-    moved = old.registered.shape @ R.T + t
+    moved = dot(old.registered.shape, R.T) + t
     apart = float(jnp.sqrt(jnp.mean(jnp.sum((moved - state.registered.shape) ** 2, axis=-1))))
     if not apart <= SAME_FACE_MM:
         return state, False
-    turn = lambda vectors: (vectors.reshape(-1, NUM_LANDMARKS, 3) @ R.T).reshape(vectors.shape)
+    turn = lambda vectors: dot(vectors.reshape(-1, NUM_LANDMARKS, 3), R.T).reshape(vectors.shape)
     basis = turn(old.model.basis.T).T
     modes = old.learner.subspace._replace(vectors=turn(old.learner.subspace.vectors))
     model = FaceModel(state.model.mean, basis, old.model.deviation, state.model.templates)

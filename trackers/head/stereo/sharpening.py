@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
+from jaxfilters._full_precision import einsum
 from jaxfilters.models.face.alignment import align
 from jaxfilters.models.face.patches import (
     SKIN_NORMALS,
@@ -71,7 +72,7 @@ def sharpened(
     for c in range(1, rig.num_cameras):
         found = align(first, slopes, images[c : c + 1], uv[c : c + 1], shape, pose, _one(rig, c))
         near = found.observed[0] & (jnp.linalg.norm(found.uv[0] - uv[c], axis=-1) < MOST_CHANGE_PX)
-        inclined = jnp.einsum("kis,kst,kjt->kij", found.by_slope[0], slopes.covariance, found.by_slope[0])
+        inclined = einsum("kis,kst,kjt->kij", found.by_slope[0], slopes.covariance, found.by_slope[0])
         places.append(jnp.where(near[:, None], found.uv[0], uv[c]))
         mismatch = MISMATCH_PX * jnp.maximum(SAME_SKIN - found.score, 0.0)
         lacking = jnp.concatenate([lacking, mismatch])
@@ -115,13 +116,13 @@ def _along_rays(shape: Array, pose: Array, uv: Array, covariance: Array, lacking
     sight = jnp.cross(by_shape[0, :, 0], by_shape[0, :, 1])
     sight /= jnp.linalg.norm(sight, axis=-1, keepdims=True)
     precision = jnp.linalg.inv(covariance)
-    along = jnp.einsum("ckix,kx->cki", by_shape, sight)[1:]
-    information = jnp.einsum("cki,ckij,ckj->k", along, precision[1:], along)
-    pull = jnp.einsum("cki,ckij,ckj->k", along, precision[1:], (uv - projected)[1:])
+    along = einsum("ckix,kx->cki", by_shape, sight)[1:]
+    information = einsum("cki,ckij,ckj->k", along, precision[1:], along)
+    pull = einsum("cki,ckij,ckj->k", along, precision[1:], (uv - projected)[1:])
     prior = 1 / UNSEEN_DEPTH_MM**2
     # A match as far as it may be from where it was: depth is nearly linear in the shift.
     shape = shape + sight * (pull / jnp.maximum(information, prior))[:, None]
-    total = jnp.einsum("ckix,ckij,ckjy->kxy", by_shape, precision, by_shape)
+    total = einsum("ckix,ckij,ckjy->kxy", by_shape, precision, by_shape)
     middle = jnp.mean(sight, axis=0)
     reach = jnp.maximum(jnp.sum(along**2), 1e-6)
     alike = jnp.sum(lacking**2) / reach * jnp.outer(middle, middle)

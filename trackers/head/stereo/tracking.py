@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxfilters._full_precision import dot
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.diffusion import DiffusionFit
@@ -250,8 +251,8 @@ def _carried(
     """Particles and belief in the modes of a model that has changed."""
     carry = lambda a: learning.carried(a, before, after)
     turning = learning.turning(before, after)
-    block = turning @ belief.covariance[POSE:, POSE:] @ turning.T
-    cross = belief.covariance[:POSE, POSE:] @ turning.T
+    block = dot(dot(turning, belief.covariance[POSE:, POSE:]), turning.T)
+    cross = dot(belief.covariance[:POSE, POSE:], turning.T)
     covariance = belief.covariance.at[POSE:, POSE:].set(block)
     covariance = covariance.at[:POSE, POSE:].set(cross).at[POSE:, :POSE].set(cross.T)
     search = search._replace(
@@ -273,7 +274,7 @@ def _sharper(images: Array, shape: Array, pose: Array, slopes: Slopes, rig: Came
     shape, covariance, alike = sharpened(images, shape, pose, slopes, rig)
     center = jnp.mean(shape, axis=0)
     # The landmarks stay where they are in the first image: what moves the centroid moves the pose back.
-    place = pose.at[:3].add(rotation(pose[3:]) @ center)
+    place = pose.at[:3].add(dot(rotation(pose[3:]), center))
     shape = shape - center
     observed = patches(images, shape, place, rig, jnp.asarray(SKIN_NORMALS, shape.dtype))
     return Registered(shape, covariance, alike, observed, place, images)
