@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
+from jax.extend.source_info_util import current_name_stack, user_context
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
@@ -134,7 +135,10 @@ def _evaluate(closed: ClosedJaxpr, size: int, values: list[_Value]) -> list[_Val
         return _Value(var.val, False) if isinstance(var, Literal) else known[var]
 
     for eqn in jaxpr.eqns:
-        known |= dict(zip(eqn.outvars, _apply(eqn, size, [read(var) for var in eqn.invars]), strict=True))
+        # Messages and profiles name the line of the model, not this one.
+        names = current_name_stack() + eqn.source_info.name_stack
+        with user_context(eqn.source_info.traceback, name_stack=names):
+            known |= dict(zip(eqn.outvars, _apply(eqn, size, [read(var) for var in eqn.invars]), strict=True))
     return [read(var) for var in jaxpr.outvars]
 
 
