@@ -6,7 +6,9 @@ every product does, and so do its derivatives. On a CPU the compiled programs ar
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 PRECISION = "highest"
 
@@ -14,3 +16,16 @@ dot = partial(jnp.matmul, precision=PRECISION)
 """`a @ b` of vectors, matrices, and batches of matrices."""
 einsum = partial(jnp.einsum, precision=PRECISION)
 tensordot = partial(jnp.tensordot, precision=PRECISION)
+
+
+@jax.custom_jvp
+def qr(A: Float[Array, "*batch n m"]) -> tuple[Float[Array, "*batch n k"], Float[Array, "*batch k m"]]:
+    """`jnp.linalg.qr`, whose derivatives are products that ask for no precision."""
+    Q, R = jnp.linalg.qr(A)
+    return Q, R
+
+
+@qr.defjvp
+def _qr_jvp(primals, tangents):
+    with jax.default_matmul_precision(PRECISION):
+        return jax.jvp(lambda A: tuple(jnp.linalg.qr(A)), primals, tangents)

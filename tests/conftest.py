@@ -22,6 +22,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
 
 PROCESSOR_SECONDS = pytest.StashKey[float]()
 """Processor time of the set-up and the call of a test."""
@@ -157,6 +158,48 @@ def data_dir():
     if not folder:
         pytest.skip("JAXFILTERS_DATA is not set: no recordings to read")
     return Path(folder)
+
+
+def _programs_in(value):
+    """The programs inside of a parameter of an operation: bodies of loops, branches, compiled functions."""
+    if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
+        yield getattr(value, "jaxpr", value)
+    elif isinstance(value, tuple | list):
+        for item in value:
+            yield from _programs_in(item)
+
+
+@pytest.fixture(scope="session")
+def products_at_default_precision():
+    """`f(function, *args, own=True)`: the lines whose products of floats leave their precision to the device.
+
+    Only lines of the package, unless `own` is False: the models of tests are the tests' own. A product inside of one of
+    JAX's functions counts for the line that calls it, and a derivative for the product that it is of.
+    """
+
+    from jaxfilters import models, trackers  # checked by jaxtyping if imported this late
+
+    tests = str(Path(__file__).parent) + os.sep
+    folders = (tests, *(package.__path__[0] + os.sep for package in (sys.modules["jaxfilters"], models, trackers)))
+
+    def line_of(eqn, caller):
+        frames = eqn.source_info.traceback.frames if eqn.source_info.traceback else ()
+        here = (f"{frame.file_name}:{frame.line_num}" for frame in frames if frame.file_name.startswith(folders))
+        return next(here, caller)
+
+    def products(program, caller):
+        for eqn in program.eqns:
+            line = line_of(eqn, caller)
+            if eqn.primitive.name in ("dot_general", "conv_general_dilated") and eqn.params["precision"] is None:
+                yield from [line] * jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
+            for inner in _programs_in(tuple(eqn.params.values())):
+                yield from products(inner, line)
+
+    def found(function, *args, own=True):
+        lines = dict.fromkeys(products(jax.make_jaxpr(function)(*args).jaxpr, ""))
+        return [line for line in lines if not own or not line.startswith(tests)]
+
+    return found
 
 
 @pytest.fixture(scope="session")

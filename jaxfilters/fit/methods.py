@@ -15,6 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxfilters._full_precision import PRECISION
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.search import StepResult
 from jaxfilters.optimize.least_squares import BoxLevenbergMarquardt
@@ -164,7 +165,9 @@ class Lbfgsb:
 
     def step(self, objective: Any, step: Array, z: Array, state: Any, bounds: tuple[Array, Array]) -> StepResult:
         """One iteration, including its line search."""
-        moved, state = self._solver(lambda z: objective(step, z)).update(z, state, bounds)
+        # The solver's own products have the precision of where they are traced.
+        with jax.default_matmul_precision(PRECISION):
+            moved, state = self._solver(lambda z: objective(step, z)).update(z, state, bounds)
         return StepResult(moved, state, state.value, state.grad, z, state.error <= self.tolerance)
 
     def _solver(self, fun: Callable) -> Any:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32
 
+from jaxfilters._full_precision import qr
 from jaxfilters.math.linalg import safe_norm
 
 
@@ -135,7 +136,7 @@ def principal_components(pca: IncrementalPCA) -> PrincipalComponents:
     vectors, variances = pca.vectors[order], variances[order]
     is_initialised = variances > 0
     directions = vectors / jnp.where(is_initialised, variances, 1.0)[:, None]
-    Q, R = jnp.linalg.qr(directions.T)
+    Q, R = qr(directions.T)
     own = jnp.diagonal(R)
     basis = Q * jnp.where(own < 0, -1.0, 1.0)
     is_component = is_initialised & (jnp.abs(own) > 1e-3)

@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._full_precision import qr
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face import pose as head
@@ -125,7 +126,7 @@ def triangulate(rig: CameraRig, uv: Float[Array, "C K 2"]) -> Float[Array, "K 3"
     A = rig.focal[:, None, :, None] * rig.rotation[:, None, :2] - offset * rig.rotation[:, None, 2:]
     b = offset[..., 0] * rig.translation[:, None, 2:] - rig.focal[:, None] * rig.translation[:, None, :2]
     A, b = (jnp.moveaxis(a, 0, 1).reshape(uv.shape[1], -1, *a.shape[3:]) for a in (A, b))
-    Q, R = jnp.linalg.qr(A)
+    Q, R = qr(A)
     projected = jnp.sum(Q * b[..., None], axis=-2)
     return jax.scipy.linalg.solve_triangular(R, projected[..., None])[..., 0]
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._full_precision import qr
 from jaxfilters.math import linalg
 
 
@@ -58,7 +59,7 @@ def remove_motion(residual: Float[Array, "K 3"], mean: Float[Array, "K 3"]) -> F
 
     def left(weights: Array) -> Array:
         root = linalg.safe_sqrt(weights)
-        Q, R = jnp.linalg.qr(root[:, None] * T)
+        Q, R = qr(root[:, None] * T)
         return r - _product(T, jax.scipy.linalg.solve_triangular(R, _product(Q.T, root * r)))
 
     def reweighted(_: Array | int, rest: Array) -> Array:
@@ -94,7 +95,7 @@ def remove_rigid(
     """
     T = _motions(mean)
     root = linalg.safe_sqrt(jnp.repeat(weights, 3))
-    Q, R = jnp.linalg.qr(root[:, None] * T)
+    Q, R = qr(root[:, None] * T)
     motion = jax.scipy.linalg.solve_triangular(R, _product(Q.T, root * residual.ravel()))
     return residual - _product(T, motion).reshape(residual.shape)
 

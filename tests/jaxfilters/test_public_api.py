@@ -3,6 +3,7 @@
 In float64: derivatives are compared with finite differences.
 """
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -128,7 +129,7 @@ EXACT = {
 """Filters that are exact for a linear Gaussian model."""
 
 SAMPLED = {
-    "ensemble_kalman": lambda noise, _: jf.ensemble_kalman(
+    "ensemble_kalman": lambda noise, share: jf.ensemble_kalman(
         sample_prior, sample_transition, observe, covariance(noise), num_particles=COUNT, noise=jf.StandardNormal(2)
     ),
     "bootstrap": lambda noise, share: jf.bootstrap(
@@ -194,6 +195,19 @@ def test_filters_that_are_exact_have_the_evidence_and_the_gradient_of_the_textbo
     np.testing.assert_allclose(value, EXPECTED, atol=2e-4)
     np.testing.assert_allclose(slope, SLOPE, atol=2e-2)
     np.testing.assert_allclose(slope, difference(function), rtol=1e-6)
+
+
+PROGRAMS = EXACT | {name: partial(build, share=0.5) for name, build in SAMPLED.items()}
+TRACED = {"extended_kalman", "unscented_kalman", "rao_blackwell", "guided_rao_blackwell", "auxiliary"}
+"""Those of which the programs are made quickly, and others of which they have parts."""
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in TRACED else pytest.param(name, marks=pytest.mark.system) for name in PROGRAMS]
+)
+def test_products_have_full_precision_and_so_have_their_derivatives(x64, products_at_default_precision, name):
+    """Of the filters: how precise the products of a model are is for the model to say, here for this file."""
+    assert not products_at_default_precision(value_and_slope(PROGRAMS[name], KEY), NOISE)
 
 
 QUICK = {"ensemble_kalman", "bootstrap", "rao_blackwell"}

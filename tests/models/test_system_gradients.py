@@ -28,13 +28,14 @@ PERSON_P = jnp.array([[70.0, -40.0, 0.0, 200.0], [0.0, -20.0, -75.0, 220.0], [0.
 
 def articulated(theta):
     """Length and noise of the hand seen by one camera; cuts, quaternion and views included."""
-    sequence = synthetic.simulate_paper(KEY, 1)
+    with jax.ensure_compile_time_eval():  # checked on the host, though the caller traces this
+        sequence, hand = synthetic.simulate_paper(KEY, 1), synthetic.paper_hand()
+        limits = filters.inequalities(limit_rows(synthetic.LAYOUT, table_1()))
     rows = slice(0, 4)
     std = theta["noise"] * jnp.broadcast_to(sequence.noise_std, sequence.features.shape)
     looks = filters.FeatureObservation(sequence.features[rows], sequence.masks[rows], std[rows])
     prior = Gaussian(sequence.initial_mean, theta["spread"] * sequence.initial_covariance)
-    limits = filters.inequalities(limit_rows(synthetic.LAYOUT, table_1()))
-    filter = filters.recommended(synthetic.paper_hand(), prior, limits)
+    filter = filters.recommended(hand, prior, limits)
     return jaxfilters.log_evidence(filter, KEY, looks, jnp.ones(4).at[0].set(0.0))
 
 
@@ -125,3 +126,9 @@ def test_derivatives_are_finite_and_something(evidence, theta):
     value, slope = (value_and_slope if evidence is articulated else jax.jit(value_and_slope))(theta)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf) and leaf != 0 for leaf in jax.tree.leaves(slope)), slope
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("evidence", "theta"), SYSTEMS, ids=[system.__name__ for system, _ in SYSTEMS])
+def test_products_have_full_precision(products_at_default_precision, evidence, theta):
+    assert not products_at_default_precision(jax.value_and_grad(evidence), jax.tree.map(jnp.float32, theta))

@@ -79,6 +79,19 @@ def test_filter_and_smoother_agree_with_textbook(n, m, name, wide):
         np.testing.assert_array_equal(infos.num_invalid, np.sum(~observed, axis=1))
 
 
+@pytest.mark.parametrize(("n", "m"), [(3, 2), (12, 10)])
+@pytest.mark.parametrize("name", ["joseph", "square_root", "fast"])
+def test_products_have_full_precision(products_at_default_precision, n, m, name):
+    """Of small matrices, written out, and of those that the device multiplies."""
+    filter, ys = build(n, m, getattr(jf.arithmetic, name)), jnp.asarray(problem(n, m)[-1], float)
+
+    def smoothed(ys):
+        beliefs, infos = jf.smoothing.filter_and_smooth(filter, KEY, ys)
+        return beliefs.mean.sum() + infos.log_evidence.sum()
+
+    assert not products_at_default_precision(jax.value_and_grad(smoothed), ys)
+
+
 @pytest.mark.parametrize(("n", "m"), SIZES)
 def test_masked_and_missing_components_are_the_same(n, m):
     ys = jnp.asarray(problem(n, m)[-1], float)

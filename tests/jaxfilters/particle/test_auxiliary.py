@@ -250,6 +250,14 @@ def test_iterated_twisting_of_a_linear_model_leaves_little_variance(x64):
 
 
 @pytest.mark.system
+def test_products_of_twisted_filters_have_full_precision(products_at_default_precision):
+    prior, Q, ys = jf.Gaussian(jnp.zeros(2), jnp.eye(2)), jnp.eye(2), jnp.zeros((3, 2))
+    reading = lambda x, y: -jnp.sum((y - x) ** 2)
+    find = lambda key: jf.iterated_auxiliary(key, prior, lambda x: x, Q, reading, ys, num_particles=20, iterations=1)
+    assert not products_at_default_precision(find, KEY)
+
+
+@pytest.mark.system
 def test_iterated_twisting_is_unbiased_and_better_than_bootstrap(exact):
     ys = jnp.asarray(YS, jnp.float32)
     inputs = jnp.asarray(~MISSING, jnp.float32)

@@ -232,3 +232,13 @@ def test_landmarks_that_moved_far_are_found_again(face):
     assert found.score[:, 4].min() > 0.98
     kept = relocated(face.patches, face.slopes, jnp.full_like(images, 120.0), *arguments[3:])
     np.testing.assert_array_equal(kept.uv, lost.uv)
+
+
+@pytest.mark.system
+def test_products_have_full_precision(face, products_at_default_precision):
+    pose, images = jnp.asarray(face.scene.registered), jnp.zeros((2, *face.rig.shape))
+    uv = jnp.asarray(face.scene.uv(face.scene.registered))
+    normals = jnp.asarray(face.scene.normals)
+    assert not products_at_default_precision(patches, images, face.shape, pose, face.rig, normals)
+    look = lambda images, uv: module.align(face.patches, face.slopes, images, uv, face.shape, pose, face.rig)
+    assert not products_at_default_precision(look, images, uv)

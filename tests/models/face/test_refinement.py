@@ -374,3 +374,15 @@ def test_a_variance_is_updated_by_what_a_frame_can_tell_of_it():
     new = module.running_variance(jnp.full(4, 0.5), excess, alignment, 0.1, (1e-4, 100.0))
     # The second loses a tenth of 9.5 by the square of .5 / 9.5; the last gains a tenth of 1.5 by that of 2 / 4.
     np.testing.assert_allclose(new, [0.65, 0.5 - 0.95 * (0.5 / 9.5) ** 2, 0.5, 0.5 + 0.15 / 4], rtol=1e-6)
+
+
+def test_products_have_full_precision(face, products_at_default_precision):
+    def fit(prior, found):
+        is_own = jnp.ones((2, 10), bool)
+        refined = module.refine(
+            prior, found, face.slopes, face.model, face.model_variance, face.rig, prior.mean, is_own
+        )
+        wide = jnp.tile(jnp.eye(3), (10, 1, 1))
+        return refined, module.displaced(prior.mean, found, face.slopes, face.model, wide, face.rig)
+
+    assert not products_at_default_precision(fit, face.prior, face.found(face.project(face.prior.mean)))

@@ -152,3 +152,11 @@ def test_fingers_matched_to_their_neighbours_have_a_variant_near_the_truth(count
     before = np.asarray(forward_kinematics(wrong, GEOMETRY).joints)[[8, 12, 16, 20]]
     assert np.linalg.norm(before - right, axis=-1).max() > 0.03
     assert np.linalg.norm(tips - right, axis=-1).max(axis=1).min() < 0.02
+
+
+@pytest.mark.system
+def test_products_have_full_precision(products_at_default_precision):
+    def registered(observed, start):
+        return register(CAMERA, target_from_image(CAMERA, observed), GEOMETRY, start, WIDE, CONFIG)
+
+    assert not products_at_default_precision(registered, jnp.ones((32, 32)), POSE)
