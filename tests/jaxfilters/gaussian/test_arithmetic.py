@@ -38,7 +38,9 @@ def noise_in(name, root):
 
 
 def covariance_of(belief):
-    return belief.covariance if isinstance(belief, Gaussian) else belief.root @ belief.root.T
+    if isinstance(belief, Gaussian):
+        return belief.covariance
+    return jnp.matmul(belief.root, jnp.swapaxes(belief.root, -1, -2), precision="highest")
 
 
 def textbook_update(mean, P, y, H, R):

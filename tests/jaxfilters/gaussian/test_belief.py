@@ -15,7 +15,9 @@ FORMS = {
 
 
 def covariance_of(belief):
-    return belief.covariance if isinstance(belief, Gaussian) else belief.root @ belief.root.T
+    if isinstance(belief, Gaussian):
+        return belief.covariance
+    return jnp.matmul(belief.root, jnp.swapaxes(belief.root, -1, -2), precision="highest")
 
 
 @pytest.fixture(params=FORMS, ids=str)

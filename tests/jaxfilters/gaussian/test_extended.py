@@ -55,7 +55,9 @@ def linear_filter(arithmetic=arithmetics.joseph, F=F, **options):
 
 
 def covariance_of(belief):
-    return belief.covariance if isinstance(belief, Gaussian) else belief.root @ np.swapaxes(belief.root, -1, -2)
+    if isinstance(belief, Gaussian):
+        return belief.covariance
+    return jnp.matmul(belief.root, jnp.swapaxes(belief.root, -1, -2), precision="highest")
 
 
 def textbook(observed, root_noise=False):

@@ -33,7 +33,9 @@ def rng():
 
 
 def covariance_of(belief):
-    return np.asarray(belief.covariance if isinstance(belief, Gaussian) else belief.root @ belief.root.T)
+    if isinstance(belief, Gaussian):
+        return np.asarray(belief.covariance)
+    return np.asarray(jnp.matmul(belief.root, jnp.swapaxes(belief.root, -1, -2), precision="highest"))
 
 
 def rows(normals, lower, upper):
