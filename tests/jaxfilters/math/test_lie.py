@@ -92,7 +92,7 @@ def test_normalising_survives_tiny_quaternions_and_reports_zero_as_nan():
     assert np.isnan(lie.quaternion_normalize(jnp.zeros(4))).all()
     q = jnp.array([1.0, -2.0, 0.5, 3.0])
     # The direction does not change along q itself.
-    np.testing.assert_allclose(jax.jacfwd(lie.quaternion_normalize)(q) @ q, 0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(jax.jacfwd(lie.quaternion_normalize)(q)) @ np.asarray(q), 0, atol=1e-6)
 
 
 def test_mean_ignores_signs_and_returns_what_all_agree_on(x64, rng):

@@ -137,7 +137,7 @@ def test_coordinates_are_independent_and_laid_out_in_blocks(dt):
     np.testing.assert_allclose(three.Q, np.kron(one.Q, np.diag([2.0, 3.0, 5.0])), rtol=1e-6)
     x = jnp.arange(9.0)
     np.testing.assert_array_equal(model.position @ x, x[:3])
-    np.testing.assert_allclose(model.transition(x, 0.5), model.discretize(0.5).F @ x, rtol=1e-5)
+    np.testing.assert_allclose(model.transition(x, 0.5), np.asarray(model.discretize(0.5).F) @ np.asarray(x), rtol=1e-5)
 
 
 def test_an_unknown_turn_is_the_known_one_where_the_rate_is_given(x64):

@@ -11,7 +11,10 @@ from jaxfilters.gaussian.constraints import constraint_distances, cut, linear_co
 from jaxfilters.gaussian.constraints.directions import compiled
 
 halfspace, interval = compiled(cut.halfspace), compiled(cut.interval)
-FORMS = {"covariance": lambda mean, root: Gaussian(mean, root @ root.T), "root": GaussianRoot}
+FORMS = {
+    "covariance": lambda mean, root: Gaussian(mean, jnp.matmul(root, root.T, precision="highest")),
+    "root": GaussianRoot,
+}
 
 
 @pytest.fixture(params=FORMS, ids=str)
