@@ -24,7 +24,6 @@ from jaxfilters import weights
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla import last_axis
-from jaxfilters._xla.last_axis import batch_last
 from jaxfilters._xla.materialize import materialized
 from jaxfilters._xla.noise import split
 from jaxfilters.filter import Filter
@@ -392,7 +391,7 @@ def _by_linear_observation(
     linear = observe(x, inputs)
     checks.check_linear_observation(linear, y, belief.mean.shape[0])
     h, C, R = linear
-    condition = batch_last(_condition) if max(C.shape) <= factor.UNROLLED else _condition
+    condition = last_axis.batch_last(_condition) if max(C.shape) <= factor.UNROLLED else _condition
     return condition(belief, y - h, C, R)
 
 
