@@ -12,7 +12,6 @@ import numpy as np
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import upright_depth
-from jaxfilters.trackers.background.choice import Background
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people.state import PeopleConfig, PeopleScene
 from jaxfilters.trackers.people.tracker import people_scene
@@ -93,8 +92,3 @@ def images(pets: Pets) -> Iterator[np.ndarray]:
             yield pets.undistortion.apply(image)
     finally:
         video.release()
-
-
-def probability(subtraction: Background, image: np.ndarray) -> np.ndarray:
-    """(rows, cols) uint8: probability of foreground times 255."""
-    return cv2.convertScaleAbs(subtraction.apply(image), alpha=255.0)

@@ -12,7 +12,6 @@ import csv
 import itertools
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,10 +22,9 @@ from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, evaluate, floor_tracks
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
-from jaxfilters.benchmarks.scenarios._pets import Pets, images, load_pets, probability
-from jaxfilters.trackers.background.choice import background
+from jaxfilters.benchmarks.scenarios._pets import SHAPE, Pets, images, load_pets
 from jaxfilters.trackers.people.recorded import Sighting, smoothed
-from jaxfilters.trackers.people.session import PeopleTracks
+from jaxfilters.trackers.people.session import PeopleSession
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import start, step
 
@@ -49,7 +47,7 @@ class Followed(NamedTuple):
     tracking_s: np.ndarray
     """(frames,) seconds from the foreground to the report."""
     background_s: np.ndarray
-    """(frames,) seconds from the straightened image to the foreground."""
+    """(frames,) seconds from the straightened image to the foreground, and for outlines and records."""
     input_s: np.ndarray
     """(frames,) seconds for decoding and straightening."""
 
@@ -80,35 +78,29 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
 
 
 def follow_video(pets: Pets, frames: int | None) -> Followed:
-    """The whole pipeline over the first frames of the video; over all without a number."""
-    subtraction = background("median")
-    subtraction.prime(image for i, image in enumerate(images(pets)) if i % PRIME_EVERY == 0)
-    people, clocks = PeopleTracks(pets.scene), []
+    """As `jaxfilters track people` follows the first frames of the video; all of them without a number."""
+    session = PeopleSession(pets.scene)
+    session.prime([[image for i, image in enumerate(images(pets)) if i % PRIME_EVERY == 0]])
     confirmed: list[tuple[int, int, float, float]] = []
-    tracking = []
-
-    def moments() -> Iterator[tuple[float, tuple[CameraFrame, ...]]]:
-        before = time.perf_counter()
-        for i, image in enumerate(itertools.islice(images(pets), frames)):
-            clock = [before, time.perf_counter()]
-            foreground = probability(subtraction, image)
-            clocks.append(np.diff([*clock, time.perf_counter()]))
-            yield i / FRAMES_PER_SECOND, (CameraFrame(foreground, image, np.bool_(True)),)
-            before = time.perf_counter()
-
-    jax.block_until_ready(step(pets.scene, start(pets.scene), (_nothing(pets),), np.float32(0)))
-    for time_s, observed in moments():
-        now = people.step(observed, time_s)
+    clocks = []
+    blank = CameraFrame(np.zeros(SHAPE, np.uint8), np.zeros((*SHAPE, 3), np.uint8), np.bool_(False))
+    jax.block_until_ready(step(pets.scene, start(pets.scene), (blank,), np.float32(0)))
+    before = time.perf_counter()
+    for i, image in enumerate(itertools.islice(images(pets), frames)):
+        read = time.perf_counter()
+        now = session.process([image], i / FRAMES_PER_SECOND)
         confirmed += [
             (now.frame, identity, float(sighting.mean[0]), float(sighting.mean[1]))
             for identity, sighting in now.added
             if sighting.frame == now.frame
         ]
-        tracking.append(now.seconds)
-        if now.frame % 100 == 99:
-            sys.stderr.write(f"  {now.frame + 1} frames\n")
-    inputs, subtracting = np.transpose(clocks)
-    return Followed(confirmed, people.recorder.tracks, np.array(tracking), subtracting, inputs)
+        done = time.perf_counter()
+        clocks.append((read - before, done - read - now.seconds, now.seconds))
+        if i % 100 == 99:
+            sys.stderr.write(f"  {i + 1} frames\n")
+        before = time.perf_counter()
+    inputs, subtracting, tracking = np.transpose(clocks)
+    return Followed(confirmed, session.tracks.recorder.tracks, tracking, subtracting, inputs)
 
 
 def read_truth(path: Path, pets: Pets) -> FloorTracks:
@@ -175,8 +167,3 @@ def _speed(followed: Followed) -> dict[str, Metric]:
     metrics = {f"frames_per_second_{name}": 1 / float(np.median(times)) for name, times in rates.items()}
     metrics["frames_per_second"] = metrics["frames_per_second_with_background"]
     return {name: Metric(value, "frames/s", "higher") for name, value in metrics.items()}
-
-
-def _nothing(pets: Pets) -> CameraFrame:
-    shape = pets.camera.shape
-    return CameraFrame(np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.uint8), np.bool_(False))

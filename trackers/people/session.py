@@ -29,6 +29,10 @@ REPORTED_PX = 2.0
 """Motion of a corner of the image from which on a camera is reported to have turned."""
 KEPT_BEYOND = 1.4
 """The background does not follow the image within a person's outline of this size."""
+STANDS_M_PER_S = 0.3
+"""Only where people are slower than this: others have left a place before it could become background, and the
+background around them stays true. On frames 0-199 of PETS it gives .204 m in place of .209, on 200-399 .216 in place of
+.344, where two people who walk together stood .7 m beside their places."""
 
 
 class PeopleEstimate(NamedTuple):
@@ -275,13 +279,14 @@ class PeopleSession:
             self._registrations[camera].refer_to(empty)
 
     def _occupied(self, camera: int) -> np.ndarray | None:
-        """Non-zero where people stood after the last images, where the background must not follow."""
+        """Non-zero where people stand still after the last images, where the background must not follow."""
         if self._outlines is None:
             return None
         people, shape = jax.device_get(self.tracks.people), self._images[camera].shape[:2]
         outline, mask = self._outlines[camera], np.zeros(shape, np.uint8)
-        inside = ((people.mode == TRACKED) | (people.mode == TENTATIVE)) & (outline.code == VISIBLE)
-        for slot in np.flatnonzero(inside):
+        is_there = (people.mode == TRACKED) | (people.mode == TENTATIVE)
+        stands = np.linalg.norm(people.belief.mean[:, 2:4], axis=1) < STANDS_M_PER_S
+        for slot in np.flatnonzero(is_there & stands & (outline.code == VISIBLE)):
             reach = KEPT_BEYOND * np.sqrt(np.diagonal(outline.shape[slot]))
             low, high = outline.center[slot] - reach, outline.center[slot] + reach
             u = np.clip(np.round([low[0], high[0]]), 0, shape[1]).astype(int)

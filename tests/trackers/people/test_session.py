@@ -1,10 +1,13 @@
 """What the tracker is given frame by frame, what is kept of it, and that it can be continued."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.background.median import MedianBackground
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import session
 from jaxfilters.trackers.people.demo_room import demo_room
@@ -12,7 +15,6 @@ from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.recorded import as_arrays, from_arrays
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, PeopleConfig, Report
 from jaxfilters.trackers.people.tracker import people_scene
-
 
 NO_BOXES = DetectedForeground({}, Undistortion((120, 160)))
 
@@ -114,6 +116,29 @@ def test_foreground_without_a_box_and_a_box_without_foreground_count_less(scene,
         [bayes(0.99, 0.1), bayes(0.99, 0.99), bayes(0.01, 0.99), bayes(0.01, 0.1)],
         atol=0.003,
     )
+
+
+@pytest.mark.parametrize(("speed_m_per_s", "is_kept"), [(0.0, True), (0.2, True), (0.4, False), (1.2, False)])
+def test_the_background_is_kept_beneath_people_who_stand_and_follows_beneath_walkers(
+    scene, given, monkeypatch, speed_m_per_s, is_kept
+):
+    step, kept = session.step, []
+
+    def walking(*arguments):
+        people, report = step(*arguments)
+        velocity = speed_m_per_s * np.array([0.6, -0.8])
+        mean = people.belief.mean.at[0].set(jnp.array([0.0, 0.0, *velocity, 1.75, 0.5, 0.0, 0.0, 0.0]))
+        return people._replace(belief=dataclasses.replace(people.belief, mean=mean)), report
+
+    monkeypatch.setattr(session, "step", walking)
+    monkeypatch.setattr(
+        MedianBackground, "apply", lambda self, image, keep: (kept.append(keep), image[..., 0] / 255)[1]
+    )
+    one = session.PeopleSession(scene)
+    for i in range(4):
+        one.process([np.zeros((120, 160, 3), np.uint8)], 0.1 * i)
+    u, v = np.asarray(scene.cameras[0].project(jnp.array([0.0, 0.0, 0.9]))[0]).round().astype(int)
+    assert [bool(keep[v, u]) for keep in kept[1:]] == [is_kept] * 3
 
 
 @pytest.mark.parametrize(("argument", "given"), [("subtraction", []), ("detected", [NO_BOXES] * 2)])
