@@ -50,7 +50,8 @@ def on_device(events: list[dict], calls: int) -> list[Kernel]:
         for (pid, tid, kind), name in names.items()
         if kind == "thread_name" and pid in devices and name.startswith("Stream")
     }
-    launches, microseconds = Counter(), Counter()
+    launches: Counter[str] = Counter()
+    microseconds: Counter[str] = Counter()
     for event in events:
         if event.get("ph") == "X" and (event["pid"], event["tid"]) in streams:
             launches[event["name"]] += 1
