@@ -152,7 +152,7 @@ def _setup(options: argparse.Namespace) -> Setup:
     scene = as_input_error(lambda: people_scene(cameras, described.floor, furniture=furniture, config=config))
     undistortions = [file.undistortion for file in files]
     detected = [
-        DetectedForeground(read_detections(path), undistortion)
+        DetectedForeground(read_detections(path), undistortion, spread_px=config.spread_px)
         for path, undistortion in zip(options.detections, undistortions, strict=False)
     ]
     return Setup(scene, undistortions, sources, None, detected)

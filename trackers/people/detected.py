@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxfilters.models.person.foreground import PARTS
 from jaxfilters.trackers.io.undistortion import Undistortion
+from jaxfilters.trackers.people.config import PeopleConfig
 
 _BOX_WIDTH = 0.5 / max(part.radius for part in PARTS)
 """Width of a body in box widths, in units of the width that `PARTS` are given in."""
@@ -44,14 +45,22 @@ class DetectedForeground:
     floor, and its identities are those of silhouettes.
     """
 
-    def __init__(self, boxes: Mapping[int, np.ndarray], undistortion: Undistortion):
+    def __init__(
+        self,
+        boxes: Mapping[int, np.ndarray],
+        undistortion: Undistortion,
+        *,
+        spread_px: float = PeopleConfig.spread_px,
+    ):
         """Boxes of a recording whose images come in their order.
 
         Args:
             boxes: By frame from 0, (n, 5) left, top, right, bottom in pixels of the video, and score from 0 to 1.
             undistortion: What straightens the images of the camera.
+            spread_px: How far the tracker takes silhouettes to reach beyond the edges of a body, as in its
+                configuration; boxes end at the edges.
         """
-        self._boxes, self._undistortion = boxes, undistortion
+        self._boxes, self._undistortion, self._spread_px = boxes, undistortion, spread_px
         self._frame = 0
 
     def prime(self, images: Iterable[np.ndarray]) -> None:
@@ -63,7 +72,7 @@ class DetectedForeground:
         self._frame += 1
         absent = np.ones(image.shape[:2], np.float32)
         for *box, score in self._straight(boxes) if boxes is not None else ():
-            _cover(absent, np.array(box), score)
+            _cover(absent, np.array(box) + self._spread_px * np.array([-1, -1, 1, 1]), score)
         return 1 - absent
 
     def state(self) -> dict[str, np.ndarray]:

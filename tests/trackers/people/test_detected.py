@@ -18,15 +18,17 @@ def box_of(probability):
 def test_a_silhouette_fills_its_box_and_frames_follow_one_another():
     """To a pixel but for the soles and the crown, which bodies of the model lack 0.03 and 0.012 of their height of."""
     box = np.array([50, 20, 78, 100, 1.0])
-    found = DetectedForeground({1: box[None]}, PLAIN)
+    found = DetectedForeground({1: box[None]}, PLAIN, spread_px=0.0)
     assert not found.apply(IMAGE).any()
     saved = found.state()
     shown = found.apply(IMAGE)
     np.testing.assert_allclose(box_of(shown), [50, 21, 78, 97.6], atol=1.1)
     assert not found.apply(IMAGE).any()
-    again = DetectedForeground({1: box[None]}, PLAIN)
+    again = DetectedForeground({1: box[None]}, PLAIN, spread_px=0.0)
     again.restore(saved)
     np.testing.assert_array_equal(again.apply(IMAGE), shown)
+    wider = DetectedForeground({0: box[None]}, PLAIN, spread_px=4.0)
+    np.testing.assert_allclose(box_of(wider.apply(IMAGE)) - box_of(shown), [-4, -4, 4, 4], atol=1)
 
 
 def test_scores_are_probabilities_and_boxes_add_up_also_at_the_border():
@@ -46,7 +48,9 @@ def test_boxes_are_straightened_like_the_images():
     drawn = np.zeros(SHAPE, np.uint8)
     drawn[top : bottom + 1, (left + right) // 2] = 255
     straight = np.nonzero(lens.apply(drawn).max(axis=1) > 120)[0]
-    shown = DetectedForeground({0: np.array([(left, top, right, bottom, 1.0)], float)}, lens).apply(IMAGE)
+    shown = DetectedForeground({0: np.array([(left, top, right, bottom, 1.0)], float)}, lens, spread_px=0.0).apply(
+        IMAGE
+    )
     _, v0, _, v1 = box_of(shown)
     height = straight.max() - straight.min()
     np.testing.assert_allclose(v0, straight.min() + 0.012 * height, atol=1.6)
