@@ -20,7 +20,7 @@ tensordot = partial(jnp.tensordot, precision=PRECISION)
 
 @jax.custom_jvp
 def qr(A: Float[Array, "*batch n m"]) -> tuple[Float[Array, "*batch n k"], Float[Array, "*batch k m"]]:
-    """`jnp.linalg.qr`, whose derivatives are products that ask for no precision."""
+    """As `jnp.linalg.qr`, with derivatives in full precision: JAX computes them from products that ask for none."""
     Q, R = jnp.linalg.qr(A)
     return Q, R
 

@@ -40,7 +40,7 @@ class PeopleConfig:
     spread_px: float = 0.75
     """How far silhouettes reach beyond their edges: where the contrast is 100, an edge that lens, video coder and
     resampling blur by 1.4 pixels crosses a threshold of 30 grey levels that much too far out. Chosen among 0.5, 0.75
-    and 1 on the first halves of PETS and of CAVIAR's corridor."""
+    and 1 on frames 0-199 of PETS; on CAVIAR's corridor the difference is within the noise."""
     calibration_error: float = 0.0
     """Standard deviation of the shift of silhouettes by the calibration of each camera but the first, which defines the
     floor, as a share of the columns of its image; 0 for cameras that agree, .005 where they differ by decimetres."""

@@ -45,6 +45,9 @@ def test_the_turn_of_a_camera_is_found_and_undone(angles_px):
     assert same is still
     assert nothing is None
     image, blank = registration.straightened(rendered(rotation))
+    # Another picture of that moment, as the boxes of a detector are drawn, turns with it.
+    np.testing.assert_array_equal(registration.as_last(rendered(rotation)), image)
+    assert np.abs(registration.as_last(still).astype(int) - still).mean() > 1
     # Forty corners, of which the far ones leave the image, and a light that is that of other parts of the scene.
     assert off_px(registration, rotation) < 0.4
     differences = np.abs(image.astype(int) - still)[blank == 0]
