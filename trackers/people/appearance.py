@@ -36,7 +36,10 @@ LONGEST_S = 4.0
 
 
 def appearances(
-    scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
+    scene: PeopleScene,
+    places: Float[Array, "slots shape"],
+    active: Bool[Array, " slots"],
+    frames: tuple[CameraFrame, ...],
 ) -> tuple[Float[Array, "slots 48"], Bool[Array, " slots"]]:
     """Histograms of everybody, and whose are worth something; of the first camera that sees enough of a person."""
     histograms, good = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)

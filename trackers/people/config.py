@@ -18,7 +18,7 @@ class PeopleConfig:
     """Largest number of people at a time, the lost ones who may come back included."""
     height_m: float = 1.72
     """Mean height of people, metres."""
-    height_sd_m: float = 0.08
+    height_sd_m: float = 0.1
     """Standard deviation of the heights of people, metres."""
     width_m: float = 0.45
     """Of the ellipsoid of an unknown person, clothes, arms and stride included."""

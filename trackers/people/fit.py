@@ -22,7 +22,8 @@ from jaxfilters.trackers.people.silhouettes import (
     unexplained_of,
     views_of,
 )
-from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, CameraFrame, PeopleScene
+from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, STRIDE, CameraFrame, PeopleScene
+from jaxfilters.trackers.people.stride import longest_stride, with_best_stride, with_stride
 
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction a person is searched for, along each axis."""
@@ -58,6 +59,8 @@ class Fit(NamedTuple):
 
     place: Float[Array, "slots 4"]
     """X, Y, height, width: metres; where the likelihood of the images times the prediction is largest."""
+    stride: Float[Array, "slots 2"]
+    """From the middle of the body to the front foot along X and Y, metres; 0 where legs are together."""
     axes: Float[Array, "slots 4 4"]
     """Rows: unit vectors away from the camera, sideways, along the height and the width."""
     steps: Float[Array, "slots 4"]
@@ -101,6 +104,7 @@ def fit_people(
         frames: One a camera.
     """
     start = jax.vmap(observed_place, in_axes=(None, 0))(scene, predicted.mean)
+    longest = longest_stride(predicted.mean)
     covariance = _observed_covariance(scene, predicted)
     prior = jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)
@@ -121,9 +125,10 @@ def fit_people(
             mine = shifted(unshifted, shifts[k])
 
         def best(place, offsets):
-            candidates = place + dot(offsets, axes[k])
+            place = with_best_stride(scene, place, longest[k], mine, contrasts)
+            candidates = place + with_stride(dot(offsets, axes[k]))
             scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
-            away = candidates - start[k]
+            away = candidates[:, : STRIDE.start] - start[k]
             total = scores - einsum("ci,ij,cj->c", away, prior[k], away) / 2
             # Where candidates are equal, the one that moves least: the middle of the lattice comes first.
             nearest_first = jnp.argsort(jnp.sum(offsets**2, axis=-1))
@@ -135,7 +140,7 @@ def fit_people(
         return places.at[k].set(place), shifts
 
     lattices, num_active = _lattices(), jnp.sum(active)
-    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, (start, shifts))
+    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, (with_stride(start), shifts))
     if has_shifts(scene):
         views = jax.vmap(shifted)(views, shifts)
     return _curvature(scene, places, shifts, active, seniority, views, axes, _steps(scene, start))
@@ -166,11 +171,12 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        candidates = places[k] + dot(jnp.concatenate([around * steps[k], -away, away]), axes[k])
+        candidates = places[k] + with_stride(dot(jnp.concatenate([around * steps[k], -away, away]), axes[k]))
         values = by_reading(scene, candidates, mine, contrasts)
         scores = jnp.sum(values, axis=0) / scene.config.independent_patches
         fit = Fit(
-            places[k],
+            places[k, : STRIDE.start],
+            places[k, STRIDE],
             axes[k],
             steps[k],
             jax.tree.map(
@@ -186,7 +192,8 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
 
     n, cameras = len(places), len(scene.cameras)
     empty = Fit(
-        places,
+        places[:, : STRIDE.start],
+        places[:, STRIDE],
         axes,
         steps,
         Quadratic(jnp.zeros((n, readings)), jnp.zeros((n, readings, 4)), jnp.zeros((n, readings, 4, 4))),
@@ -210,9 +217,9 @@ def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
         theirs = jax.tree.map(lambda leaf: leaf[senior], views)
         others = active.at[k].set(False).at[senior].set(False)
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
-        between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])
+        between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])[: STRIDE.start]
         offsets = dot(dot(foreground.lattice(2), jnp.eye(2, 4)) * steps[senior], axes[senior])
-        candidates = places[senior] + (between[:, None] + offsets).reshape(-1, 4)
+        candidates = places[senior] + with_stride((between[:, None] + offsets).reshape(-1, 4))
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
         return score - (jnp.max(values) - with_k) / scene.config.independent_patches

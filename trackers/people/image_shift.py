@@ -57,7 +57,7 @@ def weighted(scene: PeopleScene, place: Float[Array, " 4"], views: View) -> View
 
 def best_shift(
     scene: PeopleScene,
-    place: Float[Array, " 4"],
+    place: Float[Array, " shape"],
     views: View,
     contrasts: Float[Array, "cameras samples"],
     shift: Float[Array, "cameras 2"],

@@ -163,7 +163,10 @@ def _look(camera, furniture, config, xy):
 
 
 def birth(
-    scene: PeopleScene, places: Float[Array, "slots 4"], active: Bool[Array, " slots"], frames: tuple[CameraFrame, ...]
+    scene: PeopleScene,
+    places: Float[Array, "slots shape"],
+    active: Bool[Array, " slots"],
+    frames: tuple[CameraFrame, ...],
 ) -> Birth:
     """The floor point whose person explains most, of those with enough evidence a pixel.
 

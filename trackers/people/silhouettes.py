@@ -21,17 +21,13 @@ from jaxfilters.models.person.ellipsoid import (
 )
 from jaxfilters.models.person.foreground import Window, contrast, log_likelihood_ratio, presence
 from jaxfilters.trackers.people.silhouette_bias import displacement
-from jaxfilters.trackers.people.state import PLACE, CameraFrame, PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.state import PLACE, STRIDE, CameraFrame, PeopleConfig, PeopleScene
 
 MARGIN = 0.3
 """Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
 OVERLAP = 2.5
 """Sizes of an outline beyond which a body makes hardly any pixel foreground: one in a thousand."""
 LEAST_SIZE_M = 0.1
-SINK = 0.023
-"""Of the height, over a step: hips, at 0.53 of it, sink by 1 - cos a where legs swing to a, up to 0.42 radians."""
-STANDING_M_PER_S, WALKING_M_PER_S = 0.25, 0.75
-"""Up to the first, speed is taken for error; from the second on, strides are full ones."""
 
 
 class View(NamedTuple):
@@ -49,15 +45,8 @@ class View(NamedTuple):
 
 
 def place_of(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots 4"]:
-    """X, Y, height and width of what a state looks like: a person who walks is lower than the same one at rest."""
-    return mean[..., jnp.array(PLACE)].at[..., 2].multiply(stature(mean))
-
-
-def stature(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots"]:
-    """Height as it appears, in heights of a body of which half the frames show a stride, as those behind `presence`."""
-    speed = jnp.linalg.norm(mean[..., 2:4], axis=-1)
-    stride = (speed - STANDING_M_PER_S) / (WALKING_M_PER_S - STANDING_M_PER_S)
-    return 1 + SINK * (0.5 - jnp.clip(stride, 0.0, 1.0))
+    """X, Y, height and width of a state, metres."""
+    return mean[..., jnp.array(PLACE)]
 
 
 def observed_place(scene: PeopleScene, mean: Float[Array, " 9"]) -> Float[Array, " 4"]:
@@ -65,17 +54,18 @@ def observed_place(scene: PeopleScene, mean: Float[Array, " 9"]) -> Float[Array,
     return place_of(mean) + displacement(scene, mean)
 
 
-def body_of(place: Float[Array, "*batch 4"]) -> Ellipsoid:
-    """The ellipsoid of X, Y, height and width; of a size that an outline can be had of."""
+def body_of(place: Float[Array, "*batch shape"]) -> Ellipsoid:
+    """The ellipsoid of X, Y, height and width, whatever follows; of a size that an outline can be had of."""
     return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
 
 
 def presence_of(
-    config: PeopleConfig, P: Float[Array, "3 4"], place: Float[Array, " 4"], uv: Float[Array, "*pixels 2"]
+    config: PeopleConfig, P: Float[Array, "3 4"], place: Float[Array, " shape"], uv: Float[Array, "*pixels 2"]
 ) -> Float[Array, "*pixels"]:
-    """`presence` of X, Y, height and width in the camera of a projection matrix."""
+    """`presence` of X, Y, height, width and, if it is known, the stride, in the camera of a projection matrix."""
     height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
-    return presence(P, place[:2], height, width, uv, config.spread_px)
+    stride = place[STRIDE] if len(place) > STRIDE.start else None
+    return presence(P, place[:2], height, width, uv, config.spread_px, stride)
 
 
 def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -137,7 +127,7 @@ def area_of(contour: Outline) -> Float[Array, ""]:
 
 def overlapping(
     P: Float[Array, "3 4"],
-    places: Float[Array, "slots 4"],
+    places: Float[Array, "slots shape"],
     others: Bool[Array, " slots"],
     uv: Float[Array, "samples 2"],
 ) -> Bool[Array, " slots"]:
@@ -150,7 +140,7 @@ def overlapping(
 
 
 def unexplained_of(
-    scene: PeopleScene, places: Float[Array, "slots 4"], others: Bool[Array, " slots"], views: View
+    scene: PeopleScene, places: Float[Array, "slots shape"], others: Bool[Array, " slots"], views: View
 ) -> Float[Array, "cameras samples"]:
     """Probability that neither clutter nor any of the others makes the samples of a window foreground."""
 
@@ -175,7 +165,7 @@ def contrasts_of(views: View, unexplained: Float[Array, "cameras samples"]) -> F
 
 
 def log_likelihoods(
-    scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
+    scene: PeopleScene, place: Float[Array, " shape"], views: View, contrasts: Float[Array, "cameras samples"]
 ) -> Float[Array, " cameras"]:
     """Log likelihood of a person at a place over that of nobody, in each camera, as of independent looks."""
 
@@ -187,14 +177,14 @@ def log_likelihoods(
 
 
 def log_likelihood(
-    scene: PeopleScene, place: Float[Array, " 4"], views: View, contrasts: Float[Array, "cameras samples"]
+    scene: PeopleScene, place: Float[Array, " shape"], views: View, contrasts: Float[Array, "cameras samples"]
 ) -> Float[Array, ""]:
     """`log_likelihoods` of all cameras together."""
     return jnp.sum(log_likelihoods(scene, place, views, contrasts))
 
 
 def shares_seen(
-    scene: PeopleScene, place: Float[Array, " 4"], views: View, unexplained: Float[Array, "cameras samples"]
+    scene: PeopleScene, place: Float[Array, " shape"], views: View, unexplained: Float[Array, "cameras samples"]
 ) -> Float[Array, " cameras"]:
     """Of the silhouette, how much is in each image and hidden by nobody and nothing."""
 

@@ -26,6 +26,8 @@ HEIGHT, WIDTH = 4, 5
 BIAS = slice(6, STATE)
 PLACE = (0, 1, HEIGHT, WIDTH)
 """X, Y, height and width in a state: what one image shows."""
+STRIDE = slice(4, 6)
+"""After X, Y, height and width of a silhouette: from the middle to the front foot along X and Y, metres."""
 
 
 @pytree_dataclass

@@ -25,7 +25,7 @@ from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.image_shift import displacement_by_shift, shift_sd
 from jaxfilters.trackers.people.lifecycle import birth, cells_of, padded
 from jaxfilters.trackers.people.silhouette_bias import bias_factor
-from jaxfilters.trackers.people.silhouettes import body_of, observed_place, stature
+from jaxfilters.trackers.people.silhouettes import body_of, observed_place
 from jaxfilters.trackers.people.state import (
     BIAS,
     HEIGHT,
@@ -122,7 +122,7 @@ def step(
     people = people._replace(belief=chosen(active, belief, people.belief), shift=fit.shift)
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.existence(scene, people, fit, dt, looked)
-    places = _observed_places(scene, people)
+    places = jnp.concatenate([_observed_places(scene, people), fit.stride], axis=1)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
@@ -205,8 +205,8 @@ def updated(
 
 def _of_one(scene, camera, belief, reading, whole, frames):
     in_state = jnp.eye(STATE)[jnp.array(PLACE)]
-    H = dot(reading.H, in_state).at[:, HEIGHT].multiply(stature(belief.mean))
-    H, R = H.at[:, BIAS].set(dot(reading.H, bias_factor(scene, belief.mean))), reading.R
+    H = dot(reading.H, in_state).at[:, BIAS].set(dot(reading.H, bias_factor(scene, belief.mean)))
+    R = reading.R
     if camera:
         height = jnp.maximum(belief.mean[HEIGHT], _LEAST_HEIGHT_M)
         by_shift = displacement_by_shift(scene.cameras[camera], belief.mean[:2], height)

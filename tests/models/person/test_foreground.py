@@ -15,10 +15,12 @@ from jaxfilters.models.person.foreground import (
     contrast,
     lattice,
     log_likelihood_ratio,
+    lowered,
     presence,
     quadratic_fit,
     window,
 )
+from jaxfilters.models.synthetic.walkers import LEG_SWING, Walker, body
 
 SHAPE = (120, 160)
 
@@ -71,6 +73,31 @@ def test_presence_is_that_of_a_person_at_a_place():
     assert q[:2].min() > 0.6
     assert q[2:].max() < 0.1
     np.testing.assert_allclose(q[2], q[3], rtol=1e-3)
+
+
+def test_feet_of_a_stride_are_where_they_stand_and_not_between():
+    """Both soles, the middle between them, and the hips, which sink as legs of 0.9 m do; camera 1 looks along Y."""
+    camera, stride = camera_1(), jnp.array([0.36, 0.0])
+    points = jnp.array([[-0.69, 1.0, 0.12], [-1.31, 1, 0.12], [-1, 1, 0.12], [-1, 1, 0.85]])
+    xy, (uv, _) = jnp.array([-1.0, 1.0]), camera.project(points)
+    at = jax.jit(lambda stride: presence(camera.P, xy, 1.7, 0.45, uv, stride=stride))
+    apart, together = np.asarray(at(stride)), np.asarray(at(jnp.zeros(2)))
+    assert apart[[0, 1, 3]].min() > 0.5 > 0.2 > apart[2]
+    assert together[:2].max() < 0.1 < 0.5 < together[2]
+
+
+def test_walkers_sink_as_much_as_their_strides_say():
+    """The middle of the head at every moment of a stride, whose foot is 0.9 m below the hip of a body of 1.66 m."""
+    phases = jnp.linspace(0, 2 * jnp.pi, 16)
+
+    def head(phase):
+        still = jnp.zeros(())
+        return body(Walker(jnp.zeros(2), still, phase, jnp.ones(()), jnp.array(1.66), jnp.array(0.42))).center[0, 2]
+
+    strides = 0.9 * jnp.sin(LEG_SWING * jnp.sin(phases))[:, None] * jnp.array([0.6, 0.8])
+    sunk = 1.54 - np.asarray(jax.jit(jax.vmap(head))(phases))
+    found = jax.jit(jax.vmap(lambda stride: lowered(jnp.array(1.66), stride)))(strides)
+    np.testing.assert_allclose(1.66 - np.asarray(found), sunk, atol=0.005)
 
 
 @pytest.mark.system

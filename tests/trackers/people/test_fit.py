@@ -37,7 +37,7 @@ def parabolas(seed, n):
     quadratic = Quadratic(none[:, None], jnp.asarray(gradient)[:, None], jnp.asarray(curvature)[:, None])
     steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
     place, axes, shift = jnp.asarray(place), jnp.asarray(axes), jnp.zeros((n, 1, 2))
-    return Fit(place, axes, steps, quadratic, none, shift, none[:, None], none, none), mean, precision
+    return Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, none[:, None], none, none), mean, precision
 
 
 @pytest.mark.usefixtures("x64")

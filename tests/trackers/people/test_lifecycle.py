@@ -39,6 +39,7 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
     axes = jnp.zeros((SLOTS, 4, 4))
     return Fit(
         jnp.zeros((SLOTS, 4)),
+        jnp.zeros((SLOTS, 2)),
         axes,
         jnp.full((SLOTS, 4), 0.1),
         blank,
