@@ -8,8 +8,6 @@ turned upside down, whose "arm" are the fingers.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
-from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -24,26 +22,19 @@ from jaxfilters.models.hand.cost import count_observed
 from jaxfilters.models.hand.motion import per_coordinate
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, Target, gauss_newton, target_from_image
 from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics
+from jaxfilters.models.hand.starting_poses import (
+    PALM_TO_WRIST,
+    Hypotheses,
+    multiplied,
+    second_axis,
+    starting_poses,
+)
 from jaxfilters.models.rendering.comparison import compare_capsules
 from jaxfilters.models.rendering.geometry import Capsules
 from jaxfilters.models.rendering.placement import share_poses
 
-PALM_TO_WRIST = 0.055
-"""Metres from the middle of the palm to the wrist of an average hand."""
 SEARCH_RADIUS = 0.16
 """Metres about the middle of the palm within which readings are explained."""
-GESTURES = np.deg2rad(
-    [
-        [0.0] * 15,
-        [0.0] * 3 + [0.0, 12.0, 0.0] + [0.0] * 3 + [0.0, -12.0, 0.0] + [0.0, -27.0, 0.0],
-        [10.0, 10.0, 0.0] + [25.0, 0.0, 35.0] * 4,
-        [30.0, 30.0, 0.0] + [75.0, 0.0, 90.0] * 4,
-    ]
-)
-"""Joint angles of an open, a spread, a relaxed and a closed hand, (4, 15)."""
-NUM_ROLLS = 12
-TILTS = np.deg2rad([-45.0, 0.0, 45.0])
-"""Of the fingers towards the camera and away from it."""
 SCALES = (0.85, 0.925, 1.0, 1.075, 1.15)
 STRAIGHT, BENT = np.deg2rad([[0.0, 0.0, 0.0], [45.0, 0.0, 70.0]])
 """Angles of a finger in two of the variants of a finalist."""
@@ -88,52 +79,6 @@ class Start(NamedTuple):
     """+1 for a right hand, -1 for a left one."""
     cost: float
     """Metres: mean error over the readings near the hand, at most `MAX_ERROR` and a little more for an unusual size."""
-
-
-class Hypotheses(NamedTuple):
-    """Poses of hands; leaves (h, ...)."""
-
-    poses: Float[np.ndarray, "h 22"]
-    scales: Float[np.ndarray, " h"]
-    sides: Float[np.ndarray, " h"]
-
-    def rows(self, index: np.ndarray | slice) -> "Hypotheses":
-        """Some of them."""
-        return Hypotheses(*(leaf[index] for leaf in self))
-
-
-def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequence[float]) -> Hypotheses:
-    """Hands about the middle of a palm: rolls about the optical axis, palm or back to the camera, tilts, gestures."""
-    rotation, wrist, angles = _grid()
-    poses = np.concatenate([center + scale * wrist, rotation, angles], axis=1).astype(np.float32)
-    count = len(poses)
-    return Hypotheses(
-        np.tile(poses, (len(sides), 1)),
-        np.full(count * len(sides), scale, np.float32),
-        np.repeat(np.asarray(sides, np.float32), count),
-    )
-
-
-@cache
-def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations (h, 4), wrists from the middle of the palm (h, 3) and angles (h, 15)."""
-
-    def about(axis: int, angle: float) -> np.ndarray:
-        turn = np.zeros(4)
-        turn[[0, 1 + axis]] = math.cos(0.5 * angle), math.sin(0.5 * angle)
-        return turn
-
-    rolls = np.arange(NUM_ROLLS) * (2 * math.pi / NUM_ROLLS)
-    rotations = np.stack(
-        [
-            _product(_product(about(2, roll), about(1, flip)), about(0, tilt))
-            for roll, flip, tilt in product(rolls, (0.0, math.pi), TILTS)
-        ]
-    )
-    wrists = PALM_TO_WRIST * np.stack([_second_axis(rotation) for rotation in rotations])
-    repeat = len(GESTURES)
-    angles = np.tile(GESTURES, (len(rotations), 1))
-    return np.repeat(rotations, repeat, axis=0), np.repeat(wrists, repeat, axis=0), angles
 
 
 def find_starts(
@@ -240,21 +185,10 @@ def _one_off(pose: np.ndarray, count: int, outwards: int) -> np.ndarray:
 
 def _turned(pose: np.ndarray, scale: float, turn: np.ndarray) -> np.ndarray:
     """The pose turned in its own frame by a quaternion, about the middle of its palm."""
-    before, turned = pose[3:7], _product(pose[3:7], turn)
-    middle = pose[:3] - PALM_TO_WRIST * scale * _second_axis(before)
-    wrist = middle + PALM_TO_WRIST * scale * _second_axis(turned)
+    before, turned = pose[3:7], multiplied(pose[3:7], turn)
+    middle = pose[:3] - PALM_TO_WRIST * scale * second_axis(before)
+    wrist = middle + PALM_TO_WRIST * scale * second_axis(turned)
     return np.concatenate([wrist, turned, pose[7:]]).astype(np.float32)
-
-
-def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    vector = p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], vector])
-
-
-def _second_axis(q: np.ndarray) -> np.ndarray:
-    """Where a rotation takes the y axis."""
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
 
 
 def registered(
@@ -270,6 +204,19 @@ def registered(
     found, costs = _refined(image, one, FINE)
     cost = float(costs[0]) + UNUSUAL_SIZE * (math.log(start.scale) / SIZE_STD) ** 2
     return start._replace(pose=found.poses[0], cost=cost)
+
+
+def costs_of(
+    camera: Pinhole,
+    observed: Float[Array, "rows cols"],
+    center: Float[np.ndarray, " 3"],
+    geometry: HandGeometry,
+    starts: Sequence[Start],
+) -> Float[np.ndarray, " s"]:
+    """Costs of hands as they are, as `find_starts` would judge them on this window, metres."""
+    image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
+    tried = Hypotheses(*(np.asarray([start[i] for start in starts], np.float32) for i in range(3)))
+    return _sized(*_refined(image, tried, ()))[1]
 
 
 def _refined(image: tuple, tried: Hypotheses, widths: tuple[float, ...]) -> tuple[Hypotheses, np.ndarray]:

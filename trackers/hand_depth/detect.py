@@ -61,6 +61,8 @@ class Sighting(NamedTuple):
     """(3,) metres, camera frame: the middle of the palm."""
     frame: np.ndarray
     """(rows, cols) metres: without other large surfaces, which are `inf` where they are farther away, else NaN."""
+    surface: int
+    """Number of the surface on which it lies: a hand and its forearm are one."""
 
 
 def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
@@ -123,4 +125,4 @@ def _sighting(frame: np.ndarray, surfaces: np.ndarray, area: np.ndarray, center:
     # Small surfaces stay: fingers before the palm are separated from it by a jump.
     other = (surfaces != label) & ((surfaces == 0) | (area[surfaces] > LARGEST_PART)) & np.isfinite(frame)
     behind = np.where(frame > center[2], np.inf, np.nan)
-    return Sighting(center.astype(np.float32), np.where(other, behind, frame).astype(np.float32))
+    return Sighting(center.astype(np.float32), np.where(other, behind, frame).astype(np.float32), label)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,8 @@ from jaxtyping import Array
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.observation import crop
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
-from jaxfilters.models.hand.start import BATCH, SCALES, Start, find_starts, registered
-from jaxfilters.trackers.hand_depth.detect import NEAREST, hand_sightings
+from jaxfilters.models.hand.start import BATCH, SCALES, SEARCH_RADIUS, Start, costs_of, find_starts, registered
+from jaxfilters.trackers.hand_depth.detect import NEAREST, Sighting, hand_sightings
 from jaxfilters.trackers.hand_depth.filtering import (
     WINDOW,
     Setup,
@@ -23,6 +24,10 @@ from jaxfilters.trackers.hand_depth.filtering import (
     pose_moments,
 )
 
+SAME_ARM = 1.5 * SEARCH_RADIUS
+"""Metres between two places on one surface up to which they are judged together."""
+CLEARLY = 0.9
+"""Share of the cost of another place below which one is better than it."""
 SECOND_CHANCE, RACE_INTERVAL, QUIET_INTERVAL = 0.3, 1.0, 3.0
 """Seconds from a start to the first race of new starts against the track, between races while it is doubtful, and
 while it is not."""
@@ -45,10 +50,8 @@ def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> T
 
     Where what it shows is no hand, `race_time` says when to look again: not in every frame, since it takes a second.
     """
-    starts, image = [], np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
-    for sighting in hand_sightings(setup.camera, image):
-        camera, window = _cropped(setup.compiled(), jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
-        starts += find_starts(camera, window, sighting.center, setup.likelihood.geometry, _sizes(state), (1.0, -1.0))
+    image = np.asarray(filled(jnp.asarray(frame), state.missing_is_background))
+    starts = _starts(setup, state, hand_sightings(setup.camera, image))
     wanted = [start for start in starts if not start.side * float(state.side) < 0]
     found = min(wanted, key=lambda start: start.cost, default=None)
     if found is None or not found.cost < WORST_START:
@@ -56,6 +59,31 @@ def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> T
         return state._replace(race_time=jnp.asarray(time + pause, dtype=float))
     doubt = found.cost > DOUBTFUL_COST or _is_rivalled(setup, found, starts)
     return _begun(setup, state, found, time, doubt)
+
+
+def _starts(setup: Setup, state: TrackState, sightings: list[Sighting]) -> list[Start]:
+    """The starts about every sighting but those that another one on the same arm explains better.
+
+    About the middle of a forearm alone, an upside-down hand is cheap whose "forearm" is the palm. Of two places on one
+    arm, the one whose best start explains both counts: that with the lower of the higher costs, if it is clearly lower.
+    """
+    geometry = setup.likelihood.geometry
+    windows = [
+        (*_cropped(setup.compiled(), jnp.asarray(each.frame), jnp.asarray(each.center)), each.center)
+        for each in sightings
+    ]
+    found = [find_starts(*window, geometry, _sizes(state), (1.0, -1.0)) for window in windows]
+
+    def highest(starts: list[Start], pair: tuple[int, int]) -> float:
+        costs = np.max([costs_of(*windows[i], geometry, starts) for i in pair], axis=0)
+        return float(np.min(costs, initial=np.inf))
+
+    beaten = set()
+    for i, j in combinations(range(len(sightings)), 2):
+        if sightings[i].surface == sightings[j].surface and math.dist(windows[i][2], windows[j][2]) < SAME_ARM:
+            first, second = highest(found[i], (i, j)), highest(found[j], (i, j))
+            beaten |= {j} if first < CLEARLY * second else {i} if second < CLEARLY * first else set()
+    return [start for i, starts in enumerate(found) if i not in beaten for start in starts]
 
 
 def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
