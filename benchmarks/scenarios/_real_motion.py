@@ -30,7 +30,7 @@ from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
-from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, LEAN_STD, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
@@ -155,7 +155,7 @@ def back_projected(camera: Pinhole, uvd: np.ndarray) -> np.ndarray:
 def hand_of(chosen: HandSet, detections: Detections) -> tuple[MarkedHand, Inequalities]:
     """The average hand before the camera, and its limits."""
     layout = five_fingers(3, chosen.side)
-    motion = about_ease(layout, relaxed_angles(layout).ravel())
+    motion = about_ease(layout, relaxed_angles(layout).ravel(), lean_std=LEAN_STD)
     hand = articulated_hand(
         layout, projection=Perspective(detections.camera), motion=motion, point_std=detections.noise
     )

@@ -15,7 +15,7 @@ from jaxfilters.math.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.anatomy import PALM_WIDTH, relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
-from jaxfilters.models.articulated.motion import ANGLE_SPREAD
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD, AboutEase, lean_axes
 from jaxfilters.models.articulated.projection import Perspective
 
 NUM_STARTS = 6
@@ -210,6 +210,9 @@ def _fitted(
         missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
         parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]
         parts += [p[rotation:angles] / size.std] if in_space else []
+        if isinstance(hand.motion, AboutEase) and hand.motion.lean_std is not None:
+            axis, sight = lean_axes(x, layout)
+            parts.append(jnp.sum(axis * sight, keepdims=True) / hand.motion.lean_std)
         if limits is not None:
             value = dot(limits.normals, x)
             outside = jnp.maximum(value - limits.upper, 0.0) + jnp.maximum(limits.lower - value, 0.0)
@@ -246,7 +249,8 @@ def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
         size = AVERAGE_SIZE
     width = layout.palm.start
     shape_std = (LENGTH_STD * x[layout.static]).at[width - layout.static.start].set(size.width_std * x[width])
-    variances = jnp.concatenate([moving, rates, shape_std**2]).astype(x.dtype)
+    errors = jnp.zeros(0) if hand.errors is None else hand.errors.covariance
+    variances = jnp.concatenate([moving, rates, shape_std**2, errors]).astype(x.dtype)
     q = x[layout.quaternion]
     across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
     covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)

@@ -37,7 +37,7 @@ from jaxfilters.models.articulated.filters import (
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
-from jaxfilters.models.articulated.motion import FRAME_INTERVAL, about_ease
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL, LEAN_STD, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
@@ -133,7 +133,7 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
         layout = five_fingers(2 if camera is None else 3, side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
         per_metre = diagonal / HAND_DIAGONAL if camera is None else 1.0
-        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=per_metre)
+        motion = about_ease(layout, relaxed_angles(layout).ravel(), per_metre=per_metre, lean_std=LEAN_STD)
         # Views differ by what a detector errs by in one frame, however long its errors last.
         noise = sequence.noise_px or float(np.median(sequence.std[np.isfinite(sequence.y)]))
         projection = None if camera is None else Perspective(camera)
