@@ -9,8 +9,8 @@ an average hand of the same extent would have. `recommended_known_size` is the t
 
 What limits it: a hand of 90 pixels that faces the camera (ICVL) is flatter, 22 mm in depth, than its foreshortening can
 be read from detections that are 4 pixels off; there the plane at the depth of the root is nearer to the truth. Even of
-exact points the most likely pose of such a hand is tilted by 17 degrees, since the joint density of pose and angles is
-higher, though narrower, where fingers point to the camera.
+exact points the most likely pose of such a hand is tilted by 17 degrees where all rotations are alike, since the joint
+density of pose and angles is higher, though narrower, where fingers point to the camera; hence `LEAN_STD`.
 """
 
 import time

@@ -111,7 +111,6 @@ class AboutEase:
         columns.append(jnp.concatenate([jnp.diag(before), jnp.zeros_like(jnp.diag(before)), nothing]))
         return jnp.concatenate(columns, axis=1)
 
-
     def _turned_flat(self, x: Float[Array, " n"], layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, " n"]:
         """The state with the long axis turned towards the image plane, as far as it turns in `dt` frames.
 

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.linalg import expm
 
 from jaxfilters.models.articulated.anatomy import relaxed_angles
 from jaxfilters.models.articulated.layout import Layout, five_fingers
-from jaxfilters.models.articulated.motion import ANGLE_SPREAD, MOVEMENT_TIME, AboutEase, about_ease
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD, MOVEMENT_TIME, AboutEase, about_ease, lean_axes
 
 SPEED_STD, TIME = (0.01, 0.02, 0.03), (5.0, 8.0, 12.0)
 """Of position, quaternion and angles."""
@@ -79,6 +80,48 @@ def test_no_time_changes_nothing():
     np.testing.assert_array_equal(motion.noise_root(layout, 0.0), 0)
 
 
+@pytest.mark.system
+@pytest.mark.parametrize("position_size", [2, 3])
+def test_a_hand_of_which_nothing_is_known_has_its_long_axis_near_the_image_plane(position_size, x64):
+    """Many hands after many frames, against Watson's density exp(-s^2 / 2 lean_std^2) of the sine s of the lean."""
+    lean_std, hands, step = 0.4, 2000, 0.1
+    layout = Layout(1, position_size)
+    motion = about_ease(layout, np.zeros(4), lean_std=lean_std, speed_std=(0.0, 0.15, 0.0), time=0.2)
+    root = motion.noise_root(layout, step)
+
+    def move(states, key):
+        noise = jax.random.normal(key, (hands, root.shape[1])) @ root.T
+        states = jax.vmap(lambda x: motion.advance(x, layout, step))(states) + noise
+        q = states[:, layout.quaternion]
+        states = states.at[:, layout.quaternion].set(q / jnp.linalg.norm(q, axis=1, keepdims=True))
+        return states, None
+
+    # All begin with the long axis along the line of sight but for a little.
+    first = (
+        jnp.zeros((hands, layout.size)).at[:, layout.position.stop].set(0.7).at[:, layout.position.stop + 2].set(0.7)
+    )
+    first = first.at[:, : layout.position.stop].set(jnp.arange(1.0, 1 + position_size))
+    states, _ = jax.lax.scan(move, first, jax.random.split(jax.random.key(0), 600))
+    sines = np.array(jax.vmap(lambda x: jnp.sum(jnp.prod(jnp.stack(lean_axes(x, layout)), axis=0)))(states))
+    grid = np.linspace(-1, 1, 2001)
+    density = np.cumsum(np.exp(-0.5 * (grid / lean_std) ** 2))
+    assert stats.kstest(sines, lambda s: np.interp(s, grid, density / density[-1])).pvalue > 1e-3
+
+
+def test_a_lean_of_any_size_is_turned_flat_about_the_axis_across_it(x64, random_state):
+    """The axis turns in its plane with the line of sight, by rate times sin cos of the lean to first order."""
+    layout = Layout(2, 3)
+    motion = about_ease(layout, np.zeros(8), lean_std=0.3, speed_std=(0.0, 0.02, 0.0))
+    x = jnp.asarray(random_state(np.random.default_rng(1), layout)).at[layout.rates].set(0.0)
+    dt = 1e-3
+    before, sight = (np.asarray(axis) for axis in lean_axes(x, layout))
+    after, _ = (np.asarray(axis) for axis in lean_axes(motion.advance(x, layout, dt), layout))
+    lean = np.arcsin(before @ sight)
+    rate = (2 * 0.02) ** 2 * MOVEMENT_TIME / 0.3**2
+    assert np.arcsin(after @ sight) - lean == pytest.approx(-rate * dt * np.sin(lean) * np.cos(lean), rel=1e-3)
+    assert np.linalg.det(np.stack([before, after, sight])) == pytest.approx(0, abs=1e-12)
+
+
 def test_speeds_in_an_image_are_those_in_space_times_its_scale():
     layout = Layout(2)
     speed = about_ease(layout, np.zeros(8), per_metre=500.0, speed_std=(0.01, 0.02, 0.03)).speed_std
@@ -92,6 +135,7 @@ def test_speeds_in_an_image_are_those_in_space_times_its_scale():
         (dict(ease=np.full(8, np.nan)), "ease must be 8 finite angles"),
         (dict(speed_std=(1.0, -0.1, 0.1)), "speed_std must be three numbers"),
         (dict(time=0.0), "time must be positive; got 0.0"),
+        (dict(lean_std=0.0), "lean_std must be positive; got 0.0"),
         (dict(per_metre=float("inf")), "per_metre must be positive; got inf"),
     ],
 )
