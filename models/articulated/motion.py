@@ -82,7 +82,8 @@ class AboutEase:
         pose, pose_rates = _pose(layout)
         t = dt / self.time[pose]
         x = x.at[pose].add(-self.time[pose] * jnp.expm1(-t) * x[pose_rates]).at[pose_rates].multiply(jnp.exp(-t))
-        x = x if self.lean_std is None else self._turned_flat(x, layout, dt)
+        if self.lean_std is not None:
+            x = _turned_flat(x, layout, self._turning(layout) / self.lean_std**2 * dt)
         t = dt / self.time[angles]
         off, rate = x[angles] - self.ease, x[rates]
         x = x.at[angles].set(self.ease + jnp.exp(-t) * ((1 + t) * off + dt * rate))
@@ -111,20 +112,23 @@ class AboutEase:
         columns.append(jnp.concatenate([jnp.diag(before), jnp.zeros_like(jnp.diag(before)), nothing]))
         return jnp.concatenate(columns, axis=1)
 
-    def _turned_flat(self, x: Float[Array, " n"], layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, " n"]:
-        """The state with the long axis turned towards the image plane, as far as it turns in `dt` frames.
+    def _turning(self, layout: Layout) -> Float[Array, ""]:
+        """How fast the rotation diffuses, in squared radians per frame: a rate is twice that of the unit quaternion."""
+        return jnp.mean(4 * self.speed_std[layout.quaternion] ** 2 * self.time[layout.quaternion])
 
-        With the diffusion D of the rotation, a drift of D / lean_std^2 sin cos of the angle to the image plane has the
-        density exp(-sin^2 / (2 lean_std^2)) of axes on the sphere in the long run: that of Watson, a girdle.
-        """
-        time, speed = self.time[layout.quaternion], self.speed_std[layout.quaternion]
-        # A rotation's rate is twice that of its unit quaternion.
-        rate = jnp.mean(4 * speed**2 * time) / self.lean_std**2
-        axis, sight = lean_axes(x, layout)
-        turned = so3_exp(jnp.expm1(-rate * dt) * jnp.sum(axis * sight) * jnp.cross(axis, sight))
-        for block in (layout.quaternion, layout.quaternion_rate):
-            x = x.at[block].set(quaternion_multiply(turned, x[block]))
-        return x
+
+def _turned_flat(x: Float[Array, " n"], layout: Layout, amount: Float[Array, ""]) -> Float[Array, " n"]:
+    """The state with the hand's long axis turned towards the image plane.
+
+    With the diffusion D of the rotation, a drift of D / lean_std^2 sin cos of the angle to the image plane has the
+    density exp(-sin^2 / (2 lean_std^2)) of axes on the sphere in the long run: that of Watson, a girdle. The amount is
+    D / lean_std^2 times the frames that have passed.
+    """
+    axis, sight = lean_axes(x, layout)
+    turned = so3_exp(jnp.expm1(-amount) * jnp.sum(axis * sight) * jnp.cross(axis, sight))
+    for block in (layout.quaternion, layout.quaternion_rate):
+        x = x.at[block].set(quaternion_multiply(turned, x[block]))
+    return x
 
 
 def lean_axes(x: Float[Array, " n"], layout: Layout) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:

@@ -68,10 +68,7 @@ def _starts(setup: Setup, state: TrackState, sightings: list[Sighting]) -> list[
     arm, the one whose best start explains both counts: that with the lower of the higher costs, if it is clearly lower.
     """
     geometry = setup.likelihood.geometry
-    windows = [
-        (*_cropped(setup.compiled(), jnp.asarray(each.frame), jnp.asarray(each.center)), each.center)
-        for each in sightings
-    ]
+    windows = [_window(setup, sighting) for sighting in sightings]
     found = [find_starts(*window, geometry, _sizes(state), (1.0, -1.0)) for window in windows]
 
     def highest(starts: list[Start], pair: tuple[int, int]) -> float:
@@ -137,6 +134,12 @@ def _begun(setup: Setup, state: TrackState, found: Start, time: float, doubt: bo
 def _sizes(state: TrackState) -> tuple[float, ...]:
     scale = float(state.scale)
     return SCALES if math.isnan(scale) else (scale,)
+
+
+def _window(setup: Setup, sighting: Sighting) -> tuple[Pinhole, Array, np.ndarray]:
+    """Camera, depth and middle of what is about a sighting."""
+    camera, depth = _cropped(setup.compiled(), jnp.asarray(sighting.frame), jnp.asarray(sighting.center))
+    return camera, depth, sighting.center
 
 
 @jax.jit
