@@ -25,6 +25,8 @@ from jaxfilters.trackers.people.silhouettes import (
 from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, STRIDE, CameraFrame, PeopleScene
 from jaxfilters.trackers.people.stride import longest_stride, with_best_stride, with_stride
 
+ALONE = 0.5
+"""Probability that nobody else makes a pixel foreground, for every pixel of a window, above which strides are found."""
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction a person is searched for, along each axis."""
 HEIGHT_STEP_M = 0.03
@@ -119,13 +121,15 @@ def fit_people(
         k = order[turn % num_active]
         unshifted = jax.tree.map(lambda leaf: leaf[k], views)
         mine = shifted(unshifted, shifts[k]) if has_shifts(scene) else unshifted
-        contrasts = contrasts_of(mine, unexplained_of(scene, places, active.at[k].set(False), mine))
+        unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
+        contrasts = contrasts_of(mine, unexplained)
+        alone = jnp.min(unexplained) > ALONE
         if has_shifts(scene):
             shifts = shifts.at[k].set(best_shift(scene, places[k], unshifted, contrasts, shifts[k]))
             mine = shifted(unshifted, shifts[k])
 
         def best(place, offsets):
-            place = with_best_stride(scene, place, longest[k], mine, contrasts)
+            place = with_best_stride(scene, place, longest[k], mine, contrasts, alone)
             candidates = place + with_stride(dot(offsets, axes[k]))
             scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
             away = candidates[:, : STRIDE.start] - start[k]

@@ -2,12 +2,13 @@
 
 A person who walks across the line of sight shows a gap between the legs for most of the time, and is displaced by
 decimetres where one shape stands for all moments of a stride. How far a stride has got is a nuisance of each image,
-over which the likelihood is maximised together with the place (a profile likelihood).
+over which the likelihood is maximised together with the place (a profile likelihood). Where somebody else is in the
+window as well, a free stride would also explain that person, and people who meet change places: there it is half.
 """
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfilters.trackers.people.silhouettes import View, log_likelihood
 from jaxfilters.trackers.people.state import HEIGHT, STRIDE, PeopleScene
@@ -40,8 +41,9 @@ def with_best_stride(
     longest: Float[Array, " 2"],
     views: View,
     contrasts: Float[Array, "cameras samples"],
+    alone: Bool[Array, ""],
 ) -> Float[Array, " 6"]:
-    """A silhouette with the stride under which the images are most likely.
+    """A silhouette with the stride under which the images are most likely, or half the largest beside others.
 
     Args:
         scene: Cameras and constants.
@@ -49,8 +51,9 @@ def with_best_stride(
         longest: The largest stride, metres.
         views: The windows of the person.
         contrasts: What candidates are compared with.
+        alone: Whether nobody else may make the window foreground.
     """
     strides = jnp.array(STRIDES)[:, None] * longest
     candidates = jnp.broadcast_to(shape, (len(STRIDES), *shape.shape)).at[:, STRIDE].set(strides)
     scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, views, contrasts)
-    return candidates[jnp.argmax(scores)]
+    return jnp.where(alone, candidates[jnp.argmax(scores)], shape.at[STRIDE].set(longest / 2))
