@@ -16,16 +16,13 @@ from jaxfilters.models.articulated.kinematics import scaled_rotation, turn, unit
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.camera import Pinhole
 
-ANGLE_ACCELERATION = math.radians(3.0)
-"""Per frame squared: to close a hand, 90 degrees, in a third of a second takes 3.6, one way and then the other."""
-
 
 @pytree_dataclass
 class WeakPerspective:
     """Orthographic projection times one scale, the quaternion's squared length; everything is in pixels [9]."""
 
     position_size: ClassVar[int] = 2
-    acceleration_std: ClassVar[tuple[float, float, float]] = (1.0, 0.006, ANGLE_ACCELERATION)
+    acceleration_std: ClassVar[tuple[float, float, float]] = (1.0, 0.006, math.radians(1.5))
     """Of wrist (pixels), quaternion and angles (radians), per frame squared, unless one knows better."""
 
     def center(self) -> Float[Array, " 2"]:
@@ -64,7 +61,7 @@ class Perspective:
 
     camera: Pinhole
     position_size: ClassVar[int] = 3
-    acceleration_std: ClassVar[tuple[float, float, float]] = (0.0015, 0.006, ANGLE_ACCELERATION)
+    acceleration_std: ClassVar[tuple[float, float, float]] = (0.0015, 0.006, math.radians(1.5))
     """Of wrist (metres), quaternion and angles (radians), per frame squared: those of weak perspective at 0.75 m."""
 
     def center(self) -> Float[Array, " 2"]:
