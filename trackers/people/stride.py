@@ -2,7 +2,7 @@
 
 A person who walks across the line of sight shows a gap between the legs for most of the time, and is displaced by
 decimetres where one shape stands for all moments of a stride. How far a stride has got is a nuisance of each image,
-over which the likelihood is maximised together with the place (a profile likelihood). Where somebody else is in the
+over which the likelihood is maximised together with the place (a profile likelihood). Where another person is in the
 window as well, a free stride would also explain that person, and people who meet change places: there it is half.
 """
 

@@ -12,6 +12,7 @@ from jaxfilters.models.synthetic.room import floor_camera, looking
 from jaxfilters.models.synthetic.walkers import HIP, LEG_SWING, Walker, body
 from jaxfilters.trackers.people import stride
 from jaxfilters.trackers.people.fit import fit_people
+from jaxfilters.trackers.people.silhouettes import View
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.stride import FULL_STRIDE, longest_stride, with_stride
 from jaxfilters.trackers.people.tracker import people_scene
@@ -19,6 +20,7 @@ from jaxfilters.trackers.people.tracker import people_scene
 AT, HEIGHT_M = (0.3, 4.0), 1.8
 PINHOLE = Pinhole.from_intrinsics(330.0, (239.5, 179.5), (360, 480))
 T_CAMERA_WORLD = looking((0.0, -4.0, 2.9), 90.0, 15.0)
+FLOOR = [(-4, -2), (4, -2), (4, 8), (-4, 8)]
 APART = (0.2, 0.5, 0.8, 1.0)
 """Shares of a full stride; at 0, limbs one behind the other make a body as narrow as nobody."""
 
@@ -47,7 +49,9 @@ def test_legs_are_together_by_default():
 def test_beside_others_legs_are_half_a_stride_apart_whatever_the_image_shows(alone, share, monkeypatch):
     monkeypatch.setattr(stride, "log_likelihood", lambda scene, shape, views, contrasts: shape[4])
     shape, longest = jnp.array([1.0, 2.0, 1.7, 0.45, 0.1, 0.0]), jnp.array([0.4, 0.0])
-    chosen = stride.with_best_stride(None, shape, longest, None, None, jnp.array(alone))
+    scene = people_scene([floor_camera(PINHOLE, T_CAMERA_WORLD)], FLOOR)
+    views = View(*[jnp.zeros((1, 1))] * len(View._fields))
+    chosen = stride.with_best_stride(scene, shape, longest, views, jnp.zeros((1, 1)), jnp.array(alone))
     np.testing.assert_allclose(chosen, [1.0, 2.0, 1.7, 0.45, share * 0.4, 0.0], rtol=1e-6)
 
 
@@ -55,8 +59,7 @@ def test_beside_others_legs_are_half_a_stride_apart_whatever_the_image_shows(alo
 def found():
     """The search in silhouettes of somebody who walks to the right, with legs by a share of a full stride apart."""
     camera = floor_camera(PINHOLE, T_CAMERA_WORLD)
-    floor = [(-4, -2), (4, -2), (4, 8), (-4, 8)]
-    scene = people_scene([camera], floor, config=PeopleConfig(capacity=1, spread_px=0.0))
+    scene = people_scene([camera], FLOOR, config=PeopleConfig(capacity=1, spread_px=0.0))
     mean = jnp.array([[*AT, 1.2, 0.0, HEIGHT_M, 0.47, 0.0, 0.0, 0.0]])
     sd = jnp.array([0.3, 0.3, 0.3, 0.3, 0.02, 0.05, 0.1, 0.1, 0.1])
     search = jax.jit(lambda frame: fit_people(scene, Gaussian(mean, jnp.diag(sd**2)[None]), *nothing, (frame,)))
