@@ -72,8 +72,9 @@ def _starts(setup: Setup, state: TrackState, sightings: list[Sighting]) -> list[
     found = [find_starts(*window, geometry, _sizes(state), (1.0, -1.0)) for window in windows]
 
     def highest(starts: list[Start], pair: tuple[int, int]) -> float:
-        costs = np.max([costs_of(*windows[i], geometry, starts) for i in pair], axis=0)
-        return float(np.min(costs, initial=np.inf))
+        if not starts:
+            return math.inf
+        return float(np.max([costs_of(*windows[i], geometry, starts) for i in pair], axis=0).min())
 
     beaten = set()
     for i, j in combinations(range(len(sightings)), 2):
