@@ -25,8 +25,8 @@ from jaxfilters.trackers.head.mono.claims import pose_variance
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
+from jaxfilters.trackers.head.mono.verdict import is_strange
 from jaxfilters.trackers.head.stereo.tracking import (
-    FEWEST_ANCHORED,
     LEAST_SCORE,
     MOST_STEPS,
     MOST_STRANGE,
@@ -96,7 +96,8 @@ def _step(
     score = score_at(state.model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(state.model, looks, rig, belief.mean, images))
     fewer = jnp.maximum(state.num_outliers - 2, 0)
-    num_outliers = jnp.where(estimate.num_anchored < FEWEST_ANCHORED, state.num_outliers + 1, fewer)
+    strange = is_strange(estimate.num_anchored, score, belief.mean[:POSE], state.window.poses[0])
+    num_outliers = jnp.where(strange & (not options.is_published), state.num_outliers + 1, fewer)
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     state = _after(state, search, belief, estimate, missed)
