@@ -9,6 +9,7 @@ from jaxfilters.models.face.landmarks import NAMES, PEOPLE_SHAPE
 from jaxfilters.models.face.mirroring import PAIRS, mirrored
 from jaxfilters.models.face.multilinear import learn, shape
 from jaxfilters.models.synthetic.face_training import generator_shapes, people_of
+from jaxfilters.trackers.io.enrolled_people import fingerprint
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.face_models import (
     FaceModelFile,
@@ -169,3 +170,10 @@ def test_a_face_of_another_size_is_that_face_scaled_with_its_expressions():
         expression = face.expression_mean + face.expression_std * draw.normal(size=face.num_expressions)
         expected = scale * shape(face, face.identity_mean + away, expression)
         np.testing.assert_allclose(shape(wider, grown, expression), expected, atol=0.2)
+
+
+@pytest.mark.system
+def test_people_are_of_the_same_model_in_another_precision():
+    expected = fingerprint(people_face_model().model)
+    with jax.enable_x64(True):
+        assert fingerprint(people_face_model().model) == expected

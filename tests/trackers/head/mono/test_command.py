@@ -113,11 +113,12 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     assert [row["status"] for row in rows] == ["searching"] * 2 + ["tracking"] * (FRAMES - 2)
     assert float(rows[7]["x_m"]) == pytest.approx(0.107, rel=1e-5)
     assert float(rows[7]["pitch_rad"]) == pytest.approx(0.3, rel=1e-5)
-    assert (float(rows[7]["expression_5"]), float(rows[7]["identity_15"])) == (0.25, 1.5)
+    assert (float(rows[7]["expression_5"]), float(rows[7]["identity_16"])) == (0.25, 1.5)
     assert np.isnan(float(rows[0]["identity_1"]))
     options = fake[0].options
     assert (options.seed, options.num_particles, options.eyes_apart_mm) == (4, 60, 64.5)
-    assert fake[0].face.num_identities == 15
+    # Those of the package, and the size.
+    assert fake[0].face.num_identities == 15 + 1
     report = json.loads((out / "report.json").read_text())
     assert report["is_focal_length_assumed"] is True
     assert report["detector"] in ("cascades", "mediapipe")
