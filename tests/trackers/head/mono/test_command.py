@@ -131,7 +131,7 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     assert "generator" in report["face_model"]["source"]
     with np.load(out / "track.npz") as track:
         assert track["identity"].shape == (FRAMES, 16)
-        assert track["person_identity"].shape == (15,)
+        assert track["person_identity"].shape == (16,)
         assert track["status_names"][int(track["status"][5])] == "tracking"
     captured = capsys.readouterr()
     assert "assumed focal length" in captured.err
