@@ -26,6 +26,7 @@ from jaxfilters.models.synthetic.articulated import (
     LAYOUT,
     ArticulatedSequence,
     paper_hand,
+    simulate_drawn,
     simulate_held,
     simulate_paper,
 )
@@ -69,17 +70,22 @@ class Runs(NamedTuple):
 
 def run_paper(mode: str, shape: int, seeds: range) -> Runs:
     """The 55 frames of the paper."""
-    keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(shape), seed))(jnp.arange(seeds.start, seeds.stop))
-    return _filtered(FILTERS[mode], jax.vmap(lambda key: simulate_paper(key, shape))(keys))
+    return _filtered(FILTERS[mode], jax.vmap(lambda key: simulate_paper(key, shape))(_keys(shape, seeds)))
+
+
+def run_drawn(mode: str, shape: int, seeds: range) -> Runs:
+    """The same frames from starts that are samples of what is believed."""
+    return _filtered(FILTERS[mode], jax.vmap(lambda key: simulate_drawn(key, shape))(_keys(20 + shape, seeds)))
 
 
 def run_held(mode: str, shape: int, seeds: range, num_frames: int) -> Runs:
     """One pose of the sequence, repeated."""
-    keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(10 + shape), seed))(
-        jnp.arange(seeds.start, seeds.stop)
-    )
     simulate = partial(simulate_held, shape=shape, num_frames=num_frames, frame=HELD_FRAME)
-    return _filtered(FILTERS[mode], jax.vmap(simulate)(keys))
+    return _filtered(FILTERS[mode], jax.vmap(simulate)(_keys(10 + shape, seeds)))
+
+
+def _keys(first: int, seeds: range) -> Array:
+    return jax.vmap(partial(jax.random.fold_in, jax.random.key(first)))(jnp.arange(seeds.start, seeds.stop))
 
 
 class Model(NamedTuple):

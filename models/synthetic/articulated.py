@@ -153,6 +153,29 @@ def initial_belief(
     return mean.at[layout.static].set(believed), _initial_covariance(q, errors)
 
 
+@jax.jit
+def drawn_belief(key: AnyKey, x: Float[Array, " 37"]) -> tuple[Float[Array, " 37"], Float[Array, "37 37"]]:
+    """Mean and covariance at the start that belong together: the mean is off by a sample of the covariance.
+
+    The variances are those of table 2; the rates are believed to be zero.
+
+    Args:
+        key: Random key.
+        x: Truth.
+    """
+    key, rotation_key = jax.random.split(key)
+    layout, dtype = LAYOUT, x.dtype
+    q = x[layout.quaternion] / jnp.linalg.norm(x[layout.quaternion])
+    turned = so3_exp(ROTATION_STD * jax.random.normal(rotation_key, (3,), dtype))
+    q = quaternion_multiply(turned, q)
+    covariance = _initial_covariance(q, TABLE_2)
+    off = jnp.sqrt(jnp.diag(covariance)) * jax.random.normal(key, x.shape, dtype)
+    mean = jnp.zeros_like(x).at[layout.quaternion].set(q)
+    for part in (layout.position, layout.angles, layout.static):
+        mean = mean.at[part].set((x + off)[part])
+    return mean, covariance
+
+
 def simulate_paper(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES) -> ArticulatedSequence:
     """The paper's sequence of one of the `SHAPES` with all features; the same lengths are believed of either.
 
@@ -160,6 +183,18 @@ def simulate_paper(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES)
         ValueError: if `shape` is not one of `SHAPES`, or `num_frames` < 1.
     """
     return _simulate(key, paper_states(shape, num_frames), FULL, TABLE_2, INITIAL_SHAPE)
+
+
+def simulate_drawn(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES) -> ArticulatedSequence:
+    """The paper's sequence of one of the `SHAPES`, begun at a sample of what is believed: see `drawn_belief`.
+
+    Raises:
+        ValueError: as `simulate_paper`.
+    """
+    record_key, belief_key = jax.random.split(key)
+    states, hand = paper_states(shape, num_frames), paper_hand()
+    measured, masks = record(record_key, states, hand)
+    return ArticulatedSequence(states, measured, masks, hand.observation_std(), *drawn_belief(belief_key, states[0]))
 
 
 def simulate_held(key: AnyKey, shape: int = 1, *, num_frames: int = 500, frame: int = 0) -> ArticulatedSequence:

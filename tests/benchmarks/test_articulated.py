@@ -31,6 +31,7 @@ def runs(num_frames):
 def test_every_filter_is_judged_by_its_last_frames(monkeypatch, tmp_path):
     monkeypatch.delenv("JAXFILTERS_DATA", raising=False)
     monkeypatch.setattr(paper, "run_paper", lambda mode, shape, seeds: runs(55))
+    monkeypatch.setattr(paper, "run_drawn", lambda mode, shape, seeds: runs(55))
     monkeypatch.setattr(paper, "run_held", lambda mode, shape, seeds, num_frames: runs(num_frames))
     monkeypatch.setattr(articulated, "interleaved", lambda calls, rounds: dict.fromkeys(calls, 55e-6))
     value = {name: metric.value for name, metric in articulated.run(quick=True, seed=0, out=tmp_path).items()}
@@ -40,6 +41,7 @@ def test_every_filter_is_judged_by_its_last_frames(monkeypatch, tmp_path):
         assert value[f"diverged_share_{mode}_shape{shape}"] == value[f"angle_error_deg_{mode}_shape{shape}"] == 0
         assert value[f"nees_lengths_{mode}_shape{shape}"] == pytest.approx(6)
         assert value[f"r13_difference_px_{mode}"] == 0
+    assert value["drawn_nees_lengths_median_recommended_shape2"] == pytest.approx(6)
     assert value["held_nees_lengths_recommended"] == pytest.approx(6)
     assert value["held_std_kept_literal"] == 1
     # 55 frames at once.

@@ -19,12 +19,12 @@ NUM_KEYPOINTS = 21
 """Of one hand: wrist, thumb 1-4, index, middle, ring, little finger, base to tip."""
 LEAST_CONFIDENCE = 0.2
 """Keypoints below it count as not visible; it is what OpenPose draws hands from."""
-NOISE_SHARE = 0.05
+NOISE_SHARE = 0.03
 """Noise of a keypoint's coordinate in one frame as a share of the hand's diagonal in the image, where nobody says
-better. Detectors look at a crop around the hand, so that their error grows with it. That of MediaPipe's network is
-13.4 % of the palm's size (F. Zhang et al., MediaPipe Hands: on-device real-time hand tracking, 2020; which
-distances it takes is not said). With the palm as long as from wrist to knuckles, half of the diagonal of an average
-hand, that is 6.7 % of the diagonal, and as a root mean square of distances 4.7 % in each coordinate."""
+better. Detectors look at a crop around the hand, so that their error grows with it. Networks on ICVL and NYU err by
+1.1 to 4.3 %. MediaPipe's is said to err by 13.4 % of the palm's size (F. Zhang et al., MediaPipe Hands: on-device
+real-time hand tracking, 2020; which distances it takes is not said), which would be 4.7 % of the diagonal for a palm of
+half of it. `persistence` then raises what is taken for one frame, since errors last."""
 
 _PATTERNS = {
     "wrist": "wrist_[xy]",
