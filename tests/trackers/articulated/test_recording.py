@@ -192,7 +192,7 @@ def test_default_noise_is_a_share_of_the_hand_in_the_image():
     points[1, 5:] = np.nan
     points[1, 4] = 110, 60  # a fingertip and the wrist alone say little of the size
     points[2] = np.nan
-    assert keypoint_noise(points) == pytest.approx(0.05 * 500)
+    assert keypoint_noise(points) == pytest.approx(0.03 * 500)
     assert keypoint_noise(np.where(np.arange(NUM_KEYPOINTS)[None, :, None] == 3, points, np.nan)) == 1.0
 
 
