@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import image_size, seed
 from jaxfilters.trackers.app.compiled import keep_compiled_programs
-from jaxfilters.trackers.app.devices import keep_freed_memory, use_all_cores
+from jaxfilters.trackers.app.devices import collect_rarely, keep_freed_memory, use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
 from jaxfilters.trackers.app.options import add_picture_options
 from jaxfilters.trackers.app.output_folder import check_free
@@ -34,6 +34,7 @@ def command() -> int:
     if sys.argv[1:2] != ["bench"] and (trouble := keep_compiled_programs()):
         print(f"jaxfilters: {trouble}.", file=sys.stderr)
     keep_freed_memory()
+    collect_rarely()
     return main()
 
 
