@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 _SUFFICIENT = 0.99995**2
 """A step that reduces the energy to this fraction or less is successful whatever the quadratic model predicts."""
@@ -77,35 +77,54 @@ def line_search(
     energy_of = lambda residuals: 0.5 * jnp.sum(jnp.square(residuals))
     energy = energy_of(r)
     trial = jnp.clip(x + direction, *bounds)
-    step, trial_residuals = trial - x, residuals_at(trial)
+    step = trial - x
     slope = jnp.sum(gradient * step)
     predicted = -slope - 0.5 * jnp.sum(step * product(step))
-    decrease = energy - energy_of(trial_residuals)
-    gain_ratio = decrease / jnp.where(predicted > 0, predicted, 1.0)
+    gain_ratio_of = lambda decrease: decrease / jnp.where(predicted > 0, predicted, 1.0)
     rounding = 4 * jnp.finfo(x.dtype).eps * energy
     below_rounding = (predicted > 0) & (predicted <= rounding)
-    success = (decrease >= (1 - _SUFFICIENT) * energy) | ((predicted > 0) & (gain_ratio > _MIN_GAIN_RATIO))
-    success |= below_rounding & (decrease >= 0)
 
-    def shorten(carry: tuple) -> tuple:
-        t, _, _, halvings, _ = carry
-        t = 0.5 * t
-        point = jnp.where(slope < 0, x + t * step, jnp.clip(x - 2 * t * gradient_scale * gradient, *bounds))
+    def succeeds(decrease: Array) -> Array:
+        success = (decrease >= (1 - _SUFFICIENT) * energy) | (
+            (predicted > 0) & (gain_ratio_of(decrease) > _MIN_GAIN_RATIO)
+        )
+        return success | (below_rounding & (decrease >= 0))
+
+    def attempt(search: _Search) -> _Search:
+        is_full, t = search.attempts == 0, search.share
+        shortened = jnp.where(slope < 0, x + t * step, jnp.clip(x - 2 * t * gradient_scale * gradient, *bounds))
+        point = jnp.where(is_full, trial, shortened)
         residuals = residuals_at(point)
-        sufficient = energy_of(residuals) <= energy + _ARMIJO * jnp.sum(gradient * (point - x))
-        return t, point, residuals, halvings + 1, sufficient
+        reached = energy_of(residuals)
+        decrease = jnp.where(is_full, energy - reached, search.decrease)
+        sufficient = reached <= energy + _ARMIJO * jnp.sum(gradient * (point - x))
+        ends = jnp.where(is_full, succeeds(decrease) | below_rounding | ~is_active, sufficient)
+        return _Search(0.5 * t, point, residuals, decrease, ends, search.attempts + 1)
 
-    fails = ~success & ~below_rounding & is_active
-    start = jnp.ones((), x.dtype), trial, trial_residuals, jnp.zeros((), jnp.int32), ~fails
-    _, point, residuals, _, sufficient = jax.lax.while_loop(
-        lambda carry: ~carry[4] & (carry[3] < _MAX_HALVINGS), shorten, start
-    )
-    accepted = success | (fails & sufficient)
+    # The full step is the first round of the loop, so that the residuals are in the compiled program only once.
+    start = _Search(jnp.ones_like(slope), x, r, jnp.zeros_like(energy), jnp.zeros((), bool), jnp.zeros((), jnp.int32))
+    last = jax.lax.while_loop(lambda search: ~search.ends & (search.attempts <= _MAX_HALVINGS), attempt, start)
+    success = succeeds(last.decrease)
+    accepted = success | (last.ends & ~below_rounding & is_active)
     pick = lambda new, old: jnp.where(accepted, new, old)
     is_stagnant = below_rounding & ~success
+    gain_ratio = jnp.clip(gain_ratio_of(last.decrease), 0.0, 1.0)
     return StepOutcome(
-        pick(point, x), pick(residuals, r), step, decrease, success, jnp.clip(gain_ratio, 0.0, 1.0), is_stagnant
+        pick(last.point, x), pick(last.residuals, r), step, last.decrease, success, gain_ratio, is_stagnant
     )
+
+
+class _Search(NamedTuple):
+    """The attempts of a line search so far."""
+
+    share: Float[Array, ""]
+    """Of the step, for the next attempt."""
+    point: Float[Array, " n"]
+    residuals: Float[Array, " rows"]
+    decrease: Float[Array, ""]
+    """Of the energy, by the full step."""
+    ends: Bool[Array, ""]
+    attempts: Int[Array, ""]
 
 
 def current_damping(last: Float[Array, ""], diagonal: Float[Array, " n"]) -> Float[Array, ""]:
