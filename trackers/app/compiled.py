@@ -13,12 +13,15 @@ SECONDS_TO_COMPILE = 0.1
 """Programs that compile faster are not kept. Of a tracker's hundreds, a dozen take longer, and they are nearly all of
 the time: with them `demo` takes 19 s in place of 55, with all of them as long."""
 
+_LEAST_SECONDS = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+"""JAX's name for this setting, which a user may have chosen."""
+
 MEGABYTES = 256
 """The programs that have not been asked for longest make room for others. A tracker has 1 to 3 megabytes."""
 
 
 def keep_compiled_programs() -> str:
-    """Let JAX find what earlier runs have compiled, and leave what this one compiles; not if JAX has a folder already.
+    """Let JAX find what earlier runs have compiled, and leave what this one compiles.
 
     `JAX_COMPILATION_CACHE_DIR` names another folder; `JAX_ENABLE_COMPILATION_CACHE=0` keeps nothing.
 
@@ -26,14 +29,17 @@ def keep_compiled_programs() -> str:
         Why nothing is kept, if the folder cannot be written; else an empty string.
     """
     settings = jax.config.values
-    if settings["jax_compilation_cache_dir"] or not settings["jax_enable_compilation_cache"]:
+    if not settings["jax_enable_compilation_cache"]:
         return ""
-    folder = platformdirs.user_cache_path("jaxfilters") / "compiled" / _instruction_set()
-    if not os.access(next(path for path in (folder, *folder.parents) if os.path.exists(path)), os.W_OK):
-        return f"{folder} cannot be written: what is compiled now is not kept"
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_TO_COMPILE)
-    jax.config.update("jax_compilation_cache_max_size", MEGABYTES * 1_000_000)
+    if not settings["jax_compilation_cache_dir"]:
+        folder = platformdirs.user_cache_path("jaxfilters") / "compiled" / _instruction_set()
+        if not os.access(next(path for path in (folder, *folder.parents) if os.path.exists(path)), os.W_OK):
+            return f"{folder} cannot be written: what is compiled now is not kept"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", MEGABYTES * 1_000_000)
+    # Above JAX's own border of a second half of a tracker's programs are compiled in every run.
+    if _LEAST_SECONDS not in os.environ:
+        jax.config.update(_LEAST_SECONDS.lower(), SECONDS_TO_COMPILE)
     return ""
 
 

@@ -58,9 +58,17 @@ def test_the_second_run_finds_what_the_first_has_compiled(tmp_path):
 
 @pytest.mark.system
 def test_a_folder_that_the_user_chose_is_left_alone(tmp_path):
-    assert run_with(tmp_path / "cache", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "mine"))[1] == str(tmp_path / "mine")
+    mine = str(tmp_path / "mine")
+    for hit in (False, True):
+        assert run_with(tmp_path / "cache", JAX_COMPILATION_CACHE_DIR=mine) == (hit, mine)
     assert run_with(tmp_path / "cache", JAX_ENABLE_COMPILATION_CACHE="0") == (False, "None")
     assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.system
+def test_the_user_may_choose_which_programs_are_kept(tmp_path):
+    for _ in range(2):
+        assert not run_with(tmp_path, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="100")[0]
 
 
 def test_a_folder_that_cannot_be_written_is_said(no_folder, tmp_path, monkeypatch):
@@ -85,6 +93,7 @@ def test_machines_that_cannot_run_each_others_programs_have_folders_of_their_own
 def test_the_command_keeps_programs_but_where_speed_is_measured(arguments, kept, monkeypatch, capsys):
     monkeypatch.setattr(cli, "keep_compiled_programs", lambda: "no room")
     monkeypatch.setattr(cli, "keep_freed_memory", lambda: None)
+    monkeypatch.setattr(cli, "collect_rarely", lambda: None)
     monkeypatch.setattr(cli, "main", lambda: 7)
     monkeypatch.setattr(sys, "argv", ["jaxfilters", *arguments])
     assert cli.command() == 7
