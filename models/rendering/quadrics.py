@@ -6,10 +6,12 @@ B is linear and B^2 - A C quadratic in the pixel, so a pixel costs one square ro
 expanded about an anchor pixel within the part, because differences of large coordinates would cost float32 its digits.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
@@ -21,19 +23,22 @@ from jaxfilters.models.rendering.rays import Vector, components, cross, dot, min
 def capsule_parts(camera: Pinhole, capsules: Capsules) -> Parts:
     """Capsules in the camera frame, prepared for `CAPSULE`."""
     start, end, radius = components(capsules.start), components(capsules.end), capsules.radius
-    box = jax.lax.stop_gradient(_hull(_sphere_box(camera, start, radius), _sphere_box(camera, end, radius)))
+    ends = Vector(*(jnp.stack(pair, axis=-1) for pair in zip(start, end, strict=True)))
+    boxes = jax.vmap(_sphere_box, in_axes=(None, -1, None), out_axes=-2)(camera, ends, radius)
+    box = jax.lax.stop_gradient(_hull(boxes[..., 0, :], boxes[..., 1, :]))
     anchor = anchor_of(camera, box)
-    basis = pixel_basis(camera, anchor)
+    basis = _based(pixel_basis(camera, anchor))
     axis, length = _direction(minus(end, start))
+    caps = jax.vmap(_sphere, in_axes=(None, -1, None), out_axes=-2)(basis, ends, radius)
+    begins = dot(axis, start)[..., None]
     columns = [
-        *_cylinder(basis, start, axis, radius),
-        *_sphere(basis, start, radius),
-        *_sphere(basis, end, radius),
-        *_linear(axis, basis),
-        dot(axis, start),
-        dot(axis, start) + length,
+        _cylinder(basis, start, axis, radius),
+        caps.reshape(*radius.shape, 18),
+        _linear(axis, basis),
+        begins,
+        begins + length[..., None],
     ]
-    return Parts(jnp.stack(columns, axis=-1), anchor, box)
+    return Parts(jnp.concatenate(columns, axis=-1), anchor, box)
 
 
 def ellipsoid_parts(camera: Pinhole, ellipsoids: Ellipsoids) -> Parts:
@@ -48,8 +53,8 @@ def ellipsoid_parts(camera: Pinhole, ellipsoids: Ellipsoids) -> Parts:
     def scaled(vector):
         return Vector(*(dot(vector, components(axes[:, :, i])) / ellipsoids.radii[:, i] for i in range(3)))
 
-    basis = [scaled(direction) for direction in pixel_basis(camera, anchor)]
-    return Parts(jnp.stack(_sphere(basis, scaled(center), 1.0), axis=-1), anchor, box)
+    basis = _based([scaled(direction) for direction in pixel_basis(camera, anchor)])
+    return Parts(_sphere(basis, scaled(center), jnp.ones_like(center.x)), anchor, box)
 
 
 def _box(camera, center, square, cross_z):
@@ -103,43 +108,66 @@ def _direction(vector):
     return scale(vector, inverse), jnp.where(proper, length, 0.0)
 
 
+class _Basis(NamedTuple):
+    """Directions of a pixel's ray and of its derivatives in u and v, on a last axis.
+
+    All coefficients of a form are then one array: computed one by one they were most of the program to compile.
+    """
+
+    each: Vector
+    """The three of them (*parts, 3)."""
+    first: Vector
+    """Of each of the six pairs (*parts, 6)."""
+    second: Vector
+
+
+_FIRST, _SECOND = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+_TIMES = np.array([1, 2, 2, 1, 2, 1])
+"""How often each pair is in the square of the ray; a pair of different directions counts in either order."""
+
+
+def _based(basis: Sequence[Vector]) -> _Basis:
+    def stacked(indices: Sequence[int]) -> Vector:
+        return Vector(*(jnp.stack(part, axis=-1) for part in zip(*(basis[i] for i in indices), strict=True)))
+
+    return _Basis(stacked(range(3)), stacked(_FIRST), stacked(_SECOND))
+
+
+def _each(vector: Vector) -> Vector:
+    """The vector of each part beside the directions of its basis."""
+    return Vector(*(component[..., None] for component in vector))
+
+
 def _linear(vector, basis):
-    return [dot(vector, direction) for direction in basis]
+    return dot(_each(vector), basis.each)
 
 
 def _quadratic(form: Callable, basis):
-    ray, along_x, along_y = basis
-    return [
-        form(ray, ray),
-        2 * form(ray, along_x),
-        2 * form(ray, along_y),
-        form(along_x, along_x),
-        2 * form(along_x, along_y),
-        form(along_y, along_y),
-    ]
+    return _TIMES.astype(basis.first.x.dtype) * form(basis.first, basis.second)
 
 
 def _root(gap, line, discriminant):
     """Coefficients of -B / C and (B^2 - A C) / C^2; a camera inside (gap C <= 0) sees nothing."""
     outside = gap > 0
-    inverse = jnp.where(outside, 1 / jnp.where(outside, gap, 1.0), 0.0)
-    return [value * inverse for value in line] + [value * inverse**2 for value in discriminant]
+    inverse = jnp.where(outside, 1 / jnp.where(outside, gap, 1.0), 0.0)[..., None]
+    return jnp.concatenate([line * inverse, discriminant * inverse**2], axis=-1)
 
 
 def _sphere(basis, center, radius):
     # r^2 d.d - |c x d|^2 is (d.c)^2 - d.d (c.c - r^2) without its cancellation.
     def form(a, b):
-        return radius**2 * dot(a, b) - dot(cross(center, a), cross(center, b))
+        return radius[..., None] ** 2 * dot(a, b) - dot(cross(_each(center), a), cross(_each(center), b))
 
     return _root(dot(center, center) - radius**2, _linear(center, basis), _quadratic(form, basis))
 
 
 def _cylinder(basis, point, axis, radius):
     across = minus(point, scale(axis, dot(axis, point)))
-    moment = cross(point, axis)
+    moment = _each(cross(point, axis))
 
     def form(a, b):
-        return radius**2 * dot(cross(axis, a), cross(axis, b)) - dot(moment, a) * dot(moment, b)
+        turned = dot(cross(_each(axis), a), cross(_each(axis), b))
+        return radius[..., None] ** 2 * turned - dot(moment, a) * dot(moment, b)
 
     return _root(dot(across, across) - radius**2, _linear(across, basis), _quadratic(form, basis))
 
