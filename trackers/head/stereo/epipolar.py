@@ -95,7 +95,8 @@ def _refined(image: np.ndarray, templates: Array, start: np.ndarray) -> tuple[np
         before, after = s[:, [1, 3]], s[:, [2, 4]]
         curvature = np.minimum(before - 2 * s[:, :1] + after, -1e-6)
         uv += step * np.clip(0.5 * (before - after) / curvature, -1, 1)
-    return uv, _scores(image, templates, uv[:, None])[:, 0]
+    # As many places as before, of which one counts: the same program.
+    return uv, _scores(image, templates, np.repeat(uv[:, None], len(offsets), axis=1))[:, 0]
 
 
 def _scores(image: np.ndarray, templates: Array, places: np.ndarray) -> np.ndarray:
