@@ -80,11 +80,18 @@ class Fit(NamedTuple):
     surplus: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel that a person explains which the nearest senior could not explain alone, in
     the best place for that; `inf` without a senior near by."""
+    shares_in_view: Float[Array, "slots cameras"]
+    """Of the silhouette, how much lies in each image and before furniture, whoever else may be there."""
 
     @property
     def share_seen(self) -> Float[Array, " slots"]:
         """Of the silhouette, how much the camera shows that shows most."""
         return jnp.max(self.shares_seen, axis=-1)
+
+    @property
+    def share_in_view(self) -> Float[Array, " slots"]:
+        """Of the silhouette, how much could be seen were nobody else there, in the camera that shows most."""
+        return jnp.max(self.shares_in_view, axis=-1)
 
 
 def fit_people(
@@ -191,6 +198,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
             shares_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
             _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
+            shares_seen(scene, places[k], mine, jnp.ones_like(unexplained)),
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
@@ -206,6 +214,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         jnp.zeros((n, cameras)),
         jnp.zeros(n),
         jnp.full(n, jnp.inf),
+        jnp.zeros((n, cameras)),
     )
     order = jnp.argsort(~active)
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)

@@ -57,9 +57,9 @@ HIDDEN_SHARE = 0.1
 HIDDEN_COST = 0.5
 """Log odds per second lost by a person of whom nothing is visible: people can be hidden, but not for ever."""
 LEAST_SURPLUS = 0.5
-"""Mean log likelihood ratio a pixel that two people explain beyond what one of them explains alone."""
+"""Mean log likelihood ratio a pixel in view that two people explain beyond what one of them explains alone."""
 SUPERFLUOUS_COST = 2.0
-"""Log odds per second lost by a person who explains less than that."""
+"""Log odds per second lost by a person who is all in view and explains less than that."""
 AWAY_SD = 2.0
 """Standard deviations beyond the border of the floor from which on a person has left it."""
 LOST_SD_M = 1.2
@@ -231,9 +231,12 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
-    # A person whom one other person explains as well is hidden behind that person, or nobody.
-    superfluous = fit.surplus < LEAST_SURPLUS
-    cost = jnp.where(people.mode == TRACKED, SUPERFLUOUS_COST * dt, LEAST_SURPLUS - fit.surplus)
+    # A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
+    # not speak for nobody: of a person who is tracked, less is expected, and less follows.
+    tracked, in_view = people.mode == TRACKED, fit.share_in_view
+    superfluous = fit.surplus < LEAST_SURPLUS * jnp.where(tracked, in_view, 1.0)
+    a_second = HIDDEN_COST + (SUPERFLUOUS_COST - HIDDEN_COST) * in_view
+    cost = jnp.where(tracked, a_second * dt, LEAST_SURPLUS - fit.surplus)
     change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
     log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
     unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)

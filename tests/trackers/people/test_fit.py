@@ -37,7 +37,8 @@ def parabolas(seed, n):
     quadratic = Quadratic(none[:, None], jnp.asarray(gradient)[:, None], jnp.asarray(curvature)[:, None])
     steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
     place, axes, shift = jnp.asarray(place), jnp.asarray(axes), jnp.zeros((n, 1, 2))
-    return Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, none[:, None], none, none), mean, precision
+    share = none[:, None]
+    return Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, share, none, none, share), mean, precision
 
 
 @pytest.mark.usefixtures("x64")
@@ -117,6 +118,7 @@ def test_everybody_is_found_where_drawn_though_two_overlap(found):
     assert fit.score[:3].min() > 0.5
     assert fit.flatness[:3].min() > 0
     assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
+    assert fit.share_in_view[:3].min() > 0.9
 
 
 def test_slots_mean_nothing_to_the_search(found):

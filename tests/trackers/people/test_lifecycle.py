@@ -33,7 +33,7 @@ def people_of(*modes, **fields):
     return people._replace(**{key: jnp.asarray(value) for key, value in fields.items()})
 
 
-def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
+def fit_of(score=1.0, share_seen=1.0, surplus=np.inf, share_in_view=1.0):
     full = lambda value: jnp.broadcast_to(jnp.asarray(value, float), (SLOTS,))
     blank = Quadratic(full(0)[:, None], jnp.zeros((SLOTS, 1, 4)), jnp.zeros((SLOTS, 1, 4, 4)))
     axes = jnp.zeros((SLOTS, 4, 4))
@@ -48,6 +48,7 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf):
         full(share_seen)[:, None],
         full(0),
         full(surplus),
+        full(share_in_view)[:, None],
     )
 
 
@@ -84,21 +85,25 @@ def test_somebody_hidden_is_believed_in_for_a_while_then_remembered_then_forgott
 
 
 @pytest.mark.system
-def test_whoever_shows_a_little_over_a_wall_is_followed_for_as_long_as_it_shows(camera, draw, floor):
+@pytest.mark.parametrize("neighbour", [False, True], ids=["alone", "beside somebody"])
+def test_whoever_shows_a_little_over_a_wall_is_followed_for_as_long_as_it_shows(camera, draw, floor, neighbour):
     """A sixth of the pixels of a silhouette shows, for twice as long as hidden people are believed to be there."""
-    mask, _ = draw(camera, ((0.0, 1.0, 1.7, 0.45),))
+    places = [(0.0, 1.0, 1.7, 0.45), (0.8, 1.0, 1.7, 0.45)][: 1 + neighbour]
+    mask, _ = draw(camera, places)
     shown = np.cumsum((mask > 0).sum(axis=1)) / (mask > 0).sum()
     over = np.arange(len(mask)) < np.searchsorted(shown, 1 / 6)
     wall = np.where(over, np.inf, 0.5)[:, None] * np.ones(mask.shape[1])
     scene = people_scene([camera], floor, furniture=[wall], config=CONFIG)
-    people = people_of(TRACKED, log_odds=[8.0, 0, 0, 0], identity=[7, -1, -1, -1])
-    mean = people.belief.mean.at[0, 1].set(1.0).at[0, 5].set(0.45)
+    modes = [TRACKED] * len(places)
+    people = people_of(*modes, log_odds=[8.0, 8.0, 0, 0], identity=[7, 3, -1, -1], next_identity=8)
+    of_places = jnp.ix_(jnp.arange(len(places)), jnp.array([0, 1, 4, 5]))
+    mean = people.belief.mean.at[of_places].set(jnp.array(places))
     people = people._replace(belief=Gaussian(mean, people.belief.covariance))
     shows = np.where(over[:, None], mask, 0).astype(np.uint8)
     frame = CameraFrame(shows, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True))
     for _ in range(60):
         people, report = step(scene, people, (frame,), np.float32(0.1))
-    assert report.mode.tolist() == [TRACKED, FREE, FREE, FREE]
+    assert report.mode.tolist() == [*modes, *[FREE] * (SLOTS - len(modes))]
     assert report.identity[0] == 7
     assert np.linalg.norm(report.xy[0] - np.array([0.0, 1.0])) < 0.5
 
@@ -116,6 +121,20 @@ def test_whom_another_explains_as_well_is_given_up(scene):
     fit = fit_of(1.0, surplus=[np.inf, 0.2, 0.2, np.inf])
     after = evaluated(scene, people, fit)
     np.testing.assert_allclose(after.log_odds[:3], [8.0, 7.8, 0.7], rtol=1e-5)
+
+
+def test_what_furniture_hides_does_not_speak_for_nobody(scene):
+    """Of a fifth of a silhouette: a fifth of the least surplus, and of the cost beyond that of hiding."""
+    people = people_of(TRACKED, TRACKED, TENTATIVE, log_odds=[8.0, 7.0, 1.0, 0])
+
+    def after(surplus, share_in_view):
+        fit = fit_of(0.1, surplus=[np.inf, surplus, surplus, np.inf], share_in_view=share_in_view)
+        return evaluated(scene, people, fit).log_odds[1:3].tolist()
+
+    # Who is tentative must show all the same.
+    np.testing.assert_allclose(after(0.02, 0.2), [7.0 - 0.1 * (0.5 + 0.2 * 1.5), 1.0 - 0.48], atol=1e-5)
+    np.testing.assert_allclose(after(0.12, 0.2), [7.1, 1.0 - 0.38], atol=1e-5)
+    np.testing.assert_allclose(after(0.12, 1.0), [7.0 - 0.1 * 2.0, 1.0 - 0.38], atol=1e-5)
 
 
 def test_nobody_is_followed_off_the_floor_or_without_a_place(scene):
