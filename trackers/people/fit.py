@@ -90,7 +90,7 @@ class Fit(NamedTuple):
 
     @property
     def share_in_view(self) -> Float[Array, " slots"]:
-        """Of the silhouette, how much could be seen were nobody else there, in the camera that shows most."""
+        """Of the silhouette, how much would be visible were nobody else there, in the camera that shows most."""
         return jnp.max(self.shares_in_view, axis=-1)
 
 
