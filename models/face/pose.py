@@ -1,39 +1,26 @@
 """Head poses: millimetres and radians, `(x, y, z, roll, yaw, pitch)`.
 
 The model frame has x to the image's right, y down, z away from the camera; a face that looks into the first camera has
-no rotation. Positive yaw turns the nose towards the image's left. Products are sums over leading axes, so that a `vmap`
-that keeps an ensemble on the last axis runs them as vector arithmetic over it.
+no rotation. Positive yaw turns the nose towards the image's left. Everything is algebra on components, so that
+`vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble.
 """
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-
-_AXES = np.eye(3)[[2, 1, 0]]
-"""About which a head rolls, yaws and pitches."""
-_TURNS = (
-    np.einsum("ai,aj->aij", _AXES, _AXES),
-    np.eye(3) - np.einsum("ai,aj->aij", _AXES, _AXES),
-    np.cross(_AXES[:, None], np.eye(3)).swapaxes(1, 2),
-)
-"""The rotation about each of them is the first, plus the second times the cosine of the angle, plus the third times its
-sine (Rodrigues)."""
 
 
 @jax.jit  # traced once for each shape, though called at many places of a program
 def rotation(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Rotation matrix `Rz(roll) Ry(yaw) Rx(pitch)` of (roll, yaw, pitch) in radians."""
-    fixed, even, odd = (jnp.asarray(part, angles.dtype) for part in _TURNS)
-    # Sums over constant matrices: of stacked components, each has its own sines in the compiled program.
-    cos, sin = (f(angles)[:, None, None] for f in (jnp.cos, jnp.sin))
-    about_z, about_y, about_x = fixed + even * cos + odd * sin
-    return _times(_times(about_z, about_y), about_x)
-
-
-def _times(A: Float[Array, "3 3"], B: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The product in full precision, for ensembles as well."""
-    return jnp.sum(A[:, :, None] * B[None], axis=1)
+    (ca, cb, cc), (sa, sb, sc) = jnp.cos(angles), jnp.sin(angles)
+    return jnp.stack(
+        [
+            jnp.stack([ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc]),
+            jnp.stack([sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc]),
+            jnp.stack([-sb, cb * sc, cb * cc]),
+        ]
+    )
 
 
 def angles(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -65,8 +52,9 @@ def turning_axes(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
 @jax.jit  # traced once for each shape, though called at many places of a program
 def turn(shape: Float[Array, "K 3"], R: Float[Array, "3 3"]) -> Float[Array, "K 3"]:
     """`R X` of each point."""
+    x, y, z = shape[:, 0], shape[:, 1], shape[:, 2]
     # Not a matrix product: accelerators would round its float32 inputs to ten bits.
-    return jnp.sum(R * shape[:, None, :], axis=-1)
+    return jnp.stack([R[i, 0] * x + R[i, 1] * y + R[i, 2] * z for i in range(3)], axis=-1)
 
 
 def place(shape: Float[Array, "K 3"], pose: Float[Array, "6"]) -> Float[Array, "K 3"]:

@@ -101,10 +101,11 @@ def jacobian(
     R = head.rotation(pose[3:])
     turned = head.turn(shape, R)
     observed, in_front = _in_cameras(rig, turned + pose[:3])
-    inverse = 1 / observed[..., 2, None, None]
-    across, along = jnp.eye(2, 3, dtype=R.dtype), jnp.array([0.0, 0.0, 1.0], R.dtype)
-    by_camera = (across - observed[..., :2, None] * inverse * along) * inverse * rig.focal[:, None, :, None]
-    by_camera = jnp.where(in_front[..., None, None], by_camera, jnp.nan)
+    x, y, inverse = observed[..., 0], observed[..., 1], 1 / observed[..., 2]
+    zero = jnp.zeros_like(x)
+    u = jnp.stack([inverse, zero, -x * inverse**2], axis=-1) * rig.focal[:, None, :1]
+    v = jnp.stack([zero, inverse, -y * inverse**2], axis=-1) * rig.focal[:, None, 1:]
+    by_camera = jnp.where(in_front[..., None, None], jnp.stack([u, v], axis=-2), jnp.nan)
     by_world = _times(by_camera, rig.rotation[:, None])
     by_angles = jnp.swapaxes(jnp.cross(head.turning_axes(pose[3:]), turned[:, None]), -1, -2)
     return _times(by_world, R), jnp.concatenate([by_world, _times(by_world, by_angles)], axis=-1)
@@ -133,9 +134,11 @@ def triangulate(rig: CameraRig, uv: Float[Array, "C K 2"]) -> Float[Array, "K 3"
 @jax.jit  # traced once for each shape, though called at many places of a program
 def _in_cameras(rig, points):
     """Points in the camera frames (C, K, 3), before the lens where they are not in front, and whether they are."""
-    observed = jnp.sum(rig.rotation[:, None] * points[:, None, :], axis=-1) + rig.translation[:, None]
-    in_front = observed[..., 2] > NEAREST
-    return jnp.where(in_front[..., None], observed, 1.0), in_front
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    R, t = rig.rotation[..., None], rig.translation[..., None]
+    observed = R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z + t
+    in_front = observed[:, 2] > NEAREST
+    return jnp.moveaxis(jnp.where(in_front[:, None], observed, 1.0), 1, 2), in_front
 
 
 def _times(A, B):

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Num
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters._xla import last_axis
 from jaxfilters.filter import Filter
 from jaxfilters.math import diffusion
 from jaxfilters.math.diffusion import DiffusionFit
@@ -57,7 +56,7 @@ class FaceLikelihood:
         def project(x: Array) -> Array:
             return project_shape(self.rig, shape(self.model, x[POSE:]), x[:POSE])[0]
 
-        uv = last_axis.vmap(project)(particles)
+        uv = jax.vmap(project, in_axes=-1, out_axes=-1)(particles)
         found = scores(images, self.templates, uv)
         total, size = jnp.sum(found, axis=(0, 1)), found.shape[0] * found.shape[1]
         return log_weights(total, particles[POSE:], self.model.deviation, num_scores=size, sigma=self.sigma)
