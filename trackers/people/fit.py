@@ -113,7 +113,8 @@ def fit_people(
         frames: One a camera.
     """
     start = jax.vmap(observed_place, in_axes=(None, 0))(scene, predicted.mean)
-    longest = longest_stride(predicted.mean)
+    # A stride displaces a silhouette as a shift does: where images may be shifted, legs are taken to be together.
+    longest = jnp.zeros_like(start[:, :2]) if has_shifts(scene) else longest_stride(predicted.mean)
     covariance = _observed_covariance(scene, predicted)
     prior = jnp.linalg.inv(covariance + 1e-6 * jnp.eye(4))
     axes = jax.vmap(_axes, in_axes=(None, 0))(scene, start)

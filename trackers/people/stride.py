@@ -3,8 +3,8 @@
 A person who walks across the line of sight shows a gap between the legs for most of the time, and is displaced by
 decimetres where one shape stands for all moments of a stride. How far a stride has got is a nuisance of each image,
 over which the likelihood is maximised together with the place (a profile likelihood). Where another person is in the
-window as well, a free stride would also explain that person, and people who meet change places: there legs are taken to
-be together, as the gap between the legs of one is filled by the other.
+window as well, a free stride would also explain that person, and people who meet change places: there it is half.
+Where calibrations may disagree, images are shifted, and a stride displaces a silhouette as a shift does: it is 0 there.
 """
 
 import jax
@@ -44,7 +44,7 @@ def with_best_stride(
     contrasts: Float[Array, "cameras samples"],
     alone: Bool[Array, ""],
 ) -> Float[Array, " 6"]:
-    """A silhouette with the stride under which the images are most likely, or with legs together beside others.
+    """A silhouette with the stride under which the images are most likely, or half the largest beside others.
 
     Args:
         scene: Cameras and constants.
@@ -57,4 +57,4 @@ def with_best_stride(
     strides = jnp.array(STRIDES)[:, None] * longest
     candidates = jnp.broadcast_to(shape, (len(STRIDES), *shape.shape)).at[:, STRIDE].set(strides)
     scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, views, contrasts)
-    return jnp.where(alone, candidates[jnp.argmax(scores)], shape.at[STRIDE].set(0.0))
+    return jnp.where(alone, candidates[jnp.argmax(scores)], shape.at[STRIDE].set(longest / 2))

@@ -45,8 +45,8 @@ def test_legs_are_together_by_default():
     np.testing.assert_array_equal(with_stride(jnp.arange(8.0).reshape(2, 4)), [[0, 1, 2, 3, 0, 0], [4, 5, 6, 7, 0, 0]])
 
 
-@pytest.mark.parametrize(("alone", "share"), [(True, 1.0), (False, 0.0)])
-def test_beside_others_legs_are_together_whatever_the_image_shows(alone, share, monkeypatch):
+@pytest.mark.parametrize(("alone", "share"), [(True, 1.0), (False, 0.5)])
+def test_beside_others_legs_are_half_a_stride_apart_whatever_the_image_shows(alone, share, monkeypatch):
     monkeypatch.setattr(stride, "log_likelihood", lambda scene, shape, views, contrasts: shape[4])
     shape, longest = jnp.array([1.0, 2.0, 1.7, 0.45, 0.1, 0.0]), jnp.array([0.4, 0.0])
     scene = people_scene([floor_camera(PINHOLE, T_CAMERA_WORLD)], FLOOR)
@@ -55,24 +55,38 @@ def test_beside_others_legs_are_together_whatever_the_image_shows(alone, share, 
     np.testing.assert_allclose(chosen, [1.0, 2.0, 1.7, 0.45, share * 0.4, 0.0], rtol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def found():
-    """The search in silhouettes of somebody who walks to the right, with legs by a share of a full stride apart."""
-    camera = floor_camera(PINHOLE, T_CAMERA_WORLD)
-    scene = people_scene([camera], FLOOR, config=PeopleConfig(capacity=1, spread_px=0.0))
+def search_of(num_cameras, **config):
+    """The search in silhouettes of somebody who walks to the right, with legs by a share of a full stride apart.
+
+    All cameras are at the same place.
+    """
+    cameras = [floor_camera(PINHOLE, T_CAMERA_WORLD)] * num_cameras
+    scene = people_scene(cameras, FLOOR, config=PeopleConfig(capacity=1, spread_px=0.0, **config))
     mean = jnp.array([[*AT, 1.2, 0.0, HEIGHT_M, 0.47, 0.0, 0.0, 0.0]])
     sd = jnp.array([0.3, 0.3, 0.3, 0.3, 0.02, 0.05, 0.1, 0.1, 0.1])
-    search = jax.jit(lambda frame: fit_people(scene, Gaussian(mean, jnp.diag(sd**2)[None]), *nothing, (frame,)))
-    nothing = jnp.zeros((1, 1, 2)), jnp.ones(1, bool), jnp.zeros(1)
+    nothing = jnp.zeros((1, num_cameras, 2)), jnp.ones(1, bool), jnp.zeros(1)
+    search = jax.jit(lambda frames: fit_people(scene, Gaussian(mean, jnp.diag(sd**2)[None]), *nothing, frames))
     render = jax.jit(lambda walker: render_ellipsoids(PINHOLE, body(walker), T_CAMERA_WORLD))
 
     def run(share):
         phase = jnp.asarray(np.arcsin(share))
         walker = Walker(jnp.array(AT), jnp.zeros(()), phase, jnp.ones(()), jnp.array(HEIGHT_M), jnp.array(0.47))
         mask = np.isfinite(np.asarray(render(walker))).astype(np.uint8) * np.uint8(255)
-        return search(CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True)))
+        return search((CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True)),) * num_cameras)
 
     return run
+
+
+@pytest.fixture(scope="module")
+def found():
+    return search_of(1)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("error", "share"), [(0.0, 1.0), (0.005, 0.0)])
+def test_where_a_second_image_may_be_shifted_legs_are_together(error, share):
+    fit = search_of(2, calibration_error=error)(1.0)
+    np.testing.assert_allclose(fit.stride[0, 0], share * FULL_STRIDE * HEIGHT_M, rtol=1e-5)
 
 
 @pytest.mark.system
