@@ -182,7 +182,7 @@ def simulate_paper(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES)
     Raises:
         ValueError: if `shape` is not one of `SHAPES`, or `num_frames` < 1.
     """
-    return _simulate(key, paper_states(shape, num_frames), FULL, TABLE_2, INITIAL_SHAPE)
+    return _simulate(key, paper_states(shape, num_frames), FULL, _wrong_lengths)
 
 
 def simulate_drawn(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES) -> ArticulatedSequence:
@@ -191,10 +191,7 @@ def simulate_drawn(key: AnyKey, shape: int = 1, *, num_frames: int = NUM_FRAMES)
     Raises:
         ValueError: as `simulate_paper`.
     """
-    record_key, belief_key = jax.random.split(key)
-    states, hand = paper_states(shape, num_frames), paper_hand()
-    measured, masks = record(record_key, states, hand)
-    return ArticulatedSequence(states, measured, masks, hand.observation_std(), *drawn_belief(belief_key, states[0]))
+    return _simulate(key, paper_states(shape, num_frames), FULL, drawn_belief)
 
 
 def simulate_held(key: AnyKey, shape: int = 1, *, num_frames: int = 500, frame: int = 0) -> ArticulatedSequence:
@@ -203,7 +200,7 @@ def simulate_held(key: AnyKey, shape: int = 1, *, num_frames: int = 500, frame: 
     Raises:
         ValueError: as `held_states`.
     """
-    return _simulate(key, held_states(shape, num_frames, frame), FULL, TABLE_2, INITIAL_SHAPE)
+    return _simulate(key, held_states(shape, num_frames, frame), FULL, _wrong_lengths)
 
 
 def simulate_critical(key: AnyKey, *, num_frames: int = 2 * CRITICAL_FRAME + 1) -> ArticulatedSequence:
@@ -212,7 +209,7 @@ def simulate_critical(key: AnyKey, *, num_frames: int = 2 * CRITICAL_FRAME + 1) 
     Raises:
         ValueError: if `num_frames` < 1.
     """
-    return _simulate(key, critical_states(num_frames), PAPER_EXPERIMENT, NEARLY_RIGHT, None)
+    return _simulate(key, critical_states(num_frames), PAPER_EXPERIMENT, partial(initial_belief, errors=NEARLY_RIGHT))
 
 
 class OneLink(NamedTuple):
@@ -258,12 +255,15 @@ def one_link_length(x: Float[Array, " 2"]) -> Float[Array, " 1"]:
     return (x[0] * jnp.cos(x[1]))[None]
 
 
-def _simulate(key, states, features, errors, shape):
+def _simulate(key, states, features, believed):
+    """A recording of these states, begun at what is `believed` of the first of them."""
     record_key, belief_key = jax.random.split(key)
     hand = paper_hand(features)
     measured, masks = record(record_key, states, hand)
-    mean, covariance = initial_belief(belief_key, states[0], errors=errors, shape=shape)
-    return ArticulatedSequence(states, measured, masks, hand.observation_std(), mean, covariance)
+    return ArticulatedSequence(states, measured, masks, hand.observation_std(), *believed(belief_key, states[0]))
+
+
+_wrong_lengths = partial(initial_belief, shape=INITIAL_SHAPE)
 
 
 def _initial_covariance(q, errors):

@@ -96,7 +96,7 @@ def test_lengths_are_as_sure_as_they_are_right_where_starts_are_drawn_from_the_b
     errors = (means - np.asarray(sequences.states))[:, -1, LENGTHS]
     deviations = np.sqrt(np.diagonal(covariances[:, -1, LENGTHS, LENGTHS], axis1=1, axis2=2))
     # 180 lengths, alike within a run: .955 with a deviation of .04 if consistent. With errors of linearisation that
-    # are taken for fresh noise in every frame, a fifth of them are outside.
+    # are taken for fresh noise in every frame, 16 % of these are outside.
     assert np.mean(np.abs(errors) <= 2 * deviations) > 0.9
 
 
