@@ -29,6 +29,8 @@ LEAST_PIXELS = 12.0
 """Effective samples below which a half says nothing."""
 CLOSE_M = 0.8
 """People nearer than this on the floor may be mistaken for each other."""
+HIDING_M = 0.4
+"""People nearer than this on the floor are not looked at: who is behind shows little but the edges of who is before."""
 DECIDED = 0.5
 """Summed difference of dissimilarities that settles who is who."""
 LONGEST_S = 4.0
@@ -121,14 +123,15 @@ def identity_switch_correction(
     meetings = people.meetings
     xy, followed = people.belief.mean[:, :2], people.mode == TRACKED
     others = ~jnp.eye(len(xy), dtype=bool) & followed[:, None] & followed
-    close = (jnp.sum((xy[:, None] - xy) ** 2, axis=-1) < CLOSE_M**2) & others
-    clear = good[:, None] & good & ~close & others
+    squared = jnp.sum((xy[:, None] - xy) ** 2, axis=-1)
+    close, hiding = (squared < CLOSE_M**2) & others, (squared < HIDING_M**2) & others
+    clear = good[:, None] & good & ~hiding & others
     unlike = dissimilarity(people.appearance[:, None], histograms[None])
     own = jnp.diagonal(unlike)
     gain = own[:, None] + own - unlike - unlike.T
     is_open = (meetings.is_open | close) & others
-    evidence = jnp.where(close | ~is_open, 0.0, meetings.evidence + jnp.where(clear, gain, 0.0))
-    clear_s = jnp.where(close | ~is_open, 0.0, meetings.clear_s + clear * dt)
+    evidence = jnp.where(hiding | ~is_open, 0.0, meetings.evidence + jnp.where(clear, gain, 0.0))
+    clear_s = jnp.where(hiding | ~is_open, 0.0, meetings.clear_s + clear * dt)
     people, exchanged = _exchanged(people, jnp.where(is_open, evidence, 0.0))
     settled = (jnp.abs(evidence) > DECIDED) | (clear_s > LONGEST_S) | exchanged[:, None] | exchanged
     return people._replace(meetings=Meetings(is_open & ~settled, evidence * ~settled, clear_s * ~settled))

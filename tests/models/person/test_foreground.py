@@ -136,7 +136,7 @@ def test_lattice_points_are_all_combinations_with_the_unmoved_one_in_the_middle(
 @pytest.mark.system
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_quadratic_fit_is_numpys_least_squares(n):
+def test_value_and_curvature_of_quadratic_fit_are_numpys_least_squares(n):
     rng = np.random.default_rng(n)
     values, steps = rng.normal(size=3**n), rng.uniform(0.05, 0.3, n)
     x = np.asarray(lattice(n)) * steps
@@ -148,8 +148,40 @@ def test_quadratic_fit_is_numpys_least_squares(n):
         curvature[i, j] = curvature[j, i] = -coefficient * (2 if i == j else 1)
     fit = quadratic_fit(jnp.asarray(values), jnp.asarray(steps))
     np.testing.assert_allclose(fit.value, solution[0], rtol=1e-9)
-    np.testing.assert_allclose(fit.gradient, solution[1 : 1 + n], rtol=1e-9)
     np.testing.assert_allclose(fit.curvature, curvature, rtol=1e-8)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_slope_of_quadratic_fit_is_the_mean_of_the_gradient_over_a_gaussian(n):
+    """Of random polynomials up to the fourth power of each coordinate, by NumPy's rule with seven nodes."""
+    rng = np.random.default_rng(n)
+    coefficients, steps = rng.normal(size=[5] * n), rng.uniform(0.5, 1.5, n)
+
+    def at(points, coefficients):
+        values = np.broadcast_to(coefficients[..., None], (*coefficients.shape, len(points)))
+        for column in points.T:
+            values = sum(power * column**k for k, power in enumerate(values))
+        return values
+
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+    points = np.array(list(itertools.product(nodes, repeat=n))) * steps / np.sqrt(3)
+    mass = np.prod(np.array(list(itertools.product(weights / weights.sum(), repeat=n))), axis=1)
+    expected = [mass @ at(points, np.polynomial.polynomial.polyder(coefficients, axis=i)) for i in range(n)]
+    fit = quadratic_fit(jnp.asarray(at(np.asarray(lattice(n)) * steps, coefficients)), jnp.asarray(steps))
+    np.testing.assert_allclose(fit.gradient, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_reading_of_a_skew_score_is_half_as_far_towards_its_tail_as_that_of_least_squares():
+    """Depth and width as in silhouettes: narrow bodies are found as well farther away, wide ones not as well nearer."""
+    steps = np.array([0.09, 0.04])
+    depth, width = (np.asarray(lattice(2)) * steps).T
+    scores = 1000 * depth * width**2 - 30 * depth**2 - 300 * width**2
+    fit = quadratic_fit(jnp.asarray(scores), jnp.asarray(steps))
+    columns = np.column_stack([np.ones(9), depth, width, depth**2, depth * width, width**2])
+    _, slope, _, bend, _, _ = np.linalg.lstsq(columns, scores, rcond=None)[0]
+    np.testing.assert_allclose(np.linalg.solve(fit.curvature, fit.gradient), [-slope / bend / 4, 0], atol=1e-9)
 
 
 def test_values_off_the_lattice_are_named():

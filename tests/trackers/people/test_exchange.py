@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.appearance import CLOSE_M, LONGEST_S, identity_switch_correction, is_meeting
+from jaxfilters.trackers.people.appearance import (
+    CLOSE_M,
+    HIDING_M,
+    LONGEST_S,
+    identity_switch_correction,
+    is_meeting,
+)
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, WIDTH, PeopleConfig, nobody
 
 DT = jnp.asarray(0.1)
@@ -31,7 +37,7 @@ def three(*, apart, first=RED, second=BLUE, mode=(TRACKED,) * 3):
 
 def met_and_parted(worn, *, frames=8, first=RED, second=BLUE, good=CLEARLY):
     """The state after a meeting, and after some frames apart in which everybody wears what is given."""
-    near, far = three(apart=0.5, first=first, second=second), three(apart=2.0, first=first, second=second)
+    near, far = three(apart=0.3, first=first, second=second), three(apart=2.0, first=first, second=second)
     people = settle(near, jnp.stack([first, second, GREY]), good, DT)
     assert is_meeting(people.meetings).tolist() == [True, True, False]
     people = far._replace(meetings=people.meetings)
@@ -75,8 +81,14 @@ def test_people_who_look_alike_are_left_alone_and_the_case_is_closed_in_time():
     assert not is_meeting(same.meetings).any()
 
 
-def test_nothing_is_decided_while_they_are_close_or_cannot_be_seen():
-    close = three(apart=0.9 * CLOSE_M)
+def test_people_who_stay_beside_each_other_are_told_apart():
+    """Nearer than what opens a meeting, but each of them in view."""
+    people = settle(three(apart=0.9 * CLOSE_M), jnp.stack([BLUE, RED, GREY]), CLEARLY, DT)
+    assert people.identity.tolist() == [11, 10, 12]
+
+
+def test_nothing_is_decided_while_they_hide_each_other_or_cannot_be_seen():
+    close = three(apart=0.9 * HIDING_M)
     for _ in range(10):
         close = settle(close, jnp.stack([BLUE, RED, GREY]), CLEARLY, DT)
     assert close.identity.tolist() == [10, 11, 12]
@@ -94,6 +106,6 @@ def test_people_who_never_met_are_not_exchanged():
 
 @pytest.mark.parametrize("slot", [0, 1])
 def test_a_meeting_ends_when_one_is_lost(slot):
-    people = settle(three(apart=0.5), jnp.stack([RED, BLUE, GREY]), CLEARLY, DT)
+    people = settle(three(apart=0.3), jnp.stack([RED, BLUE, GREY]), CLEARLY, DT)
     people = people._replace(mode=people.mode.at[slot].set(0))
     assert not is_meeting(settle(people, jnp.stack([RED, BLUE, GREY]), CLEARLY, DT).meetings).any()
