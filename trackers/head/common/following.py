@@ -21,6 +21,15 @@ SAME_PLACE, MOST_CONTRADICTIONS = 0.5, 3
 contradict the track before it is given up."""
 
 
+class Regarded(NamedTuple):
+    """What a detector says of a track."""
+
+    state: Any
+    """Of the tracker, perhaps another one."""
+    row: Any
+    """Of the track in this frame; None where it stays as it is."""
+
+
 class Beginning(NamedTuple):
     """A track that begins."""
 
@@ -41,6 +50,9 @@ class FaceTracker(Protocol):
     """Frames in one compiled call."""
     is_live: bool
     """Whether frames cannot wait."""
+
+    regard_every_s: float
+    """Seconds between two frames in which a track is compared with what a detector finds; infinite if it never is."""
 
     @property
     def can_wait(self) -> bool:
@@ -71,6 +83,10 @@ class FaceTracker(Protocol):
         """State and track after a chunk of frames."""
         ...
 
+    def regarded(self, state: Any, row: Any, images: np.ndarray) -> Regarded:
+        """State and row of the last frame, or better ones if a detector finds the face elsewhere in it."""
+        ...
+
     def empty(self, count: int) -> Any:
         """Rows of frames without a face."""
         ...
@@ -94,6 +110,8 @@ class Following:
         """A search for a face that goes on beside the tracking."""
         self._said: set[str] = set()
         self._looked, self._contradictions, self._is_refuted = -math.inf, 0, False
+        self._regarded = -math.inf
+        """When the track was last compared with a detection; `_looked` is when any face was looked for."""
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> Any:
         """Track of the next frames, a row each.
@@ -120,7 +138,7 @@ class Following:
                 rows.append(waited)
                 done += len(waited.pose)
                 continue
-            stop = min(done + self._tracker.chunk, len(times))
+            stop = self._end_of_chunk(times, done)
             rows.append(self._follow(images[done:stop], times[done:stop]))
             done = stop
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
@@ -141,16 +159,27 @@ class Following:
             "time": self._time,
             "looked": self._looked,
             "contradictions": self._contradictions,
+            "regarded": self._regarded,
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Go on from what `saved` gave."""
-        self.state, self.events, self._said = saved["state"], saved["events"], set(saved["said"])
+        self.state, self.events, self._said = saved["state"], list(saved["events"]), set(saved["said"])
         self._frames, self._time = saved["frames"], saved["time"]
         self._looked, self._contradictions = saved["looked"], saved["contradictions"]
+        self._regarded = saved["regarded"]
         self._is_lost = self._is_refuted = False
         self._wait = None
         self._tracker.restore(saved["tracker"], self.state)
+
+    def _end_of_chunk(self, times: np.ndarray, start: int) -> int:
+        """One past the last frame of a chunk: it ends with the first frame in which a detector is due."""
+        stop = min(start + self._tracker.chunk, len(times))
+        chunk = times[start:stop]
+        is_due = chunk - self._regarded >= self._tracker.regard_every_s
+        if not self._is_lost:
+            is_due |= chunk - self._looked >= LOOK_EVERY_S
+        return start + int(np.argmax(is_due)) + 1 if is_due.any() else stop
 
     def _follow(self, images: np.ndarray, times: np.ndarray) -> Any:
         """Rows of at most a chunk of frames; the last chunk is filled up, so that one program serves all."""
@@ -169,10 +198,22 @@ class Following:
                 self._say(i, "lost" if is_lost else "found again near where it was lost")
             self._is_lost = bool(is_lost)
         self._frames += len(times)
+        if times[-1] - self._regarded >= self._tracker.regard_every_s:
+            track = self._regard(images[-1], float(times[-1]), track)
         if not self._is_lost and times[-1] - self._looked >= LOOK_EVERY_S:
             self._looked = float(times[-1])
             self._look_at(images[-1, 0], track.image_points[-1, 0])
         return track
+
+    def _regard(self, images: np.ndarray, time: float, track: Any) -> Any:
+        """The track of a chunk, with the last row from where the detector finds the face, if that is better."""
+        self._regarded = time
+        self.state, better = self._tracker.regarded(self.state, jax.tree.map(lambda leaf: leaf[-1], track), images)
+        if better is None:
+            return track
+        self._say(-1, "found again where it is detected" if self._is_lost else "put where it is detected")
+        self._is_lost = False
+        return jax.tree.map(lambda rows, last: np.concatenate([rows[:-1], np.asarray(last)[None]]), track, better)
 
     def _look_at(self, image: np.ndarray, points: np.ndarray) -> None:
         """Give the track up if a face is detected elsewhere time after time; that none is detected says nothing."""
@@ -191,7 +232,7 @@ class Following:
         """Rows up to the frame in which a track begins, or all; a lost face may also turn up where it was lost."""
         status = LOST if self._is_lost else INITIALISING
         if self._is_lost and not self._is_refuted:
-            stop = min(start + self._tracker.chunk, len(times))
+            stop = self._end_of_chunk(times, start)
             track = self._follow(images[start:stop], times[start:stop])
             if not self._is_lost:
                 self._wait = None
@@ -233,7 +274,8 @@ class Following:
         beginning = self._tracker.begin(found, self.state, self._frames)
         self.state, self._time = beginning.state, beginning.time
         self._is_lost, self._is_refuted, self._said = False, False, set()
-        self._looked, self._contradictions = beginning.time, 0
+        self._looked = self._regarded = beginning.time
+        self._contradictions = 0
         self._tracker.forget()
         self._say(-1, beginning.what)
 

@@ -19,12 +19,13 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
-from jaxfilters.trackers.head.common.following import Beginning, Following
-from jaxfilters.trackers.head.common.state import INITIALISING, POSE
+from jaxfilters.trackers.head.common.following import Beginning, Following, Regarded
+from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
+from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head.mono.detections import Collector, Detections
-from jaxfilters.trackers.head.mono.detectors import Detector
+from jaxfilters.trackers.head.mono.detectors import CascadeDetector, Detector
 from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
 from jaxfilters.trackers.head.mono.recognition import People, as_gallery, one_of, people, recognised
@@ -215,8 +216,9 @@ class _MonoTracker:
         self._system = System(face, face, rig, search_of(rig, options), deviation)
         self._num_at_recognition = 0
         """Adjustments when it was last asked who it is."""
-        self._detector = detector
-        self._collector = Collector(detector)
+        self._detector = detector or CascadeDetector()
+        self._collector = Collector(self._detector)
+        self.regard_every_s = math.inf if options.is_published else redetection.EVERY_S
         self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
         self._ready: Future[MonoState] | None = None
         """What a face that comes back needs first, compiled beside the frames."""
@@ -285,6 +287,17 @@ class _MonoTracker:
     def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
         state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
         return self._recognised(state), track
+
+    def regarded(self, state: MonoState, row: MonoTrack, images: np.ndarray) -> Regarded:
+        is_sure = row.status == DEFORMABLE
+        found = None if is_sure else redetection.located(state, self.rig, self._detector, images[0])
+        if found is None:
+            return Regarded(state, None)
+        frames = np.repeat(images[None], self.chunk, axis=0)
+        clock = np.full(self.chunk, float(state.time), np.asarray(state.time).dtype)
+        other, track = advance(self._system, found, frames, clock, np.arange(self.chunk) < 1, self._compiled)
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], track)
+        return Regarded(other, first) if redetection.is_better(first, row) else Regarded(state, None)
 
     def gallery(self, state: MonoState) -> Gallery:
         return as_gallery(self._system.unknown, self._system.face, state)

@@ -91,7 +91,7 @@ def _ahead(face, rig, points, prior) -> Bundle:
     person = Person(face.identity_mean, prior.offset_mean * jnp.ones_like(face.mean))
     expressions = jnp.tile(face.expression_mean, (len(points), 1))
     mean = posed_shape(face, person, face.expression_mean)
-    return Bundle(jax.vmap(lambda uv: _facing(rig, mean, uv))(points), expressions, person)
+    return Bundle(jax.vmap(lambda uv: facing_pose(rig, mean, uv))(points), expressions, person)
 
 
 def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
@@ -232,7 +232,7 @@ def _first_window(bundle: Bundle, views: Views, uv: Array, frame: Int[ArrayLike,
     )
 
 
-def _facing(rig: CameraRig, shape: Array, uv: Array) -> Array:
+def facing_pose(rig: CameraRig, shape: Array, uv: Array) -> Array:
     """The pose of a head that looks into the camera where its landmarks are on average, as large as they spread."""
     rays = (uv - rig.center[0]) / rig.focal[0]
     middle = jnp.mean(rays, axis=0)

@@ -100,6 +100,9 @@ def _step(
     num_outliers = jnp.where(strange & (not options.is_published), state.num_outliers + 1, fewer)
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
+    if not options.is_published:
+        # Far from the face few landmarks are turned to the camera, and two or three may correlate by chance.
+        missed |= (state.misses >= PATIENCE) & (estimate.num_anchored < FEWEST_SURE)
     state = _after(state, search, belief, estimate, missed)
     state, is_adjusted = _adjusted(system, state, estimate, score, missed, options)
     state = state._replace(

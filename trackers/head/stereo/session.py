@@ -1,5 +1,6 @@
 """The head tracker from the first images on: waiting for a face, registering it, following it, finding it again."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
-from jaxfilters.trackers.head.common.following import Beginning, Following
+from jaxfilters.trackers.head.common.following import Beginning, Following, Regarded
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import INITIALISING, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
@@ -135,6 +136,7 @@ class _HeadTracker:
 
     def __init__(self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self.regard_every_s = math.inf
         self._options, self._points = options, points
         self._compiled, self._diffusion = compiled(options), first_diffusion(options)
         self._searches = searches(rig, options)
@@ -190,6 +192,10 @@ class _HeadTracker:
         self, state: HeadState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray
     ) -> tuple[HeadState, HeadTrack]:
         return advance(self.rig, self._searches, state, images, clock, is_frame, self._compiled)
+
+    def regarded(self, state: HeadState, row: HeadTrack, images: np.ndarray) -> Regarded:
+        del row, images
+        return Regarded(state, None)
 
     def empty(self, count: int) -> HeadTrack:
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)

@@ -1,0 +1,136 @@
+"""A track in doubt, or lost, beside what the detector of landmarks finds in the same image.
+
+A head that turns far leaves few landmarks that look as registered. The others are followed from frame to frame, and the
+track may slip by tens of degrees while a detector sees the face well; a detector errs by tens of degrees on other views
+(beyond 50 degrees of yaw). So neither is believed: the tracker goes on from both poses in the same image, and the
+correlation of the registered face decides between what it makes of them.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num, UInt8
+
+from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.models.face.alignment import Alignment
+from jaxfilters.models.face.refinement import refine
+from jaxfilters.models.face.rig import CameraRig
+from jaxfilters.models.face.shape_model import shape
+from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD
+from jaxfilters.trackers.head.common.recent import nothing_changed
+from jaxfilters.trackers.head.common.search import gathered
+from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
+from jaxfilters.trackers.head.mono.detections import noise_px
+from jaxfilters.trackers.head.mono.detectors import Detector
+from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
+from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
+from jaxfilters.trackers.head.stereo.tracking import LEAST_SCORE, REGAINED_SCORE
+
+EVERY_S = 1 / 3
+"""Seconds between two frames in which a track in doubt is compared with a detection."""
+CLEARLY_BETTER = 0.02
+"""By how much the registered face must correlate better at another pose."""
+ANYWHERE_STD = np.array([200.0, 200.0, 200.0, 0.5, 0.7, 0.5])
+"""Of a pose about that which faces the camera where the landmarks are, millimetres and radians."""
+LASTING_STD = np.array([3.0, 3.0, 0.0, *np.radians([3.0, 6.0, 6.0])])
+"""Of what a detector is wrong in for seconds in a pose, beside the noise of the landmarks, millimetres and radians."""
+ROUNDS = 3
+"""Of five Gauss-Newton steps each."""
+
+
+def located(
+    state: MonoState, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
+) -> MonoState | None:
+    """The state with the face where a detector finds it in the last image; None if it finds none."""
+    near = np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
+    detected = detector.detect(image, near if np.all(np.isfinite(near)) else None)
+    if isinstance(detected, str):
+        return None
+    noise = np.full(len(detected.points), DETECTED_PX)
+    beside = np.zeros_like(state.model.mean)
+    if detector.errors is not None:
+        noise = noise_px(detector.errors, detected.points[None])
+        # A person who was registered from what it detected has the landmarks where it puts them.
+        beside = detector.errors.mean if state.prior.misplaced is None else beside
+    points, std_px, beside = (jnp.asarray(one, state.model.mean.dtype) for one in (detected.points, noise, beside))
+    found = _pose(state, rig, points, std_px, beside)
+    return _placed(state, rig, jnp.asarray(image), found, std_px) if np.all(np.isfinite(found.mean)) else None
+
+
+def is_better(other: MonoTrack, track: MonoTrack) -> bool:
+    """Whether the row from a detected pose is to be believed rather than that of the track in doubt, or lost."""
+    if other.status == LOST or not np.all(np.isfinite(other.pose)):
+        return False
+    is_sure = other.status == DEFORMABLE
+    if track.status == LOST:
+        return bool(is_sure and other.score >= REGAINED_SCORE)
+    if is_sure and other.score >= LEAST_SCORE:
+        return True
+    return bool(other.score >= max(REGAINED_SCORE, track.score + CLEARLY_BETTER))
+
+
+@jax.jit
+def _pose(
+    state: MonoState,
+    rig: CameraRig,
+    points: Float[Array, "K 2"],
+    std_px: Float[Array, " K"],
+    beside: Float[Array, "K 3"],
+) -> Gaussian:
+    """Pose and mode coefficients from detected landmarks: the likelier of the fits from the last pose and a facing one.
+
+    Args:
+        state: Of the last frame.
+        rig: One camera.
+        points: Landmarks, pixels.
+        std_px: Their standard deviations.
+        beside: By how much they lie beside the state's, model frame, millimetres.
+    """
+    model, dtype = replace(state.model, mean=state.model.mean + beside), points.dtype
+    modes, K, S = state.belief.mean[POSE:], len(points), state.slopes.covariance.shape[-1]
+    facing = jnp.concatenate([facing_pose(rig, shape(model, jnp.zeros_like(modes)), points), jnp.zeros_like(modes)])
+    usual = jnp.where(model.deviation > 0, model.deviation, UNLEARNT_STD)
+    prior = Gaussian(facing, jnp.diag(jnp.square(jnp.concatenate([jnp.asarray(ANYWHERE_STD, dtype), usual]))))
+    found = Alignment(
+        uv=points[None],
+        covariance=(jnp.square(std_px)[:, None, None] * jnp.eye(2))[None],
+        score=jnp.ones((1, K), dtype),
+        observed=jnp.ones((1, K), bool),
+        by_slope=jnp.zeros((1, K, 2, S), dtype),
+        slope_information=jnp.zeros((K, S, S), dtype),
+        slope_score=jnp.zeros((K, S), dtype),
+    )
+    loose = state.model_variance[:, None, None] * jnp.eye(3)
+
+    def fitted(x: Array) -> tuple[Gaussian, Array]:
+        def again(x: Array, _: None) -> tuple[Array, tuple[Gaussian, Array]]:
+            fit = refine(prior, found, state.slopes, model, loose, rig, x)
+            return fit.belief.mean, (fit.belief, fit.log_evidence)
+
+        _, fits = jax.lax.scan(again, x, length=ROUNDS)
+        return jax.tree.map(lambda leaf: leaf[-1], fits)
+
+    beliefs, evidence = jax.vmap(fitted)(jnp.stack([facing, state.belief.mean]))
+    best = jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[best], beliefs)
+
+
+@jax.jit
+def _placed(
+    state: MonoState, rig: CameraRig, image: Num[Array, "rows cols"], found: Gaussian, std_px: Float[Array, " K"]
+) -> MonoState:
+    """The state with the head at a detected pose, where no landmark is known to look as registered."""
+    x = found.mean
+    recent = nothing_changed(image[None].astype(x.dtype), shape(state.model, x[POSE:]), x[:POSE], rig)
+    recent = recent._replace(drift=jnp.square(std_px)[None], has_changed=jnp.ones_like(recent.has_changed))
+    lasting = jnp.diag(jnp.square(jnp.pad(jnp.asarray(LASTING_STD, x.dtype), (0, x.size - POSE))))
+    return state._replace(
+        search=gathered(state.search, x)._replace(estimate=x, velocity=jnp.zeros_like(state.search.velocity)),
+        belief=Gaussian(x, found.covariance + lasting),
+        recent=recent,
+        last_good=x,
+        misses=jnp.zeros_like(state.misses),
+        num_outliers=jnp.zeros_like(state.num_outliers),
+    )
