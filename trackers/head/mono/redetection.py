@@ -19,7 +19,7 @@ from jaxfilters.models.face.refinement import refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD
-from jaxfilters.trackers.head.common.recent import nothing_changed
+from jaxfilters.trackers.head.common.recent import CHANGED_SCORE, nothing_changed
 from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
 from jaxfilters.trackers.head.mono.detections import noise_px
@@ -32,6 +32,8 @@ EVERY_S = 1 / 3
 """Seconds between two frames in which a track in doubt is compared with a detection."""
 CLEARLY_BETTER = 0.02
 """By how much the registered face must correlate better at another pose."""
+MOST_DISTANCE = 15.1
+"""Squared distance between a detected pose and a track beyond which they exclude each other: 99 % of chi^2 of five."""
 ANYWHERE_STD = np.array([200.0, 200.0, 200.0, 0.5, 0.7, 0.5])
 """Of a pose about that which faces the camera where the landmarks are, millimetres and radians."""
 LASTING_STD = np.array([3.0, 3.0, 0.0, *np.radians([3.0, 6.0, 6.0])])
@@ -59,16 +61,33 @@ def located(
     return _placed(state, rig, jnp.asarray(image), found, std_px) if np.all(np.isfinite(found.mean)) else None
 
 
+def prepare(state: MonoState, rig: CameraRig) -> None:
+    """Compiles what `located` runs, so that the frames of a live camera do not wait for it."""
+    zero = jnp.zeros_like(state.model.mean)
+    found = _pose(state, rig, zero[:, :2], zero[:, 0] + 1.0, zero)
+    _placed(state, rig, jnp.zeros(rig.shape, jnp.uint8), found, zero[:, 0])
+
+
 def is_better(other: MonoTrack, track: MonoTrack) -> bool:
     """Whether the row from a detected pose is to be believed rather than that of the track in doubt, or lost."""
     if other.status == LOST or not np.all(np.isfinite(other.pose)):
         return False
     is_sure = other.status == DEFORMABLE
     if track.status == LOST:
-        return bool(is_sure and other.score >= REGAINED_SCORE)
-    if is_sure and other.score >= LEAST_SCORE:
-        return True
-    return bool(other.score >= max(REGAINED_SCORE, track.score + CLEARLY_BETTER))
+        return bool(other.score >= (REGAINED_SCORE if is_sure else CHANGED_SCORE))
+    if is_sure:
+        return bool(other.score >= LEAST_SCORE)
+    # Where the detection is one that the track rules out, one of them is wrong altogether: less is then asked.
+    least = LEAST_SCORE if _distance(other.pose, track) > MOST_DISTANCE else REGAINED_SCORE
+    return bool(other.score >= max(least, track.score + CLEARLY_BETTER))
+
+
+def _distance(pose: Float[np.ndarray, " 6"], track: MonoTrack) -> float:
+    """Squared distance of a pose from a track by what both are off by, all but the depth."""
+    apart = np.asarray(pose, float) - track.pose
+    apart[3:] = (apart[3:] + np.pi) % (2 * np.pi) - np.pi
+    variance = np.square(track.pose_std) + np.square(LASTING_STD)
+    return float(np.sum(np.delete(np.square(apart) / variance, 2)))
 
 
 @jax.jit

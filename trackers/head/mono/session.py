@@ -205,8 +205,7 @@ class _MonoTracker:
         focal_log_std: float,
     ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
-        self._whole, face = face, tracked(face)
-        """With all its landmarks."""
+        self._whole, face = face, tracked(face)  # with all its landmarks, and with ten
         self._face, self._options, self._points, self._detections = face, options, points, detections
         # What is compiled knows its options, but need not be compiled anew for other numbers.
         self._compiled = replace(MonoConfig(), **{name: getattr(options, name) for name in _STATIC})
@@ -328,6 +327,7 @@ class _MonoTracker:
 
     def _asked_who(self, system: System, state: MonoState) -> MonoState:
         """As when a face comes back. Frames of a camera must not wait while this is compiled for one person more."""
+        redetection.prepare(state, self.rig)
         return recognised(self._people_with(system, state), self.rig, state, self._compiled)
 
     def empty(self, count: int) -> MonoTrack:

@@ -139,9 +139,15 @@ def test_a_lost_face_is_found_where_it_is_detected(followed, talking):
     assert off.mean() < 2.0
 
 
-def row(status, score, pose=0.0):
-    names = MonoTrack._fields
-    return MonoTrack(*({"status": status, "score": score, "pose": np.full(6, pose)}.get(name) for name in names))
+def row(status, score, x=0.0, yaw=0.0):
+    """With standard deviations of 4 mm and 8 degrees; to these come 3 mm and 6 degrees of a detector."""
+    fields = {
+        "status": status,
+        "score": score,
+        "pose": np.array([x, 0.0, 600.0, 0.0, np.radians(yaw), 0.0]),
+        "pose_std": np.array([4.0, 4.0, 40.0, *np.radians([4.0, 8.0, 8.0])]),
+    }
+    return MonoTrack(*(fields.get(name) for name in MonoTrack._fields))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +158,14 @@ def row(status, score, pose=0.0):
         (row(DOUBTFUL, 0.6), row(DOUBTFUL, 0.5), True),
         (row(DOUBTFUL, 0.6), row(DOUBTFUL, 0.59), False),
         (row(DOUBTFUL, 0.45), row(DOUBTFUL, 0.1), False),
-        (row(DOUBTFUL, 0.8), row(LOST, np.nan), False),
+        # Beyond 3.9 standard deviations of 5 mm or 10 degrees: within half a turn.
+        (row(DOUBTFUL, 0.45, x=20.0), row(DOUBTFUL, 0.1), True),
+        (row(DOUBTFUL, 0.45, x=19.0), row(DOUBTFUL, 0.1), False),
+        (row(DOUBTFUL, 0.45, yaw=-40.0), row(DOUBTFUL, 0.1), True),
+        (row(DOUBTFUL, 0.45, yaw=355.0), row(DOUBTFUL, 0.1), False),
+        (row(DOUBTFUL, 0.34, x=20.0), row(DOUBTFUL, 0.1), False),
+        (row(DOUBTFUL, 0.69), row(LOST, np.nan), False),
+        (row(DOUBTFUL, 0.71), row(LOST, np.nan), True),
         (row(DEFORMABLE, 0.8), row(LOST, np.nan), True),
         (row(LOST, np.nan), row(DOUBTFUL, 0.1), False),
         (row(DEFORMABLE, 0.9, np.nan), row(DOUBTFUL, 0.1), False),
