@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.landmarks import BROWS, EYES, MEAN_SHAPE, MOUTH, NOSTRILS
 from jaxfilters.typing import AnyKey
 
@@ -37,7 +38,7 @@ class Identity:
     """(q1, q2): deviations of the quadratic terms, standard normal among people."""
 
 
-@jax.jit
+@compiled_quickly
 def make_identity(key: AnyKey) -> Identity:
     """A random person: twelve modes of shape, asymmetry, gains and curvatures."""
     modes, asymmetry, gains, curvatures = jax.random.split(key, 4)

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, UInt8
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.landmarks import MOUTH, NOSTRILS
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
@@ -173,7 +174,7 @@ def face_sequence(
     )
 
 
-@jax.jit
+@compiled_quickly
 def _truth(identity, rig, poses, expressions):
     shapes = jax.vmap(face_shape, in_axes=(None, 0, 0))(identity, expressions[:, 0], expressions[:, 1])
     return shapes, jax.vmap(project_shape, in_axes=(None, 0, 0))(rig, shapes, poses)[0]

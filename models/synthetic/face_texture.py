@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.landmarks import MIRROR
 from jaxfilters.typing import AnyKey
 
@@ -78,7 +79,7 @@ class FaceScene:
     """Grey levels behind the head in every camera."""
 
 
-@jax.jit
+@compiled_quickly
 def make_texture(key: AnyKey) -> FaceTexture:
     """Random texture, alike on both sides of the face.
 
@@ -97,7 +98,7 @@ def make_texture(key: AnyKey) -> FaceTexture:
     return FaceTexture(right[_SOURCE] * flip[:, None], phase[_SOURCE], amplitude[_SOURCE])
 
 
-@partial(jax.jit, static_argnums=1)
+@partial(compiled_quickly, static_argnums=1)
 def make_background(key: AnyKey, shape: tuple[int, int]) -> Float[Array, "rows cols"]:
     """Random waves about a mean grey level, not clipped."""
     lengths, orientations, phases = jax.random.split(key, 3)

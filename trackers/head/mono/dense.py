@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import POSE_UNITS, Bundle, Reach, Views, adjust, frame_residuals, projected
 from jaxfilters.models.face.frame_selection import reduced
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
@@ -89,7 +90,7 @@ def start_densely(face: MultilinearFace, rig: CameraRig, start: Start, dense: De
     return _adjusted(face, rig, start, views, numbers(dense.misplaced_mm), numbers(prior), numbers(REACH))
 
 
-@jax.jit
+@compiled_quickly
 def _adjusted(
     face: MultilinearFace, rig: CameraRig, start: Start, views: Views, misplaced: Array, prior: Prior, reach: Reach
 ) -> DenseStart:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import Bundle
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.rig import CameraRig
@@ -43,7 +44,7 @@ class FocalLength(NamedTuple):
         return bool(self.log_std < DETERMINED * LOG_STD)
 
 
-@partial(jax.jit, static_argnames="options")
+@partial(compiled_quickly, static_argnames="options")
 def focal_length(
     unknown: MultilinearFace, face: MultilinearFace, rig: CameraRig, state: MonoState, options: MonoConfig
 ) -> FocalLength:

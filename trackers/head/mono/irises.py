@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import Bundle, Views, projected
 from jaxfilters.models.face.frame_selection import frame_information
 from jaxfilters.models.face.landmarks import EYES
@@ -54,7 +55,7 @@ def with_irises(
     return _resized(face, rig, start, views, past, numbers(iris_px), numbers(prior))
 
 
-@jax.jit
+@compiled_quickly
 def _resized(
     face: MultilinearFace,
     rig: CameraRig,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import Bundle
 from jaxfilters.models.face.gallery import Gallery, hypotheses
 from jaxfilters.models.face.multilinear import MultilinearFace
@@ -39,13 +40,13 @@ class People(NamedTuple):
     log_prior: Float[Array, " n"]
 
 
-@jax.jit
+@compiled_quickly
 def one_of(people: People, index: Int[ArrayLike, ""]) -> MultilinearFace:
     """The face of one of them, 0 for an unknown person."""
     return jax.tree.map(lambda leaf: leaf[index], people.faces)
 
 
-@jax.jit
+@compiled_quickly
 def people(face: MultilinearFace, gallery: Gallery | None) -> People:
     """An unknown person, and everybody of the gallery."""
     if gallery is None or not len(gallery.identity):
@@ -55,7 +56,7 @@ def people(face: MultilinearFace, gallery: Gallery | None) -> People:
     return People(hypotheses(face, gallery), jnp.log(shares))
 
 
-@partial(jax.jit, static_argnames="options")
+@partial(compiled_quickly, static_argnames="options")
 def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoConfig) -> MonoState:
     """The state as it is for whoever the window tells most of; unchanged if nobody's face can be fitted.
 
@@ -122,7 +123,7 @@ def weighed(
     return bundle, -info.energy - 0.5 * (_log_det(after) - _log_det(before))
 
 
-@jax.jit
+@compiled_quickly
 def as_gallery(unknown: MultilinearFace, face: MultilinearFace, state: MonoState) -> Gallery:
     """The person who is followed, as one to remember: identity with what is not known of it, and offset.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Reach, Views, adjust, projected
@@ -85,7 +86,7 @@ def initialise(
     return _fitted(face, rig, points, _ahead(face, rig, points, prior), prior, WIDE, detected_px)
 
 
-@jax.jit
+@compiled_quickly
 def _ahead(face, rig, points, prior) -> Bundle:
     """The mean person, who looks into the camera in all frames."""
     person = Person(face.identity_mean, prior.offset_mean * jnp.ones_like(face.mean))
@@ -99,13 +100,13 @@ def _fitted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
     return _adjusted(face, rig, points, bundle, numbers(prior), numbers(reach), numbers(detected_px))
 
 
-@jax.jit
+@compiled_quickly
 def _adjusted(face, rig, points, bundle, prior, reach, detected_px) -> Start:
     found, info = adjust(face, rig, detected(points, detected_px), bundle, prior, reach, steps=STEPS)
     return Start(found, info, projected(face, rig, found))
 
 
-@jax.jit
+@compiled_quickly
 def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, "*K"]) -> Views:
     """Landmarks as detected, with the standard deviation of each coordinate, perhaps for each landmark."""
     variance = jnp.broadcast_to(jnp.square(std_px), points.shape[:2])
@@ -113,7 +114,7 @@ def detected(points: Float[Array, "n K 2"], std_px: Float[ArrayLike, "*K"]) -> V
     return Views(points, covariance, jnp.ones(points.shape[:2], bool))
 
 
-@partial(jax.jit, static_argnames="options")
+@partial(compiled_quickly, static_argnames="options")
 def begin(
     key: AnyKey,
     face: MultilinearFace,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfilters._full_precision import dot
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.diffusion import DiffusionFit
@@ -56,7 +57,7 @@ MOST_STEPS = 30.0
 """Frame times: a longer gap is treated as one of this length."""
 
 
-@partial(jax.jit, static_argnames="options")
+@partial(compiled_quickly, static_argnames="options")
 def begin(
     key: AnyKey,
     model: FaceModel,
