@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters._xla.compiled_quickly import OPTIONS, compiled_quickly
+from jaxfilters._xla import compiled_quickly as options
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 
 
 def solved(A, b, power=1):
@@ -13,10 +14,11 @@ def solved(A, b, power=1):
 PROBLEM = np.array([[2.0, 1.0], [0.0, 4.0]], np.float32), np.array([0.5, 0.25], np.float32)
 
 
+@pytest.mark.parametrize("is_frequent", [False, True])
 @pytest.mark.parametrize("power", [1, 2])
-def test_the_results_are_those_of_the_function(power):
+def test_the_results_are_those_of_the_function(power, is_frequent):
     A, b = PROBLEM
-    quick = compiled_quickly(solved, static_argnames="power")
+    quick = compiled_quickly(solved, is_frequent=is_frequent, static_argnames="power")
     expected = np.linalg.solve(A.astype(float), np.sin(b.astype(float)) ** power)
     np.testing.assert_allclose(quick(A, b, power=power), expected, rtol=1e-5)
     assert quick.__name__ == "solved"
@@ -31,7 +33,8 @@ def test_it_may_be_called_from_a_program_and_be_differentiated():
     np.testing.assert_allclose(J, np.linalg.inv(A.astype(float)) * np.cos(b.astype(float)), rtol=1e-5)
 
 
-def test_xla_knows_the_options():
+@pytest.mark.parametrize("name", ["_UNOPTIMISED", "_LIGHTLY"])
+def test_xla_knows_the_options(name):
     # XLA refuses names that it does not know.
-    compiled = jax.jit(solved).lower(*PROBLEM).compile(compiler_options=OPTIONS)
+    compiled = jax.jit(solved).lower(*PROBLEM).compile(compiler_options=getattr(options, name))
     np.testing.assert_allclose(compiled(*PROBLEM), solved(*PROBLEM), rtol=1e-6)

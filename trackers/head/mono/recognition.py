@@ -56,7 +56,7 @@ def people(face: MultilinearFace, gallery: Gallery | None) -> People:
     return People(hypotheses(face, gallery), jnp.log(shares))
 
 
-@partial(compiled_quickly, static_argnames="options")
+@partial(jax.jit, static_argnames="options")
 def recognised(people: People, rig: CameraRig, state: MonoState, options: MonoConfig) -> MonoState:
     """The state as it is for whoever the window tells most of; unchanged if nobody's face can be fitted.
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.refinement import refine
@@ -90,7 +91,7 @@ def _distance(pose: Float[np.ndarray, " 6"], track: MonoTrack) -> float:
     return float(np.sum(np.delete(np.square(apart) / variance, 2)))
 
 
-@jax.jit
+@compiled_quickly
 def _pose(
     state: MonoState,
     rig: CameraRig,
@@ -136,7 +137,7 @@ def _pose(
     return jax.tree.map(lambda leaf: leaf[best], beliefs)
 
 
-@jax.jit
+@compiled_quickly
 def _placed(
     state: MonoState, rig: CameraRig, image: Num[Array, "rows cols"], found: Gaussian, std_px: Float[Array, " K"]
 ) -> MonoState:
