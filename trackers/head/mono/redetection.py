@@ -52,13 +52,14 @@ def located(
     if isinstance(detected, str):
         return None
     noise = np.full(len(detected.points), DETECTED_PX)
-    beside = np.zeros_like(state.model.mean)
+    beside = np.zeros(state.model.mean.shape)
     if detector.errors is not None:
         noise = noise_px(detector.errors, detected.points[None])
         # A person who was registered from what it detected has the landmarks where it puts them.
         beside = detector.errors.mean if state.prior.misplaced is None else beside
-    points, std_px, beside = (jnp.asarray(one, state.model.mean.dtype) for one in (detected.points, noise, beside))
-    found = _pose(state, rig, points, std_px, beside)
+    number = lambda a: jnp.asarray(a, state.model.mean.dtype)
+    std_px = number(noise)
+    found = _pose(state, rig, number(detected.points), std_px, number(beside))
     return _placed(state, rig, jnp.asarray(image), found, std_px) if np.all(np.isfinite(found.mean)) else None
 
 
@@ -79,13 +80,13 @@ def is_better(other: MonoTrack, track: MonoTrack) -> bool:
     if is_sure:
         return bool(other.score >= LEAST_SCORE)
     # Where the detection is one that the track rules out, one of them is wrong altogether: less is then asked.
-    least = LEAST_SCORE if _distance(other.pose, track) > MOST_DISTANCE else REGAINED_SCORE
+    least = LEAST_SCORE if _distance(np.asarray(other.pose, float), track) > MOST_DISTANCE else REGAINED_SCORE
     return bool(other.score >= max(least, track.score + CLEARLY_BETTER))
 
 
 def _distance(pose: Float[np.ndarray, " 6"], track: MonoTrack) -> float:
     """Squared distance of a pose from a track by what both are off by, all but the depth."""
-    apart = np.asarray(pose, float) - track.pose
+    apart = pose - np.asarray(track.pose, float)
     apart[3:] = (apart[3:] + np.pi) % (2 * np.pi) - np.pi
     variance = np.square(track.pose_std) + np.square(LASTING_STD)
     return float(np.sum(np.delete(np.square(apart) / variance, 2)))
