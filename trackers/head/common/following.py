@@ -21,7 +21,7 @@ SAME_PLACE, MOST_CONTRADICTIONS = 0.5, 3
 contradict the track before it is given up."""
 
 
-class Regarded(NamedTuple):
+class Compared(NamedTuple):
     """What a detector says of a track."""
 
     state: Any
@@ -51,7 +51,7 @@ class FaceTracker(Protocol):
     is_live: bool
     """Whether frames cannot wait."""
 
-    regard_every_s: float
+    compare_every_s: float
     """Seconds between two frames in which a track is compared with what a detector finds; infinite if it never is."""
 
     @property
@@ -83,7 +83,7 @@ class FaceTracker(Protocol):
         """State and track after a chunk of frames."""
         ...
 
-    def regarded(self, state: Any, row: Any, images: np.ndarray) -> Regarded:
+    def compared(self, state: Any, row: Any, images: np.ndarray) -> Compared:
         """State and row of the last frame, or better ones if a detector finds the face elsewhere in it."""
         ...
 
@@ -110,7 +110,7 @@ class Following:
         """A search for a face that goes on beside the tracking."""
         self._said: set[str] = set()
         self._looked, self._contradictions, self._is_refuted = -math.inf, 0, False
-        self._regarded = -math.inf
+        self._compared = -math.inf
         """When the track was last compared with a detection; `_looked` is when any face was looked for."""
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> Any:
@@ -159,7 +159,7 @@ class Following:
             "time": self._time,
             "looked": self._looked,
             "contradictions": self._contradictions,
-            "regarded": self._regarded,
+            "compared": self._compared,
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -167,7 +167,7 @@ class Following:
         self.state, self.events, self._said = saved["state"], list(saved["events"]), set(saved["said"])
         self._frames, self._time = saved["frames"], saved["time"]
         self._looked, self._contradictions = saved["looked"], saved["contradictions"]
-        self._regarded = saved["regarded"]
+        self._compared = saved["compared"]
         self._is_lost = self._is_refuted = False
         self._wait = None
         self._tracker.restore(saved["tracker"], self.state)
@@ -176,7 +176,7 @@ class Following:
         """One past the last frame of a chunk: it ends with the first frame in which a detector is due."""
         stop = min(start + self._tracker.chunk, len(times))
         chunk = times[start:stop]
-        is_due = chunk - self._regarded >= self._tracker.regard_every_s
+        is_due = chunk - self._compared >= self._tracker.compare_every_s
         if not self._is_lost:
             is_due |= chunk - self._looked >= LOOK_EVERY_S
         return start + int(np.argmax(is_due)) + 1 if is_due.any() else stop
@@ -198,17 +198,17 @@ class Following:
                 self._say(i, "lost" if is_lost else "found again near where it was lost")
             self._is_lost = bool(is_lost)
         self._frames += len(times)
-        if times[-1] - self._regarded >= self._tracker.regard_every_s:
-            track = self._regard(images[-1], float(times[-1]), track)
+        if times[-1] - self._compared >= self._tracker.compare_every_s:
+            track = self._compare(images[-1], float(times[-1]), track)
         if not self._is_lost and times[-1] - self._looked >= LOOK_EVERY_S:
             self._looked = float(times[-1])
             self._look_at(images[-1, 0], track.image_points[-1, 0])
         return track
 
-    def _regard(self, images: np.ndarray, time: float, track: Any) -> Any:
+    def _compare(self, images: np.ndarray, time: float, track: Any) -> Any:
         """The track of a chunk, with the last row from where the detector finds the face, if that is better."""
-        self._regarded = time
-        self.state, better = self._tracker.regarded(self.state, jax.tree.map(lambda leaf: leaf[-1], track), images)
+        self._compared = time
+        self.state, better = self._tracker.compared(self.state, jax.tree.map(lambda leaf: leaf[-1], track), images)
         if better is None:
             return track
         self._say(-1, "found again where it is detected" if self._is_lost else "put where it is detected")
@@ -274,7 +274,7 @@ class Following:
         beginning = self._tracker.begin(found, self.state, self._frames)
         self.state, self._time = beginning.state, beginning.time
         self._is_lost, self._is_refuted, self._said = False, False, set()
-        self._looked = self._regarded = beginning.time
+        self._looked = self._compared = beginning.time
         self._contradictions = 0
         self._tracker.forget()
         self._say(-1, beginning.what)

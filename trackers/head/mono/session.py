@@ -19,7 +19,7 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
-from jaxfilters.trackers.head.common.following import Beginning, Following, Regarded
+from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
 from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
@@ -217,7 +217,7 @@ class _MonoTracker:
         """Adjustments when it was last asked who it is."""
         self._detector = detector or CascadeDetector()
         self._collector = Collector(self._detector)
-        self.regard_every_s = math.inf if options.is_published else redetection.EVERY_S
+        self.compare_every_s = math.inf if options.is_published else redetection.EVERY_S
         self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
         self._ready: Future[MonoState] | None = None
         """What a face that comes back needs first, compiled beside the frames."""
@@ -287,16 +287,16 @@ class _MonoTracker:
         state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
         return self._recognised(state), track
 
-    def regarded(self, state: MonoState, row: MonoTrack, images: np.ndarray) -> Regarded:
+    def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray) -> Compared:
         is_sure = row.status == DEFORMABLE
         found = None if is_sure else redetection.located(state, self.rig, self._detector, images[0])
         if found is None:
-            return Regarded(state, None)
+            return Compared(state, None)
         frames = np.repeat(images[None], self.chunk, axis=0)
         clock = np.full(self.chunk, float(state.time), np.asarray(state.time).dtype)
         other, track = advance(self._system, found, frames, clock, np.arange(self.chunk) < 1, self._compiled)
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], track)
-        return Regarded(other, first) if redetection.is_better(first, row) else Regarded(state, None)
+        return Compared(other, first) if redetection.is_better(first, row) else Compared(state, None)
 
     def gallery(self, state: MonoState) -> Gallery:
         return as_gallery(self._system.unknown, self._system.face, state)

@@ -16,7 +16,7 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
-from jaxfilters.trackers.head.common.following import Beginning, Following, Regarded
+from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import INITIALISING, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
@@ -136,7 +136,7 @@ class _HeadTracker:
 
     def __init__(self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
-        self.regard_every_s = math.inf
+        self.compare_every_s = math.inf
         self._options, self._points = options, points
         self._compiled, self._diffusion = compiled(options), first_diffusion(options)
         self._searches = searches(rig, options)
@@ -193,9 +193,9 @@ class _HeadTracker:
     ) -> tuple[HeadState, HeadTrack]:
         return advance(self.rig, self._searches, state, images, clock, is_frame, self._compiled)
 
-    def regarded(self, state: HeadState, row: HeadTrack, images: np.ndarray) -> Regarded:
+    def compared(self, state: HeadState, row: HeadTrack, images: np.ndarray) -> Compared:
         del row, images
-        return Regarded(state, None)
+        return Compared(state, None)
 
     def empty(self, count: int) -> HeadTrack:
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)

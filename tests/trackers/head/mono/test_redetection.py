@@ -20,8 +20,8 @@ FIRST = 32
 """Frames before a track is disturbed."""
 
 
-class Told:
-    """A detector that has the true landmarks to a pixel; None are found where they are not finite."""
+class KnownLandmarks:
+    """A detector of the true landmarks with noise of a pixel, which finds no face where they are not finite."""
 
     errors = None
 
@@ -42,7 +42,7 @@ def followed(rig, face, talking, detected):
     session.process(images[:FIRST], made.times[:FIRST])
 
     def again(uv):
-        other = MonoSession(rig, face, detector=Told(uv))
+        other = MonoSession(rig, face, detector=KnownLandmarks(uv))
         other.restore(session.saved())
         return other
 
@@ -108,7 +108,7 @@ def test_a_track_that_slipped_is_put_where_the_face_is_detected(followed, talkin
     for i in range(len(still)):
         pieces.process(still[i : i + 1], times[i : i + 1])
     whole.process(still, times)
-    assert pieces._following._regarded == whole._following._regarded > times[0]
+    assert pieces._following._compared == whole._following._compared > times[0]
     assert pieces._following._looked == whole._following._looked
     # Without a detection the search itself finds the face, but later.
     _, off, _ = errors(np.full((10, 2), np.nan))
