@@ -18,7 +18,7 @@ _UNOPTIMISED = _OLDER | {"xla_backend_optimization_level": 0, "xla_llvm_disable_
 _LIGHTLY = _OLDER | {"xla_backend_optimization_level": 1} if _HAS_OLDER_EMITTERS else {}
 
 
-def compiled_quickly(function: Callable[..., R], *, is_frequent: bool = False, **settings: Any) -> Callable[..., R]:
+def compiled_quickly(function: Callable[..., R], **settings: Any) -> Callable[..., R]:
     """`jax.jit` in an eighth of the time, for what is called a few times, such as the start of a track.
 
     The results are those of `jax.jit` up to rounding. Within another function that is traced, and on other devices than
@@ -26,11 +26,21 @@ def compiled_quickly(function: Callable[..., R], *, is_frequent: bool = False, *
 
     Args:
         function: Called with arrays, of which one at least is an argument.
-        is_frequent: For one of hundreds of small loops that runs in every frame: it compiles in three fifths of the
-            time with jaxlib 0.10, and is as fast.
         settings: Of `jax.jit`, such as `static_argnames`.
     """
-    options = _LIGHTLY if is_frequent else _UNOPTIMISED
+    return _compiled(function, _UNOPTIMISED, settings)
+
+
+def compiled_lightly(function: Callable[..., R], **settings: Any) -> Callable[..., R]:
+    """As `compiled_quickly`, for a program of hundreds of small loops that runs in every frame.
+
+    With jaxlib 0.10 it compiles in three fifths of the time of `jax.jit`, and is as fast. With later ones it is
+    `jax.jit`.
+    """
+    return _compiled(function, _LIGHTLY, settings)
+
+
+def _compiled(function: Callable[..., R], options: dict[str, bool | int], settings: dict[str, Any]) -> Callable[..., R]:
     usual, quick = jax.jit(function, **settings), jax.jit(function, compiler_options=options, **settings)
 
     @wraps(function)

@@ -30,7 +30,7 @@ LEAST_PIXELS = 12.0
 CLOSE_M = 0.8
 """People nearer than this on the floor may be mistaken for each other."""
 HIDING_M = 0.4
-"""People nearer than this on the floor are not looked at: who is behind shows little but the edges of who is before."""
+"""Clothes of people nearer than this on the floor are not compared: of the one behind hardly more than edges shows."""
 DECIDED = 0.5
 """Summed difference of dissimilarities that settles who is who."""
 LONGEST_S = 4.0

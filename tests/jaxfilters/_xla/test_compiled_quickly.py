@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfilters._xla import compiled_quickly as options
-from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.compiled_quickly import compiled_lightly, compiled_quickly
 
 
 def solved(A, b, power=1):
@@ -14,11 +14,11 @@ def solved(A, b, power=1):
 PROBLEM = np.array([[2.0, 1.0], [0.0, 4.0]], np.float32), np.array([0.5, 0.25], np.float32)
 
 
-@pytest.mark.parametrize("is_frequent", [False, True])
+@pytest.mark.parametrize("compiled", [compiled_quickly, compiled_lightly])
 @pytest.mark.parametrize("power", [1, 2])
-def test_the_results_are_those_of_the_function(power, is_frequent):
+def test_the_results_are_those_of_the_function(power, compiled):
     A, b = PROBLEM
-    quick = compiled_quickly(solved, is_frequent=is_frequent, static_argnames="power")
+    quick = compiled(solved, static_argnames="power")
     expected = np.linalg.solve(A.astype(float), np.sin(b.astype(float)) ** power)
     np.testing.assert_allclose(quick(A, b, power=power), expected, rtol=1e-5)
     assert quick.__name__ == "solved"

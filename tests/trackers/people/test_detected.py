@@ -31,6 +31,14 @@ def test_a_silhouette_fills_its_box_and_frames_follow_one_another():
     np.testing.assert_allclose(box_of(wider.apply(IMAGE)) - box_of(shown), [-4, -4, 4, 4], atol=1)
 
 
+def test_legs_reach_the_lower_edge_of_a_box():
+    """But for their rounded tips, a part in 80 of the height: those of the model of bodies end 0.017 heights higher."""
+    shape, bottom, height = (480, 240), 440.0, 400.0
+    found = DetectedForeground({0: np.array([[60.0, bottom - height, 180.0, bottom, 1.0]])}, Undistortion(shape))
+    _, _, _, v1 = box_of(found.apply(np.zeros((*shape, 3), np.uint8)))
+    assert 0 <= bottom - v1 < height / 80
+
+
 def test_scores_are_probabilities_and_boxes_add_up_also_at_the_border():
     """Two boxes of one place leave (1 - a)(1 - b) for nobody; one half outside the image is cut off."""
     boxes = np.array([(40.0, 20, 68, 100, 0.6), (40.0, 20, 68, 100, 0.5), (-10.0, 60, 18, 140, 1.0)])

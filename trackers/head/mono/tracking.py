@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.compiled_quickly import compiled_lightly
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import facing
@@ -57,7 +57,7 @@ class System(NamedTuple):
     """Standard deviation of the logarithm of the focal length."""
 
 
-@partial(compiled_quickly, is_frequent=True, static_argnames="options")
+@partial(compiled_lightly, static_argnames="options")
 def advance(
     system: System,
     state: MonoState,
