@@ -3,7 +3,8 @@
 `marked_fingertips.json` holds the frames in the middle of 20 equal parts of a video, and in each, by name, the middle
 of every fingertip whose end a person sees; fingers folded onto the palm, or whose end another finger hides, are left
 out. What the border of the image cuts is marked apart, and is neither missed nor false. A tip is found if a fingertip
-of the tracker is nearer than half the width of a finger; what is near no mark is false.
+of the tracker is nearer than half the width of a finger; what is near no mark is false. The simplest thing that finds
+fingertips in one image is counted beside the tracker: a threshold in colour and the gaps of the convex hull.
 """
 
 import json
@@ -16,6 +17,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.benchmarks.scenarios._simplest import hand_by_colour, tips_by_hull
 from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, track
 from jaxfilters.trackers.fingertips.state import HandReport
 
@@ -59,8 +61,8 @@ def marks(name: str) -> dict[str, Any]:
     return json.loads(text)[name]
 
 
-def marked_metrics(name: str, folder: Path) -> dict[str, float]:
-    """Of the tracker with `--mask colour` on the whole video.
+def marked_counts(name: str, folder: Path) -> dict[str, Count]:
+    """Of the tracker with `--mask colour` on the whole video, and `_simple`, of every marked frame by itself.
 
     Raises:
         RecordingError: if the video cannot be read.
@@ -68,8 +70,10 @@ def marked_metrics(name: str, folder: Path) -> dict[str, float]:
     marked = marks(name)
     images = _images(folder / marked["file"])
     report, _ = track(images, np.arange(len(images)) / 30, "colour")
-    frames = {int(i): tips_of(report, int(i)) for i in marked["frames"]}
-    return counted(marked, frames).metrics
+    frames = [int(i) for i in marked["frames"]]
+    hulls = {i: tips_by_hull(hand_by_colour(images[i])) for i in frames}
+    simple = {i: Tips(tips, np.zeros(len(tips), int)) for i, tips in hulls.items()}
+    return {"": counted(marked, {i: tips_of(report, i) for i in frames}), "_simple": counted(marked, simple)}
 
 
 def tips_of(report: HandReport, frame: int) -> Tips:

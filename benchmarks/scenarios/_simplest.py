@@ -7,7 +7,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -28,6 +28,8 @@ POINTS = 32
 GATE_M = 1.0
 DIFFERENCE, SMALLEST_BLOB = 30, 0.002
 """Grey levels from the background, and share of the image of a blob that counts."""
+DEEP, FINGER = 0.06, 0.15
+"""Depth of a gap between fingers, and width of a finger, in roots of the area of a hand."""
 
 
 def registered_hands(
@@ -94,16 +96,15 @@ def reprojected_hand(sequence: ArticulatedSequence) -> Float[np.ndarray, "t n"]:
 
 
 def followed_blobs(
-    images: Sequence[UInt8[np.ndarray, "rows cols 3"]], camera: FloorCamera
-) -> list[tuple[int, int, Float[np.ndarray, " 2"]]]:
-    """Frame, identity and place on the floor of blobs that differ from the median image.
+    images: Iterable[UInt8[np.ndarray, "rows cols 3"]], empty: UInt8[np.ndarray, "rows cols 3"], camera: FloorCamera
+) -> list[tuple[int, int, float, float]]:
+    """Frame, identity, X and Y in metres of blobs that differ from the image of the empty floor.
 
     The middle of the lower edge of a blob is projected back to the floor, and takes the identity of the nearest blob of
     the frame before within a metre.
     """
-    empty = np.median(np.stack(images), axis=0).astype(np.uint8)
     kernel = np.ones((5, 5), np.uint8)
-    rows: list[tuple[int, int, np.ndarray]] = []
+    rows: list[tuple[int, int, float, float]] = []
     last: dict[int, np.ndarray] = {}
     next_identity = 0
     for index, image in enumerate(images):
@@ -120,7 +121,7 @@ def followed_blobs(
             if who < 0 or near[who] > GATE_M:
                 who, next_identity = next_identity, next_identity + 1
             here[who] = place
-            rows.append((index, who, place))
+            rows.append((index, who, *map(float, place)))
         last = here
     return rows
 
@@ -167,21 +168,71 @@ def pose_by_triangulation(
     return np.stack(poses)
 
 
+def projections(rig: CameraRig) -> Float[np.ndarray, "2 3 4"]:
+    """From millimetres in the world to pixels."""
+    found = []
+    for k in range(2):
+        (fx, fy), (cx, cy) = np.asarray(rig.focal[k], float), np.asarray(rig.center[k], float)
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        found.append(K @ np.c_[np.asarray(rig.rotation[k], float), np.asarray(rig.translation[k], float)])
+    return np.stack(found)
+
+
 def fingers_by_hull(mask: np.ndarray) -> int:
     """How many fingers are out, by the gaps between them in the convex hull of the largest outline."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    if not contours:
+    outline = _largest_outline(mask)
+    if outline is None:
         return 0
-    outline = max(contours, key=cv2.contourArea)
+    gaps = len(_gaps(outline))
+    return gaps + 1 if gaps else 1
+
+
+def hand_by_colour(image: UInt8[np.ndarray, "rows cols 3"]) -> Bool[np.ndarray, "rows cols"]:
+    """The smaller part of a BGR image, divided by N. Otsu's threshold (1979) in the red chrominance."""
+    red = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb)[..., 1], (5, 5), 0)
+    redder = cv2.threshold(red, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1] > 0
+    return redder if redder.mean() < 1 / 2 else ~redder
+
+
+def tips_by_hull(mask: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    """Pixels of the ends of the gaps between fingers on the convex hull of the largest outline, one for each finger.
+
+    Ends that are nearer to one another than a finger is wide are one, at their mean.
+    """
+    outline = _largest_outline(mask)
+    if outline is None:
+        return np.zeros((0, 2))
+    together: list[list[np.ndarray]] = []
+    for end in (end for gap in _gaps(outline) for end in gap):
+        near = [one for one in together if np.linalg.norm(np.mean(one, axis=0) - end) < FINGER * _size(outline)]
+        if near:
+            near[0].append(end)
+        else:
+            together.append([end])
+    return np.array([np.mean(one, axis=0) for one in together]).reshape(-1, 2)
+
+
+def _largest_outline(mask: np.ndarray) -> np.ndarray | None:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return max(contours, key=cv2.contourArea) if contours else None
+
+
+def _size(outline: np.ndarray) -> float:
+    """Root of the area, pixels."""
+    return float(np.sqrt(cv2.contourArea(outline)))
+
+
+def _gaps(outline: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Both ends on the hull of every gap that is deep, and narrower than a right angle."""
     hull = cv2.convexHull(outline, returnPoints=False)
     defects = cv2.convexityDefects(outline, np.sort(hull, axis=0)[::-1]) if len(hull) > 3 else None
     if defects is None:
-        return 0
+        return []
     first, last, deepest = (outline[defects[:, 0, i], 0].astype(float) for i in range(3))
     a, b = first - deepest, last - deepest
     cosine = np.sum(a * b, axis=1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-9)
-    gaps = int(np.sum((cosine > 0) & (defects[:, 0, 3] / 256 > 0.06 * np.sqrt(cv2.contourArea(outline)))))
-    return gaps + 1 if gaps else 1
+    chosen = (cosine > 0) & (defects[:, 0, 3] / 256 > DEEP * _size(outline))
+    return list(zip(first[chosen], last[chosen], strict=True))
 
 
 def nearest_by_warping(

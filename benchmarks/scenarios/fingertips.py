@@ -32,7 +32,7 @@ from jaxfilters.benchmarks.scenarios._hand_video import (
     hand_video_metrics,
     load_hand_video,
 )
-from jaxfilters.benchmarks.scenarios._marked_tips import VIDEOS, marked_metrics
+from jaxfilters.benchmarks.scenarios._marked_tips import VIDEOS, marked_counts
 from jaxfilters.benchmarks.timing import interleaved
 from jaxfilters.models.fingertip import thumb
 from jaxfilters.models.fingertip.detection import detect_hand
@@ -223,13 +223,14 @@ def marked_video_metrics() -> dict[str, Metric]:
     metrics: dict[str, Metric] = {}
     for name in VIDEOS:
         try:
-            found = marked_metrics(name, recording_folder(name))
+            counts = marked_counts(name, recording_folder(name))
         except RecordingError as error:
             sys.stderr.write(f"  without {name}: {error}\n")
             continue
-        metrics[f"found_pct_{name}"] = Metric(found["found_pct"], "%", "higher")
-        metrics[f"false_pct_{name}"] = Metric(found["false_pct"], "%", "lower")
-        metrics[f"names_per_finger_{name}"] = Metric(found["names_per_finger"], "", "lower")
+        for suffix, count in counts.items():
+            metrics[f"found_pct_{name}{suffix}"] = Metric(count.metrics["found_pct"], "%", "higher")
+            metrics[f"false_pct_{name}{suffix}"] = Metric(count.metrics["false_pct"], "%", "lower")
+        metrics[f"names_per_finger_{name}"] = Metric(counts[""].metrics["names_per_finger"], "", "lower")
     return metrics
 
 

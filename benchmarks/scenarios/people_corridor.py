@@ -4,6 +4,8 @@ Needs the folder `caviar_corridor` of JAXFILTERS_DATA: the camera is calibrated 
 background comes from the recording, and everybody is followed, as by `jaxfilters calibrate points` and
 `jaxfilters track people`. Truth are the places on the floor below the annotated boxes, where these stand whole in the
 image and on the part of the floor that is tracked. `walkers` are the two people who walk alone through the corridor.
+`_simple` is without a tracker: blobs that differ from the background, projected back to the floor and linked to the
+nearest.
 """
 
 import csv
@@ -17,6 +19,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, evaluate, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
 from jaxfilters.models.calibration import calibrate_floor
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.io.errors import InputError
@@ -43,16 +46,20 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     except (InputError, OSError, KeyError, ValueError, AttributeError) as error:
         raise RecordingError(f"{folder} cannot be read: {error!r}") from error
     session = PeopleSession(people_scene([camera], FLOOR))
-    session.prime([video.sample(PRIMING_IMAGES)])
-    for time_s, image in itertools.islice(video.images(), QUICK_FRAMES if quick else None):
+    samples = video.sample(PRIMING_IMAGES)
+    session.prime([samples])
+    last = QUICK_FRAMES if quick else None
+    for time_s, image in itertools.islice(video.images(), last):
         session.process([image], time_s)
     rows = [
         (one.frame, identity, *one.mean[:2]) for identity, track in session.tracks.smoothed().items() for one in track
     ]
-    table = np.array(rows, float).reshape(-1, 4)
-    found = floor_tracks(table[:, 0], table[:, 1], table[:, 2:])
-    evaluated = true.frame < session.tracks.frames
-    return _scores(FloorTracks(*(rows[evaluated] for rows in true)), found, np.asarray(camera.position())[:2])
+    empty = np.median(np.stack(samples), axis=0).astype(np.uint8)
+    blobs = followed_blobs((image for _, image in itertools.islice(video.images(), last)), empty, camera)
+    simple = [row for row in blobs if _is_on_floor(np.array(row[2:]))]
+    true = FloorTracks(*(column[true.frame < session.tracks.frames] for column in true))
+    camera_xy_m = np.asarray(camera.position())[:2]
+    return _scores(true, _tracks(rows), camera_xy_m) | _scores(true, _tracks(simple), camera_xy_m, "_simple")
 
 
 def corridor_camera(path: Path, shape: tuple[int, int]) -> FloorCamera:
@@ -74,11 +81,21 @@ def annotated(path: Path, camera: FloorCamera) -> FloorTracks:
     feet = np.stack([u, v + height / 2], axis=-1)
     xy, depth = (np.asarray(a) for a in camera.floor_points(jnp.asarray(feet)))
     shows = (feet[:, 1] < camera.shape[0] - BORDER_PX) & (height > LEAST_HEIGHT_PX) & (width > LEAST_WIDTH_PX)
-    inside = np.all((xy > FLOOR.min(axis=0)) & (xy < FLOOR.max(axis=0)), axis=-1) & (depth > 0)
-    return floor_tracks(frame, identity, xy, in_area=shows & inside)
+    return floor_tracks(frame, identity, xy, in_area=shows & _is_on_floor(xy) & (depth > 0))
 
 
-def _scores(true: FloorTracks, found: FloorTracks, camera_xy_m: np.ndarray) -> dict[str, Metric]:
+def _is_on_floor(xy: np.ndarray) -> np.ndarray:
+    """(...) which places (..., 2) are on the part of the floor that is tracked."""
+    return np.all((xy > FLOOR.min(axis=0)) & (xy < FLOOR.max(axis=0)), axis=-1)
+
+
+def _tracks(rows: list) -> FloorTracks:
+    """Of frame, identity, X and Y."""
+    table = np.array(rows, float).reshape(-1, 4)
+    return floor_tracks(table[:, 0], table[:, 1], table[:, 2:])
+
+
+def _scores(true: FloorTracks, found: FloorTracks, camera_xy_m: np.ndarray, suffix: str = "") -> dict[str, Metric]:
     scores = evaluate(true, found, camera_xy_m=camera_xy_m)
     sys.stderr.write(f"  {scores}\n")
     pairs = match(true, found)
@@ -86,13 +103,13 @@ def _scores(true: FloorTracks, found: FloorTracks, camera_xy_m: np.ndarray) -> d
     errors = np.linalg.norm(found.xy_m[pairs.estimate] - true.xy_m[pairs.truth], axis=-1)
     found_share = walks.sum() / max(1, np.isin(true.identity, WALKERS).sum())
     return {
-        "mota": Metric(scores.mota, "%", "higher"),
-        "idf1": Metric(scores.idf1, "%", "higher"),
-        "mean_error_m": Metric(scores.mean_error_m, "m", "lower"),
-        "radial_error_m": Metric(scores.radial_error_m, "m", "lower"),
-        "lateral_error_m": Metric(scores.lateral_error_m, "m", "lower"),
-        "walkers_error_m": Metric(float(errors[walks].mean()) if walks.any() else float("nan"), "m", "lower"),
-        "walkers_found": Metric(float(found_share), "", "higher"),
-        "id_switches": Metric(float(scores.id_switches), "", "lower"),
-        "transfers": Metric(float(scores.transfers), "", "lower"),
+        f"mota{suffix}": Metric(scores.mota, "%", "higher"),
+        f"idf1{suffix}": Metric(scores.idf1, "%", "higher"),
+        f"mean_error_m{suffix}": Metric(scores.mean_error_m, "m", "lower"),
+        f"radial_error_m{suffix}": Metric(scores.radial_error_m, "m", "lower"),
+        f"lateral_error_m{suffix}": Metric(scores.lateral_error_m, "m", "lower"),
+        f"walkers_error_m{suffix}": Metric(float(errors[walks].mean()) if walks.any() else float("nan"), "m", "lower"),
+        f"walkers_found{suffix}": Metric(float(found_share), "", "higher"),
+        f"id_switches{suffix}": Metric(float(scores.id_switches), "", "lower"),
+        f"transfers{suffix}": Metric(float(scores.transfers), "", "lower"),
     }

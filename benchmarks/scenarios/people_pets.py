@@ -4,8 +4,9 @@ Needs the folder `pets09_s2l1_view001` of JAXFILTERS_DATA. The whole video is de
 background (median of every 20th frame) and tracked with the constants that everything else has; scores are on the
 frames from the first to the last of the file of truth, `gt_0_399.csv` or what `--truth` names (columns `frame`, `id`,
 `x_m`, `y_m` and, if there is one, `in_area`). Names without a suffix are of the tracks that remain of a recording,
-smoothed and from before their confirmation; `_filtered` is what was known of the confirmed at every frame. A folder
-given with `--out` receives `tracks.csv` and `floor_plan.png`.
+smoothed and from before their confirmation; `_filtered` is what was known of the confirmed at every frame, `_simple` is
+without a tracker: blobs that differ from the background, projected back to the floor and linked to the nearest. A
+folder given with `--out` receives `tracks.csv` and `floor_plan.png`.
 """
 
 import csv
@@ -23,6 +24,7 @@ from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, e
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
 from jaxfilters.benchmarks.scenarios._pets import SHAPE, Pets, images, load_pets
+from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
 from jaxfilters.trackers.people.recorded import Sighting, smoothed
 from jaxfilters.trackers.people.session import PeopleSession
 from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
@@ -66,7 +68,8 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     annotated = FloorTracks(*(rows[annotated.frame <= last] for rows in annotated))
     kept = smoothed(pets.scene.config, followed.tracks)
     metrics: dict[str, Metric] = {}
-    for suffix, rows in (("", positions(kept)), ("_filtered", followed.confirmed)):
+    simple = blobs(pets, last + 1)
+    for suffix, rows in (("", positions(kept)), ("_filtered", followed.confirmed), ("_simple", simple)):
         estimate = within(rows, pets, covered)
         scores = evaluate(annotated, estimate, camera_xy_m=np.asarray(pets.camera.position())[:2])
         metrics |= score_metrics(scores, suffix)
@@ -101,6 +104,12 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
         before = time.perf_counter()
     inputs, subtracting, tracking = np.transpose(clocks)
     return Followed(confirmed, session.tracks.recorder.tracks, tracking, subtracting, inputs)
+
+
+def blobs(pets: Pets, frames: int) -> list[tuple[int, int, float, float]]:
+    """Frame, identity, X and Y in metres of what differs from the median of every 20th image of the video."""
+    empty = np.median(np.stack(list(itertools.islice(images(pets), 0, None, PRIME_EVERY))), axis=0).astype(np.uint8)
+    return followed_blobs(itertools.islice(images(pets), frames), empty, pets.camera)
 
 
 def read_truth(path: Path, pets: Pets) -> FloorTracks:

@@ -98,14 +98,15 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     images = [room.image(0, i) for i in range(len(room))]
     scene = people.people_scene(room.cameras, room.floor, furniture=room.furniture)
     tracks = people.track([[image] for image in images], [i / room.fps for i in range(len(room))], scene)
-    ours = [(one.frame, who, one.mean[:2]) for who, track in tracks.items() for one in track]
+    ours = [(one.frame, who, *one.mean[:2]) for who, track in tracks.items() for one in track]
+    empty = np.median(np.stack(images), axis=0).astype(np.uint8)
     present = [(i, who) for i in range(len(room)) for who in np.flatnonzero(room.present(i))]
     frames, whose = zip(*present, strict=True)
     truth = floor_tracks(frames, whose, np.stack([room.routes.xy[i, who] for i, who in present]))
     found: dict[str, Metric] = {}
-    for name, rows in (("", ours), ("_simple", simplest.followed_blobs(images, room.cameras[0]))):
-        frame, who, places = zip(*rows, strict=True)
-        scores = evaluate(truth, floor_tracks(frame, who, np.stack(places)))
+    for name, rows in (("", ours), ("_simple", simplest.followed_blobs(images, empty, room.cameras[0]))):
+        frame, who, x, y = zip(*rows, strict=True)
+        scores = evaluate(truth, floor_tracks(frame, who, np.stack([x, y], axis=-1)))
         found[f"people_mota{name}"] = Metric(float(scores.mota), "%", "higher")
         found[f"people_error_m{name}"] = Metric(float(scores.mean_error_m), "m", "lower")
     return found
@@ -119,7 +120,7 @@ def stereo_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         errors[""].append(rmse(follow(made, {"": HeadConfig(learn=False)})[""]))
         images = [image for _, part in made.chunks() for image in part]
         uv = np.stack([simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1)
-        poses = simplest.pose_by_triangulation(np.asarray(made.shapes[0], float), uv, _projections(made.rig))
+        poses = simplest.pose_by_triangulation(np.asarray(made.shapes[0], float), uv, simplest.projections(made.rig))
         errors["_simple"].append(_pose_rms(poses[1:], made.poses[1:]))
     return _pose_metrics("head_stereo", errors, HEAD_PAPER)
 
@@ -174,16 +175,6 @@ def symbol_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         right["_simple"].append(100 * float(np.mean(np.array(near) == truth)))
     found = {f"symbols_right{name}": _mean(values, "%", "higher") for name, values in right.items()}
     return found | {"symbols_right_paper": Metric(SYMBOLS_PAPER, "%", "higher")}
-
-
-def _projections(rig) -> np.ndarray:
-    """(2, 3, 4) from millimetres in the world to pixels."""
-    found = []
-    for k in range(2):
-        (fx, fy), (cx, cy) = np.asarray(rig.focal[k], float), np.asarray(rig.center[k], float)
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        found.append(K @ np.c_[np.asarray(rig.rotation[k], float), np.asarray(rig.translation[k], float)])
-    return np.stack(found)
 
 
 def _pose_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from jaxfilters.benchmarks.harness import main
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios import head_real
 from jaxfilters.benchmarks.scenarios.head_real import Modelled
-from jaxfilters.models.face.rig import nominal
+from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.state import INITIALISING, LOST, RIGID, HeadTrack
 from jaxfilters.trackers.head.stereo.session import HeadSession
@@ -26,10 +27,13 @@ def test_errors_go_by_yaw_and_only_of_tracked_frames():
         errors=errors,
         landmark_mm=np.repeat([[0.5], [1.5], [2.5], [np.nan]], 10, axis=1),
         within=np.repeat([[True], [False], [True], [False]], 6, axis=1),
+        simple=np.repeat([[3.0], [4.0], [9.0], [9.0]], 6, axis=1),
     )
     metrics = head_real.yaw_metrics(found)
     assert metrics["ict_lost_share_within_40deg"].value == pytest.approx(100 / 3)
     assert [metrics[f"ict_error_yaw_{name}"].value for name in ("0_10", "10_20", "beyond_40")] == [1, 2, 3]
+    assert metrics["ict_error_yaw_within_40deg"].value == pytest.approx(np.sqrt(2.5))
+    assert metrics["ict_error_yaw_within_40deg_simple"].value == pytest.approx(np.sqrt(12.5))
     assert metrics["ict_error_landmark_10_20"].value == 1.5
     assert metrics["ict_coverage_0_10"].value == 100
     assert "ict_error_x_20_30" not in metrics
@@ -134,6 +138,7 @@ def test_a_modelled_person_counts_from_registration_on(monkeypatch):
     std = np.broadcast_to(np.array([2.0, 2, 2, 2, 2, 2]) / head_real.DISPLAY, (6, 6))
     monkeypatch.setattr(Session, "track", made_track(status, pose=pose, pose_std=std, shape=made.shapes))
     monkeypatch.setattr(head_real, "HeadSession", Session)
+    monkeypatch.setattr(head_real, "without_tracker", lambda made, _: made.poses + np.array([0, 0, 5, 0, 0, 2 * np.pi]))
     found = head_real.followed(made, 0)
     assert found.is_tracked.tolist() == [True, True, False, True]
     np.testing.assert_allclose(found.yaw_deg, [15, 25, 35, 45])
@@ -142,3 +147,18 @@ def test_a_modelled_person_counts_from_registration_on(monkeypatch):
     assert np.isnan(found.errors[2]).all()
     np.testing.assert_allclose(found.landmark_mm[[0, 1, 3]], 3.0)
     np.testing.assert_array_equal(found.within[0], [True, True, True, False, True, True])
+    np.testing.assert_allclose(found.simple, np.tile([0, 0, 5, 0, 0, 0], (4, 1)), atol=1e-9)
+
+
+def test_exact_flow_gives_exact_poses_without_a_tracker(monkeypatch):
+    made = Turning()
+    shape = 40 * np.random.default_rng(0).normal(size=(10, 3))
+    uv = np.stack([project_shape(made.rig, jnp.array(shape), jnp.array(pose))[0] for pose in made.poses])
+    object.__setattr__(made, "shapes", np.tile(shape, (6, 1, 1)))
+    object.__setattr__(made, "uv", uv)
+    of_camera = {uv[0, camera].tobytes(): uv[:, camera] for camera in range(2)}
+    monkeypatch.setattr(head_real.simplest, "flowed_points", lambda images, start: of_camera[start.tobytes()])
+    found = head_real.without_tracker(made, made.frames(0, 6))
+    # Millimetres, of pixels that are rounded to float32: 3e-5 at 650 mm, times the depth over the base line.
+    np.testing.assert_allclose(found[:, :3], made.poses[:, :3], atol=0.02)
+    np.testing.assert_allclose(found[:, 3:], made.poses[:, 3:], atol=2e-4)

@@ -46,10 +46,10 @@ def test_blobs_are_projected_back_and_keep_their_names():
         feet, _ = camera.project(jnp.asarray(np.c_[at, np.zeros(2)], jnp.float32))
         for u, v in np.round(np.asarray(feet)).astype(int):
             image[v - 60 : v, u - 10 : u + 10] = 250
-    found = simplest.followed_blobs([*images, *25 * [np.full_like(images[0], 100)]], camera)
+    found = simplest.followed_blobs(images, np.full_like(images[0], 100), camera)
     assert len(found) == 12
-    assert len({who for _, who, _ in found}) == 2
-    for frame, _, place in found:
+    assert len({who for _, who, *_ in found}) == 2
+    for frame, _, *place in found:
         assert np.linalg.norm(place - places[frame], axis=1).min() < 0.1
 
 
@@ -57,11 +57,16 @@ def test_blobs_are_projected_back_and_keep_their_names():
 def test_fingers_are_the_gaps_of_the_hull_and_one(fingers):
     rows, cols = np.mgrid[:240, :320]
     mask = (rows - 180) ** 2 + (cols - 160) ** 2 < 45**2
-    for angle in 0.45 * (np.arange(fingers) - (fingers - 1) / 2):
+    angles = 0.45 * (np.arange(fingers) - (fingers - 1) / 2)
+    for angle in angles:
         along, across = np.sin(angle), np.cos(angle)
         forward = (cols - 160) * along - (rows - 180) * across
         mask |= (forward > 0) & (forward < 130) & (np.abs((cols - 160) * across + (rows - 180) * along) < 8)
     assert simplest.fingers_by_hull(mask) == fingers
+    ends = simplest.tips_by_hull(mask)
+    assert len(ends) == fingers
+    true = np.array([(160 + 130 * np.sin(angle), 180 - 130 * np.cos(angle)) for angle in angles])
+    assert np.linalg.norm(ends[:, None] - true, axis=-1).min(axis=0).max() < 10  # half the width of these fingers is 8
 
 
 def test_a_stroke_is_nearest_to_itself_drawn_larger_and_slower():
