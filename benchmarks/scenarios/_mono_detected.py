@@ -7,11 +7,13 @@ those whom the detectors' errors were measured on (`jaxfilters fit face-detector
 """
 
 import sys
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import cv2
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks.metrics import Metric
@@ -27,6 +29,7 @@ from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
 from jaxfilters.trackers.head.mono.session import MonoSession
+from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.io.face_models import people_face_model
 
 SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
@@ -64,13 +67,11 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     Raises:
         RecordingError: if a recording is missing.
     """
-    model = read_ict(recording_folder("ict_face_model"))
-    turns = read_biwi(recording_folder("biwi_head_rotation"))
-    speech = read_livelink(recording_folder("livelinkface_take"), model.names)
+    film = filming(quick, seed)
     faces = {"modelled": modelled_face(seed)}
     if not quick:
         faces["modelled_rendered"] = people_face_model().model
-    detectors, num_frames = available_detectors(), QUICK_NUM_FRAMES if quick else NUM_FRAMES
+    detectors = available_detectors()
     runs: dict[str, list[DetectedRun]] = {}
 
     def follow(made: IctSequence, kind: str, face: MultilinearFace, person: int) -> None:
@@ -82,16 +83,33 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
             sys.stderr.write(f"  person {person}, {kind}, {name}: mean errors {message}\n")
 
     for person, stretch in PEOPLE[: 1 if quick else None]:
-        made = filmed(model, turns[stretch], speech, person + seed, num_frames)
+        made = film(person, stretch)
         for kind, face in faces.items():
             follow(made, kind, face, person)
         for worn, how in ({} if quick else WORN).items():
-            made = filmed(model, turns[stretch], speech, person + seed, num_frames, **how)
+            made = film(person, stretch, **how)
             follow(made, f"modelled_{worn}", faces["modelled_rendered"], person)
     metrics: dict[str, Metric] = {}
     for name, of_people in runs.items():
         metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])
     return metrics
+
+
+def filming(quick: bool, seed: int) -> Callable[..., IctSequence]:
+    """`(person, stretch, **worn) -> sequence`: people who turn and speak as recorded, before one camera.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
+    model = read_ict(recording_folder("ict_face_model"))
+    turns = read_biwi(recording_folder("biwi_head_rotation"))
+    speech = read_livelink(recording_folder("livelinkface_take"), model.names)
+    num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
+
+    def film(person: int, stretch: int, **worn: Any) -> IctSequence:
+        return filmed(model, turns[stretch], speech, person + seed, num_frames, **worn)
+
+    return film
 
 
 def available_detectors() -> dict[str, Detector]:
@@ -114,19 +132,23 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
         detector: Of the landmarks.
         seed: Of the particles.
     """
+    images = np.concatenate([part for _, part in made.chunks(PIECE)])
+    track = followed(made, images, face, detector, seed)
+    located = [
+        pnp(face, made.rig, detector, image) if i % EVERY == 0 else np.full(6, np.nan)
+        for i, image in enumerate(images[:, 0])
+    ]
+    return _evaluated(made, track, np.stack(located))
+
+
+def followed(
+    made: IctSequence, images: UInt8[np.ndarray, "t 1 rows cols"], face: MultilinearFace, detector: Detector, seed: int
+) -> MonoTrack:
+    """Track of all images of one person, of whom nothing else is known."""
     session = MonoSession(made.rig, face, MonoConfig(seed=seed), detector=detector)
-    poses, stds, status, located = [], [], [], []
-    for start, images in made.chunks(PIECE):
-        track = session.process(images, made.times[start : start + len(images)])
-        poses.append(track.pose)
-        stds.append(track.pose_std)
-        status.append(track.status)
-        located += [
-            pnp(face, made.rig, detector, image) if i % EVERY == 0 else np.full(6, np.nan)
-            for i, image in enumerate(images[:, 0], start)
-        ]
-    pose, std = np.concatenate(poses), np.concatenate(stds)
-    return _evaluated(made, pose, std, np.isin(np.concatenate(status), TRACKED), np.stack(located))
+    pieces = [slice(start, start + PIECE) for start in range(0, len(images), PIECE)]
+    parts = [session.process(images[piece], made.times[piece]) for piece in pieces]
+    return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
 
 
 def pnp(
@@ -176,20 +198,16 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
     return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
 
 
-def _evaluated(
-    made: IctSequence,
-    pose: Float[np.ndarray, "t 6"],
-    std: Float[np.ndarray, "t 6"],
-    is_tracked: Bool[np.ndarray, " t"],
-    located: Float[np.ndarray, "t 6"],
-) -> DetectedRun:
+def pose_errors(made: IctSequence, poses: Float[np.ndarray, "t 6"]) -> Float[np.ndarray, "t 6"]:
+    """Millimetres and degrees, angles within half a turn."""
+    errors = (np.asarray(poses, float) - made.poses) * DISPLAY
+    return np.concatenate([errors[:, :3], (errors[:, 3:] + 180) % 360 - 180], axis=1)
+
+
+def _evaluated(made: IctSequence, track: MonoTrack, located: Float[np.ndarray, "t 6"]) -> DetectedRun:
+    is_tracked = np.isin(track.status, TRACKED)
     rows = np.flatnonzero(is_tracked & np.isfinite(located[:, 0]))
     begun = int(np.argmax(is_tracked)) if is_tracked.any() else 0
-    errors, beside = (_turned((one[rows] - made.poses[rows]) * DISPLAY) for one in (pose, located))
+    errors, beside = (pose_errors(made, one)[rows] for one in (track.pose, located))
     lost = float(np.mean(~is_tracked[begun:]))
-    return DetectedRun(errors, std[rows] * DISPLAY, beside, made.poses[rows, 2], lost)
-
-
-def _turned(errors: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 6"]:
-    """With angles within half a turn."""
-    return np.concatenate([errors[:, :3], (errors[:, 3:] + 180) % 360 - 180], axis=1)
+    return DetectedRun(errors, track.pose_std[rows] * DISPLAY, beside, made.poses[rows, 2], lost)

@@ -64,8 +64,8 @@ class Modelled(NamedTuple):
     """(frames, 6) millimetres and degrees, as `AXES`."""
     landmark_mm: np.ndarray
     """(frames, 10) distances."""
-    within: np.ndarray
-    """(frames, 6) whether the error is within two standard deviations."""
+    deviations: np.ndarray
+    """(frames, 6) standard deviations that the tracker claims."""
     simple: np.ndarray
     """(frames, 6) errors without a tracker."""
 
@@ -120,6 +120,16 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
 
 def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     """Losses and errors by yaw of the modelled people."""
+    parts = modelled_people(quick, seed)
+    return yaw_metrics(Modelled(*(np.concatenate(rows) for rows in zip(*parts, strict=True))))
+
+
+def modelled_people(quick: bool, seed: int) -> list[Modelled]:
+    """All of them, followed.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
     model = read_ict(recording_folder("ict_face_model"))
     turns = read_biwi(recording_folder("biwi_head_rotation"))
     speech = read_livelink(recording_folder("livelinkface_take"), model.names)
@@ -128,7 +138,7 @@ def modelled_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         made = modelled(model, turns[stretch], speech, person + seed, QUICK_NUM_FRAMES if quick else NUM_FRAMES)
         parts.append(followed(made, seed))
         sys.stderr.write(f"  person {person}: {100 * parts[-1].is_tracked.mean():.1f} % tracked\n")
-    return yaw_metrics(Modelled(*(np.concatenate(rows) for rows in zip(*parts, strict=True))))
+    return parts
 
 
 def modelled(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int) -> IctSequence:
@@ -151,7 +161,7 @@ def followed(made: IctSequence, seed: int) -> Modelled:
         yaw_deg=np.abs(np.degrees(made.poses[:, 4])),
         errors=errors,
         landmark_mm=np.linalg.norm(apart, axis=-1),
-        within=np.abs(errors) <= 2 * np.asarray(track.pose_std) * DISPLAY,
+        deviations=np.asarray(track.pose_std, float) * DISPLAY,
         simple=_pose_errors(without_tracker(made, images), made.poses),
     )
     return Modelled(*(rows[first:] for rows in found))
@@ -188,7 +198,8 @@ def yaw_metrics(found: Modelled) -> dict[str, Metric]:
             }
         landmark = float(np.sqrt(np.mean(found.landmark_mm[rows] ** 2)))
         metrics[f"ict_error_landmark_{name}"] = Metric(landmark, "mm", "lower")
-        metrics[f"ict_coverage_{name}"] = Metric(100 * float(found.within[rows].mean()), "%", "higher")
+        within = np.abs(found.errors[rows]) <= 2 * found.deviations[rows]
+        metrics[f"ict_coverage_{name}"] = Metric(100 * float(within.mean()), "%", "higher")
     return metrics
 
 

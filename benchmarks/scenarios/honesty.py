@@ -22,7 +22,14 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
-from jaxfilters.benchmarks.scenarios import _keypoint_filters, _real_hands, people_pets
+from jaxfilters.benchmarks.scenarios import (
+    _keypoint_filters,
+    _mono_detected,
+    _mono_real,
+    _real_hands,
+    head_real,
+    people_pets,
+)
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
 from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
 from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
@@ -32,8 +39,10 @@ from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_cap
 from jaxfilters.models.synthetic.face_sequence import sequence
 from jaxfilters.trackers import hand_depth
 from jaxfilters.trackers.head.common.config import HeadConfig
+from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.config import MonoConfig
-from jaxfilters.trackers.io.face_models import default_face_model
+from jaxfilters.trackers.head.mono.detectors import DETECTORS
+from jaxfilters.trackers.io.face_models import default_face_model, people_face_model
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.state import PeopleConfig
 
@@ -89,6 +98,24 @@ def mono_claims(quick: bool, seed: int) -> Claims:
     num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
     runs = [follow_all(talking_head(head, num_frames), {"": contender}, head)[""] for head in _heads(quick, seed)]
     return Claims("head_mono", "rendered", POSE, [_of_mono(run) for run in runs])
+
+
+def stereo_people_claims(quick: bool, seed: int) -> Claims:
+    """People of the ICT face model before two cameras, who turn and speak as recorded."""
+    people = head_real.modelled_people(quick, seed)
+    return Claims("head_stereo", "ict", POSE, [_where(p.is_tracked, p.errors, p.deviations) for p in people])
+
+
+def mono_people_claims(quick: bool, seed: int) -> Claims:
+    """The same kind of people before one camera: found by the cascades, followed with the model of the package."""
+    film, recordings = _mono_detected.filming(quick, seed), []
+    for person, stretch in _mono_real.PEOPLE[: 1 if quick else None]:
+        made = film(person, stretch)
+        images = np.concatenate([part for _, part in made.chunks()])
+        track = _mono_detected.followed(made, images, people_face_model().model, DETECTORS["cascades"](), person + seed)
+        errors = _mono_detected.pose_errors(made, track.pose)
+        recordings.append(_where(np.isin(track.status, TRACKED), errors, track.pose_std * DISPLAY))
+    return Claims("head_mono", "ict", POSE, recordings)
 
 
 def hand_claims(quick: bool, seed: int) -> Claims:
@@ -184,13 +211,15 @@ def _heads(quick: bool, seed: int) -> range:
 
 
 def _of_head(run: HeadRun) -> Recording:
-    tracked = run.is_tracked[:, None]
-    return Recording(np.where(tracked, run.errors, np.nan), run.deviations)
+    return _where(run.is_tracked, run.errors, run.deviations)
 
 
 def _of_mono(run: MonoRun) -> Recording:
-    tracked = run.is_tracked[:, None]
-    return Recording(np.where(tracked, run.errors, np.nan), np.asarray(run.track.pose_std, float) * DISPLAY)
+    return _where(run.is_tracked, run.errors, np.asarray(run.track.pose_std, float) * DISPLAY)
+
+
+def _where(is_tracked: np.ndarray, errors: np.ndarray, deviations: np.ndarray) -> Recording:
+    return Recording(np.where(is_tracked[:, None], errors, np.nan), np.asarray(deviations, float))
 
 
 SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
@@ -199,6 +228,8 @@ SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
     "people, PETS 2009": people_claims,
     "head before two cameras, rendered": stereo_claims,
     "head before one camera, rendered": mono_claims,
+    "head before two cameras, people of the ICT model": stereo_people_claims,
+    "head before one camera, people of the ICT model": mono_people_claims,
     **{f"key points as {model} noise, NYU": partial(keypoint_claims, model) for model in MODELS},
 }
 """One function `(quick, seed) -> Claims` for each system and kind of data."""

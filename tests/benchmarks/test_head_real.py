@@ -26,7 +26,7 @@ def test_errors_go_by_yaw_and_only_of_tracked_frames():
         yaw_deg=np.array([5.0, 15.0, 50.0, 5.0]),
         errors=errors,
         landmark_mm=np.repeat([[0.5], [1.5], [2.5], [np.nan]], 10, axis=1),
-        within=np.repeat([[True], [False], [True], [False]], 6, axis=1),
+        deviations=np.repeat([[1.0], [0.5], [2.0], [np.nan]], 6, axis=1),
         simple=np.repeat([[3.0], [4.0], [9.0], [9.0]], 6, axis=1),
     )
     metrics = head_real.yaw_metrics(found)
@@ -35,7 +35,7 @@ def test_errors_go_by_yaw_and_only_of_tracked_frames():
     assert metrics["ict_error_yaw_within_40deg"].value == pytest.approx(np.sqrt(2.5))
     assert metrics["ict_error_yaw_within_40deg_simple"].value == pytest.approx(np.sqrt(12.5))
     assert metrics["ict_error_landmark_10_20"].value == 1.5
-    assert metrics["ict_coverage_0_10"].value == 100
+    assert [metrics[f"ict_coverage_{name}"].value for name in ("0_10", "10_20", "beyond_40")] == [100, 0, 100]
     assert "ict_error_x_20_30" not in metrics
     assert metrics["ict_error_z_0_10"].unit == "mm"
 
@@ -146,7 +146,7 @@ def test_a_modelled_person_counts_from_registration_on(monkeypatch):
     np.testing.assert_allclose(found.errors[[0, 1, 3]], np.tile([3, 0, 0, roll, 0, 0], (3, 1)), atol=1e-9)
     assert np.isnan(found.errors[2]).all()
     np.testing.assert_allclose(found.landmark_mm[[0, 1, 3]], 3.0)
-    np.testing.assert_array_equal(found.within[0], [True, True, True, False, True, True])
+    np.testing.assert_allclose(found.deviations[0], 2.0)
     np.testing.assert_allclose(found.simple, np.tile([0, 0, 5, 0, 0, 0], (4, 1)), atol=1e-9)
 
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks import results_page
-from jaxfilters.benchmarks.metrics import report
+from jaxfilters.benchmarks.metrics import Metric, report
 from jaxfilters.benchmarks.scenarios import _simplest as simplest
 from jaxfilters.benchmarks.scenarios import systems
 from jaxfilters.models.camera import Pinhole
@@ -91,12 +91,24 @@ def test_the_nearest_stroke_by_time_warping_is_that_of_the_recursion_over_all_pa
     assert simplest.nearest_by_warping(known, [str(i) for i in range(30)], strokes) == expected
 
 
+ENVIRONMENT = {"jaxfilters": "0", "jax": "0", "numpy": "0", "python": "0", "cpu": "c", "cores": 1, "device": "d"}
+
+
+def test_the_page_begins_with_recordings_whose_simplest_thing_was_measured_too():
+    measured = {"mota": 98.916, "mota_simple": 62.44, "idf1": 92.0}
+    found = {name: Metric(value, "%", "higher") for name, value in measured.items()}
+    page = results_page.results_page([report("people-pets", found, ENVIRONMENT)], {})
+    rows = [line for line in page.splitlines() if line.startswith("| people on a floor")]
+    assert len(rows) == 1
+    assert rows[0].endswith("| MOTA, higher is better | 98.9 % | 62.4 % | blobs, projected back |")
+    assert "on recordings" not in results_page.results_page([report("scale", {}, ENVIRONMENT)], {})
+
+
 @pytest.mark.system
 def test_the_page_has_a_row_for_what_a_run_measures():
     found = systems.symbol_metrics(True, 0)
     assert found["symbols_right"].value > 80
-    environment = {"jaxfilters": "0", "jax": "0", "numpy": "0", "python": "0", "cpu": "c", "cores": 1, "device": "d"}
-    page = results_page.results_page([report("systems", found, environment)], {})
+    page = results_page.results_page([report("systems", found, ENVIRONMENT)], {})
     row = next(line for line in page.splitlines() if line.startswith("| symbols"))
     assert row.endswith("| nearest by dynamic time warping | 99.2 % |")
     assert f"| {found['symbols_right'].value:.3g} % | {found['symbols_right_simple'].value:.3g} % |" in row
