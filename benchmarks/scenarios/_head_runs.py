@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
@@ -17,8 +18,6 @@ from jaxfilters.trackers.head.stereo.session import HeadSession
 
 AXES = ("x", "y", "z", "roll", "yaw", "pitch")
 AXIS_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
-DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
-"""From millimetres and radians to millimetres and degrees."""
 BLOCK = 40
 """Frames in memory at once."""
 ASTRAY_PX = 8.0
@@ -36,7 +35,7 @@ class HeadRun(NamedTuple):
     @property
     def errors(self) -> Float[np.ndarray, "t 6"]:
         """Of the pose, millimetres and degrees; NaN where there is none."""
-        return (np.asarray(self.track.pose, float) - self.truth.poses[1:]) * DISPLAY
+        return pose_errors(self.track.pose, self.truth.poses[1:])
 
     @property
     def deviations(self) -> Float[np.ndarray, "t 6"]:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.benchmarks.scenarios._mono_real import NUM_FRAMES, PEOPLE, QUICK_NUM_FRAMES, filmed, modelled_face
-from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.synthetic.ict_course import read_biwi, read_livelink
@@ -198,16 +198,10 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
     return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
 
 
-def pose_errors(made: IctSequence, poses: Float[np.ndarray, "t 6"]) -> Float[np.ndarray, "t 6"]:
-    """Millimetres and degrees, angles within half a turn."""
-    errors = (np.asarray(poses, float) - made.poses) * DISPLAY
-    return np.concatenate([errors[:, :3], (errors[:, 3:] + 180) % 360 - 180], axis=1)
-
-
 def _evaluated(made: IctSequence, track: MonoTrack, located: Float[np.ndarray, "t 6"]) -> DetectedRun:
     is_tracked = np.isin(track.status, TRACKED)
     rows = np.flatnonzero(is_tracked & np.isfinite(located[:, 0]))
     begun = int(np.argmax(is_tracked)) if is_tracked.any() else 0
-    errors, beside = (pose_errors(made, one)[rows] for one in (track.pose, located))
+    errors, beside = (pose_errors(one, made.poses)[rows] for one in (track.pose, located))
     lost = float(np.mean(~is_tracked[begun:]))
-    return DetectedRun(errors, track.pose_std[rows] * DISPLAY, beside, made.poses[rows, 2], lost)
+    return DetectedRun(errors, np.asarray(track.pose_std)[rows] * DISPLAY, beside, made.poses[rows, 2], lost)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.gallery import Gallery, remember
 from jaxfilters.models.face.landmarks import FROM_68
@@ -25,8 +26,6 @@ from jaxfilters.trackers.head.mono.detections import Detections
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoTrack
 
-DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
-"""From millimetres and radians to millimetres and degrees."""
 START_FRAMES, DETECTED_PX = (0, 6, 12, 18, 24), 0.5
 """In which landmarks are detected, and the standard deviation of each coordinate."""
 BLOCK = 40
@@ -145,8 +144,7 @@ def evaluated(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:
     """A track beside the truth, without the frames up to the start."""
     first = START_FRAMES[-1] + 1
     track = jax.tree.map(lambda leaf: leaf[first:], track)
-    errors = (np.asarray(track.pose, float) - made.poses[first:]) * DISPLAY
-    errors[:, 3:] = (errors[:, 3:] + 180) % 360 - 180
+    errors = pose_errors(track.pose, made.poses[first:])
     centred = lambda shapes: shapes - shapes.mean(axis=1, keepdims=True)
     apart = centred(np.asarray(track.shape, float)) - centred(made.shapes[first:])
     return MonoRun(track, errors, np.linalg.norm(apart, axis=-1).mean(axis=1), np.degrees(made.poses[first:, 4]))

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
-from jaxfilters.benchmarks.scenarios._mono_runs import DETECTED_PX, DISPLAY, camera
+from jaxfilters.benchmarks.scenarios._mono_runs import DETECTED_PX, camera
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY
 from jaxfilters.models.face.bundle import Bundle, projected
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior

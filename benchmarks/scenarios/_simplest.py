@@ -121,7 +121,7 @@ def followed_blobs(
             if who < 0 or near[who] > GATE_M:
                 who, next_identity = next_identity, next_identity + 1
             here[who] = place
-            rows.append((index, who, *map(float, place)))
+            rows.append((index, who, float(place[0]), float(place[1])))
         last = here
     return rows
 
@@ -188,10 +188,14 @@ def fingers_by_hull(mask: np.ndarray) -> int:
 
 
 def hand_by_colour(image: UInt8[np.ndarray, "rows cols 3"]) -> Bool[np.ndarray, "rows cols"]:
-    """The smaller part of a BGR image, divided by N. Otsu's threshold (1979) in the red chrominance."""
+    """Where a hand is in a BGR image that N. Otsu's threshold (1979) in the red chrominance divides.
+
+    Of the two parts, the one that has less of the border.
+    """
     red = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb)[..., 1], (5, 5), 0)
     redder = cv2.threshold(red, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1] > 0
-    return redder if redder.mean() < 1 / 2 else ~redder
+    border = np.concatenate([redder[0], redder[-1], redder[:, 0], redder[:, -1]])
+    return redder if border.mean() < 1 / 2 else ~redder
 
 
 def tips_by_hull(mask: np.ndarray) -> Float[np.ndarray, "n 2"]:

@@ -27,7 +27,8 @@ from scipy.spatial.transform import Rotation
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios import _simplest as simplest
-from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS, DISPLAY
+from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.rig import monocular
@@ -153,8 +154,8 @@ def followed(made: IctSequence, seed: int) -> Modelled:
     images = np.concatenate([part for _, part in made.chunks(PIECE)])
     track = follow(session, images, made.times)
     is_tracked = np.isin(track.status, TRACKED)
-    errors = _pose_errors(track.pose, made.poses)
-    apart = placed(np.asarray(track.shape, float), track.pose) - placed(made.shapes, made.poses)
+    errors = pose_errors(track.pose, made.poses)
+    apart = placed(np.asarray(track.shape, float), np.asarray(track.pose)) - placed(made.shapes, made.poses)
     first = int(np.argmax(is_tracked)) if is_tracked.any() else 0
     found = Modelled(
         is_tracked=is_tracked,
@@ -162,7 +163,7 @@ def followed(made: IctSequence, seed: int) -> Modelled:
         errors=errors,
         landmark_mm=np.linalg.norm(apart, axis=-1),
         deviations=np.asarray(track.pose_std, float) * DISPLAY,
-        simple=_pose_errors(without_tracker(made, images), made.poses),
+        simple=pose_errors(without_tracker(made, images), made.poses),
     )
     return Modelled(*(rows[first:] for rows in found))
 
@@ -172,13 +173,6 @@ def without_tracker(made: IctSequence, images: np.ndarray) -> Float[np.ndarray, 
     uv = [simplest.flowed_points(images[:, camera], np.asarray(made.uv[0, camera])) for camera in range(2)]
     shape = np.asarray(made.shapes[0], float)
     return simplest.pose_by_triangulation(shape, np.stack(uv, axis=1), simplest.projections(made.rig))
-
-
-def _pose_errors(poses: np.ndarray, truth: np.ndarray) -> Float[np.ndarray, "frames 6"]:
-    """Millimetres and degrees, angles within half a turn."""
-    errors = (np.asarray(poses, float) - truth) * DISPLAY
-    errors[:, 3:] = (errors[:, 3:] + 180) % 360 - 180
-    return errors
 
 
 def yaw_metrics(found: Modelled) -> dict[str, Metric]:

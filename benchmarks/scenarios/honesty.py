@@ -33,8 +33,9 @@ from jaxfilters.benchmarks.scenarios import (
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
 from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
 from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
-from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, Contender, MonoRun, follow_all, talking_head
+from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, follow_all, talking_head
 from jaxfilters.benchmarks.scenarios._pets import load_pets
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
 from jaxfilters.benchmarks.scenarios._real_mocap import FINGERS, VIEWS, load_capture, track_lengths, true_lengths
 from jaxfilters.models.synthetic.face_sequence import sequence
 from jaxfilters.trackers import hand_depth
@@ -113,8 +114,8 @@ def mono_people_claims(quick: bool, seed: int) -> Claims:
         made = film(person, stretch)
         images = np.concatenate([part for _, part in made.chunks()])
         track = _mono_detected.followed(made, images, people_face_model().model, DETECTORS["cascades"](), person + seed)
-        errors = _mono_detected.pose_errors(made, track.pose)
-        recordings.append(_where(np.isin(track.status, TRACKED), errors, track.pose_std * DISPLAY))
+        errors = pose_errors(track.pose, made.poses)
+        recordings.append(_where(np.isin(track.status, TRACKED), errors, np.asarray(track.pose_std) * DISPLAY))
     return Claims("head_mono", "ict", POSE, recordings)
 
 

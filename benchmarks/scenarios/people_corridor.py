@@ -64,7 +64,8 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
         true = annotated(folder / "cols1gt.xml", camera)
     except (InputError, OSError, KeyError, ValueError, AttributeError) as error:
         raise RecordingError(f"{folder} cannot be read: {error!r}") from error
-    moments = list(itertools.islice(video.images(), QUICK_FRAMES if quick else None))
+    taken = itertools.islice(video.images(), QUICK_FRAMES if quick else None)
+    moments = [(time_s, image) for time_s, image in taken if image is not None]
     samples = video.sample(PRIMING_IMAGES)
     true = FloorTracks(*(column[true.frame < len(moments)] for column in true))
     evaluated = partial(_scores, true, np.asarray(camera.position())[:2])
@@ -118,7 +119,11 @@ def _is_on_floor(xy: np.ndarray) -> np.ndarray:
 
 def _rows(tracks: dict[int, list[Sighting]]) -> list[tuple[int, int, float, float]]:
     """Frame, identity, X and Y."""
-    return [(one.frame, identity, *map(float, one.mean[:2])) for identity, track in tracks.items() for one in track]
+    return [
+        (one.frame, identity, float(one.mean[0]), float(one.mean[1]))
+        for identity, track in tracks.items()
+        for one in track
+    ]
 
 
 def _scores(true: FloorTracks, camera_xy_m: np.ndarray, rows: list[tuple[int, int, float, float]]) -> dict[str, float]:

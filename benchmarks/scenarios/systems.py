@@ -23,7 +23,8 @@ from jaxfilters.benchmarks.scenarios import _simplest as simplest
 from jaxfilters.benchmarks.scenarios import fingertips
 from jaxfilters.benchmarks.scenarios._articulated_paper import LAST
 from jaxfilters.benchmarks.scenarios._head_runs import follow, rmse
-from jaxfilters.benchmarks.scenarios._mono_runs import DISPLAY, START_FRAMES, Contender, follow_all, talking_head
+from jaxfilters.benchmarks.scenarios._mono_runs import START_FRAMES, Contender, follow_all, talking_head
+from jaxfilters.benchmarks.scenarios._poses import pose_errors
 from jaxfilters.models.fingertip.segmentation import bright_mask
 from jaxfilters.models.gesture.coded import learn_paths, recognise_paths
 from jaxfilters.models.hand.skeleton import anatomical_hand
@@ -137,7 +138,7 @@ def mono_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         poses = simplest.pose_by_pnp(
             np.asarray(made.shapes[0], float), simplest.flowed_points(images, made.uv[0, 0]), made.rig
         )
-        errors["_simple"].append(np.mean(np.abs(_pose_errors(poses, made.poses))[first:], axis=0))
+        errors["_simple"].append(np.mean(np.abs(pose_errors(poses, made.poses))[first:], axis=0))
     return _pose_metrics("head_mono", errors, MONO_PAPER)
 
 
@@ -177,14 +178,8 @@ def symbol_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     return found | {"symbols_right_paper": Metric(SYMBOLS_PAPER, "%", "higher")}
 
 
-def _pose_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    off = (np.asarray(poses, float) - np.asarray(truth, float)) * DISPLAY
-    off[:, 3:] = (off[:, 3:] + 180) % 360 - 180
-    return off
-
-
 def _pose_rms(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.mean(_pose_errors(poses, truth) ** 2, axis=0))
+    return np.sqrt(np.mean(pose_errors(poses, truth) ** 2, axis=0))
 
 
 def _pose_metrics(system: str, errors: dict[str, list[np.ndarray]], paper: dict[str, float]) -> dict[str, Metric]:

@@ -13,7 +13,8 @@ from jaxfilters.benchmarks.scenarios import _head_runs as runs
 from jaxfilters.benchmarks.scenarios import _head_speed as speed
 from jaxfilters.benchmarks.scenarios import head_stereo
 from jaxfilters.benchmarks.scenarios._head_deformation import Schedule
-from jaxfilters.benchmarks.scenarios._head_runs import AXES, DISPLAY, HeadRun
+from jaxfilters.benchmarks.scenarios._head_runs import AXES, HeadRun
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
