@@ -51,7 +51,7 @@ how each was measured.
 """
 
 
-class _Row(NamedTuple):
+class Row(NamedTuple):
     """A system on recordings, beside the simplest thing, as a run of a scenario measured both."""
 
     system: str
@@ -64,8 +64,8 @@ class _Row(NamedTuple):
 
 
 _ICT = "people of the ICT face model, heads and faces moving as recorded"
-_ON_RECORDINGS = (
-    _Row(
+ON_RECORDINGS = (
+    Row(
         "hand in depth images",
         "12 recordings of real hands",
         "joints",
@@ -75,7 +75,7 @@ _ON_RECORDINGS = (
         "joint_error_mm_real_registration",
     ),
     *(
-        _Row(
+        Row(
             "hand from key points",
             f"{name}, key points of a network, size unknown",
             "joints from the wrist",
@@ -87,7 +87,7 @@ _ON_RECORDINGS = (
         for name in ("ICVL", "NYU")
     ),
     *(
-        _Row("people on a floor", recording, quantity, "blobs, projected back", scenario, metric, f"{metric}_simple")
+        Row("people on a floor", recording, quantity, "blobs, projected back", scenario, metric, f"{metric}_simple")
         for recording, scenario in (
             ("PETS 2009 S2.L1, view 1", "people-pets"),
             ("CAVIAR OneLeaveShop1cor", "people-corridor"),
@@ -99,7 +99,7 @@ _ON_RECORDINGS = (
         )
     ),
     *(
-        _Row(
+        Row(
             "head before two cameras",
             _ICT,
             quantity,
@@ -111,7 +111,7 @@ _ON_RECORDINGS = (
         for quantity, axis in (("yaw", "yaw"), ("pitch", "pitch"), ("distance", "z"))
     ),
     *(
-        _Row(
+        Row(
             "face before one camera",
             _ICT,
             f"{quantity}, {detector}",
@@ -124,7 +124,7 @@ _ON_RECORDINGS = (
         for quantity, metric in (("yaw", "yaw_rms_deg"), ("pitch", "pitch_rms_deg"), ("distance", "z_error_mm"))
     ),
     *(
-        _Row(
+        Row(
             "fingertips",
             f"`{name}`, 20 marked frames",
             quantity,
@@ -137,7 +137,7 @@ _ON_RECORDINGS = (
         for quantity, metric in (("found, higher is better", "found_pct"), ("false", "false_pct"))
     ),
     *(
-        _Row(
+        Row(
             "symbols",
             recording,
             "right, higher is better",
@@ -205,7 +205,7 @@ def _on_recordings(documents: Sequence[Mapping[str, Any]]) -> str:
     """The first table of the page, of what the runs measured; nothing where none did."""
     metrics = {document["scenario"]: document["metrics"] for document in documents}
     rows = []
-    for row in _ON_RECORDINGS:
+    for row in ON_RECORDINGS:
         of = metrics.get(row.scenario, {})
         if row.metric in of and row.metric_of_simplest in of:
             values = " | ".join(_valued(of[name]) for name in (row.metric, row.metric_of_simplest))

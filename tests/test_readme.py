@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters.benchmarks.results_page import ON_RECORDINGS
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
@@ -70,6 +72,16 @@ def test_measured_results_are_those_of_the_page_of_results():
     assert {name: float(value) for value, name in rows} == {
         name: float(f"{measured[name]['value']:.2g}") for _, name in rows
     }
+
+
+def test_accuracy_on_recordings_is_that_of_the_page_of_results():
+    rows = re.findall(r"\| (\S+ \S+) \| (\S+ \S+) \| `([\w-]+)`: `(\w+)` \|$", README, re.MULTILINE)
+    assert len(rows) > 5
+    simplest = {(row.scenario, row.metric): row.metric_of_simplest for row in ON_RECORDINGS}
+    for value, value_of_simplest, scenario, name in rows:
+        measured = json.loads((ROOT / "docs" / "results" / f"{scenario}.json").read_text())["metrics"]
+        found = [measured[key] for key in (name, simplest[scenario, name])]
+        assert [value, value_of_simplest] == [f"{one['value']:.3g} {one['unit']}" for one in found]
 
 
 def test_values_of_the_page_of_benchmarks_are_those_of_the_baseline():
