@@ -46,16 +46,20 @@ class HandRecording(NamedTuple):
     """+1 for a right hand, -1 for a left one."""
 
 
-def load(name: str, num_frames: int = NUM_FRAMES, *, evenly: bool = False) -> HandRecording:
+def load(name: str, num_frames: int = NUM_FRAMES, *, every: int = 1, evenly: bool = False) -> HandRecording:
     """One of `DEVELOPMENT` or `HELD`: the frames in the middle of a motion, the first ones of a camera's recording.
 
-    With `evenly` the frames of a motion are spread over all of it, so that the times are no longer those of the motion.
+    Args:
+        name: Of the recording.
+        num_frames: How many frames, or as many as there are.
+        every: Each how manieth frame is taken: a camera of a lower rate.
+        evenly: The frames of a motion are spread over all of it, so that the times are no longer those of the motion.
 
     Raises:
         RecordingError: the data are not there.
     """
     if name == "hpx":
-        return _camera_recording(recording_folder("hpx_hand_rgbd") / "hpx.npz", num_frames)
+        return _camera_recording(recording_folder("hpx_hand_rgbd") / "hpx.npz", num_frames, every)
     with np.load(recording_folder("tzionas_hand_motion") / "tzionas_hand_motion.npz") as data:
         sequence, side = name.split("_")
         if f"seq{sequence}_{side}" not in data:
@@ -63,16 +67,16 @@ def load(name: str, num_frames: int = NUM_FRAMES, *, evenly: bool = False) -> Ha
         motion = data[f"seq{sequence}_{side}"].astype(float)
         hand = {part: data[f"{side}_{part}"] for part in ("bones", "verts", "faces", "weights", "bind")}
         matrix = data["K"]
-    first = max(0, (len(motion) - num_frames) // 2)
-    every = np.linspace(0, len(motion) - 1, num_frames).round().astype(int)
-    motion = motion[every] if evenly else motion[first : first + num_frames]
+    first = max(0, (len(motion) - every * num_frames) // 2)
+    spread = np.linspace(0, len(motion) - 1, num_frames).round().astype(int)
+    motion = motion[spread] if evenly else motion[first : first + every * num_frames : every]
     shape, rng = (480, 640), np.random.default_rng(int(sequence))
     depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape) for vertices in _skinned(motion, hand)])
     depth = np.round(depth + NOISE_M * rng.normal(size=depth.shape), 3)
     depth = np.where(np.isfinite(depth), depth, WALL_M).astype(np.float32)
     lengths = _tip_lengths(recording_folder("tzionas_hand_motion") / f"Model_Hand_{side}.SKEL")
     camera = Pinhole.from_matrix(matrix, shape)
-    times = np.arange(len(motion), dtype=np.float32) / np.float32(RATE)
+    times = np.arange(len(motion), dtype=np.float32) * np.float32(every / RATE)
     return HandRecording(camera, times, depth, _joints(motion, hand, lengths, side), 1.0 if side == "R" else -1.0)
 
 
@@ -84,12 +88,12 @@ def pip_flexion(joints: Float[np.ndarray, "t 21 3"]) -> Float[np.ndarray, "t 4"]
     return np.arccos(np.clip(np.sum(bones[:, :, 0] * bones[:, :, 1], axis=-1), -1.0, 1.0))
 
 
-def _camera_recording(path: Path, num_frames: int) -> HandRecording:
+def _camera_recording(path: Path, num_frames: int, every: int) -> HandRecording:
     recording = open_depth(path)
-    count = min(num_frames, len(recording))
-    depth = np.stack([recording[i] for i in range(count)])
-    times = (recording.times_s - recording.times_s[0]).astype(np.float32)[:count]
-    return HandRecording(recording.camera, times, depth, np.asarray(recording.joints)[:count], 1.0)
+    taken = np.arange(len(recording))[::every][:num_frames]
+    depth = np.stack([recording[i] for i in taken])
+    times = (recording.times_s - recording.times_s[0]).astype(np.float32)[taken]
+    return HandRecording(recording.camera, times, depth, np.asarray(recording.joints)[taken], 1.0)
 
 
 def _skinned(motion: Float[np.ndarray, "t b 3 4"], hand: dict[str, np.ndarray]) -> Iterator[Float[np.ndarray, "v 3"]]:

@@ -4,10 +4,11 @@ The plain particle filter on the pose against the Rao-Blackwellized one, without
 (the pose walks at random) and B (its velocity does) with sensor noise: the comparison of Kajihara and Tanaka, figures
 6, 7 and 10. Once with the improved set-up, once with the paper's own cost and likelihood (`*_paper_cost`). The full run
 adds, on data B, the other two proposals (`rbpf_plug_in`, `rbpf_plug_in_corrected`), a plain filter whose noise is as
-wide as what the Rao-Blackwellized one draws (`pf_wide`), and the tracker with its guide (`pf_guided`, `rbpf_guided`).
-Errors are means after the first ten frames; p-values are those of one-sided paired Wilcoxon signed-rank tests over the
-seeds. Then the tracker with either filter, and registration alone, on real hands (`_real_comparison`). A folder given
-with `--out` receives every run as it finishes, the tables, and plots.
+wide as what the Rao-Blackwellized one draws (`pf_wide`), the tracker with its guide (`pf_guided`, `rbpf_guided`), and
+registration alone from its start (`registration`). Errors are means after the first ten frames; p-values are those of
+one-sided paired Wilcoxon signed-rank tests over the seeds. Then the tracker with either filter, and registration alone,
+on real hands (`_real_comparison`). A folder given with `--out` receives every run as it finishes, the tables, and
+plots.
 """
 
 import sys
@@ -49,6 +50,9 @@ NUM_SEEDS, QUICK_NUM_SEEDS = 20, 7
 """Seven pairs at least: with fewer the exact test cannot fall below 0.01."""
 QUICK_NUM_FRAMES = 40
 PAPER_COST = "_paper_cost"
+WITHOUT_PARTICLES = ("frozen", "registration")
+GUIDED_TESTS = {"_guided_better": "pf_guided", "_guided_better_than_registration": "registration"}
+"""Of the Rao-Blackwellized tracker on data B, against what."""
 
 
 def run(
@@ -91,12 +95,16 @@ def accuracy_metrics(runs: list[Run]) -> dict[str, Metric]:
         metrics[f"joint_error_mm_{name}"] = Metric(float(one.of("joint_mm").mean()), "mm", "lower")
         if one.filter != "frozen":
             metrics[f"tip_error_mm_{name}"] = Metric(float(one.of("tip_mm").mean()), "mm", "lower")
-            metrics[f"mean_ess_{name}"] = Metric(float(one.of("ess").mean()), "particles", "higher")
+            if one.filter not in WITHOUT_PARTICLES:
+                metrics[f"mean_ess_{name}"] = Metric(float(one.of("ess").mean()), "particles", "higher")
             metrics[f"lost_runs_{name}"] = Metric(float(one.of("lost").sum()), f"of {len(one.runs)}", "lower")
     for cost in ("", PAPER_COST):
         for data in "AB":
             p = _p_value(runs, data, f"rbpf{cost}", f"pf{cost}")
             metrics[f"p_value_rbpf_better_{data.lower()}{cost}"] = Metric(p, "", "lower")
+    for test, baseline in GUIDED_TESTS.items():
+        if column(runs, "B", baseline).runs:
+            metrics[f"p_value_rbpf{test}_b"] = Metric(_p_value(runs, "B", "rbpf_guided", baseline), "", "lower")
     return metrics
 
 
@@ -113,8 +121,9 @@ def _filters(num_particles: int, quick: bool) -> dict[str, dict[str, Filtering]]
         for proposal in (plug_in, plug_in_corrected)
     }
     wide = hand.particle_filter(improved, num_particles, hand.spread_of_increments(improved))
+    extra["pf_wide"] = _filtering(improved, wide)
     guided = {f"{name}_guided": _guided(name, num_particles) for name in ("pf", "rbpf")}
-    return {"A": both, "B": both | extra | {"pf_wide": _filtering(improved, wide)} | guided}
+    return {"A": both, "B": both | extra | guided | {"registration": _registration}}
 
 
 def _filtering(setting: hand.Setting, filter: Filter) -> Filtering:
@@ -133,6 +142,15 @@ def _guided(name: str, num_particles: int) -> Filtering:
         return hand.Estimate(*map(jax.numpy.asarray, (found.pose, found.joints, found.effective_sample_size)))
 
     return filtering
+
+
+def _registration(key: AnyKey, frames: jax.Array) -> hand.Estimate:
+    """Registration alone, from the start that the tracker finds and with what it is given."""
+    config = HandDepthConfig(num_particles=64, hand="right", scale=1.0)
+    state = hand_depth.build(kinect_v2(), config, hand_geometry()).init(key, np.asarray(frames[0]))
+    setup = hand_depth.set_up(kinect_v2(), config, hand_geometry())
+    poses, joints = registered(setup, state, frames, jax.numpy.full(len(frames), FRAME_INTERVAL))
+    return hand.Estimate(poses, joints, jax.numpy.full(len(frames), jax.numpy.nan))
 
 
 def _frozen(key: AnyKey, frames: jax.Array) -> hand.Estimate:
@@ -243,7 +261,7 @@ def _accuracy_table(runs: list[Run]) -> str:
         error = one.of("joint_mm")
         spread = error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else np.nan
         baseline = "pf" + (PAPER_COST if PAPER_COST in one.filter else "_guided" if "guided" in one.filter else "")
-        tested = one.filter not in ("frozen", baseline)
+        tested = one.filter not in (*WITHOUT_PARTICLES, baseline)
         p = f"{_p_value(runs, one.data, one.filter, baseline):.2g}" if tested else ""
         cells = [f"{values[0]:.2f}", f"{spread:.2f}", *(f"{value:.2f}" for value in values[1:-1]), f"{values[-1]:.0f}"]
         cells += [f"{int(one.of('lost').sum())}/{len(one.runs)}", p]

@@ -74,6 +74,16 @@ def test_metrics_are_means_over_seeds_and_tests_of_pairs():
         assert metrics[f"p_value_rbpf_better_b{cost}"].value == pytest.approx(2.0**-8)
 
 
+def test_the_tracker_is_tested_against_registration_alone_on_data_b():
+    errors = {"rbpf_guided": 1.0 + np.arange(8.0), "pf_guided": 2.0 + np.arange(8.0), "registration": np.arange(8.0)}
+    made = [made_up("B", name, seed, error) for name, each in errors.items() for seed, error in enumerate(each)]
+    metrics = pf_vs_rbpf.accuracy_metrics(made_up_runs(np.ones((8, 2))) + made)
+    assert metrics["joint_error_mm_registration_b"].value == pytest.approx(3.5)
+    assert metrics["p_value_rbpf_guided_better_b"].value == pytest.approx(2.0**-8)
+    assert metrics["p_value_rbpf_guided_better_than_registration_b"].value == pytest.approx(1.0)
+    assert "mean_ess_registration_b" not in metrics
+
+
 def test_a_run_without_estimates_is_lost():
     assert made_up("B", "rbpf", 0, float("nan")).lost
     assert made_up("B", "rbpf", 0, 40.1).lost

@@ -8,6 +8,7 @@ from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios import _real_comparison, _real_hands
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics, open_palm
+from jaxfilters.trackers.tracker import Tracker
 
 
 def test_the_flexion_of_second_joints_is_that_of_the_pose():
@@ -45,6 +46,28 @@ def test_joints_lie_within_the_hand_that_is_rendered(name, data_dir):
     assert np.isnan(found.depth).sum() == 0
 
 
+@pytest.mark.data
+def test_a_lower_rate_takes_frames_at_its_own_times(data_dir):
+    del data_dir
+    all_of_them, every = _real_hands.load("08_R", num_frames=4), _real_hands.load("08_R", num_frames=2, every=2)
+    np.testing.assert_array_equal(every.joints, all_of_them.joints[::2])
+    np.testing.assert_allclose(every.times_s, [0, 2 / 30], atol=1e-7)
+    assert np.abs(every.depth - all_of_them.depth[::2]).max() < 12 * _real_hands.NOISE_M
+
+
+def test_registration_alone_is_told_the_time_between_frames(monkeypatch):
+    """A stand-in puts every joint as many metres aside as the frame comes seconds after the one before."""
+    camera = Pinhole.from_intrinsics(1.0, (0.0, 0.0), (1, 1))
+    times, joints = np.array([5.0, 5.1, 5.4], np.float32), np.zeros((3, 21, 3))
+    recording = _real_hands.HandRecording(camera, times, np.zeros((3, 1, 1), np.float32), joints, 1.0)
+    tracker = Tracker(lambda key, frame: None, lambda state, frames, times: None)
+    monkeypatch.setattr(_real_comparison.hand_depth, "build", lambda camera, config: tracker)
+    aside = lambda setup, state, frames, elapsed: (None, jnp.zeros((3, 21, 3)).at[..., 0].set(elapsed[:, None]))
+    monkeypatch.setattr(_real_comparison, "registered", aside)
+    expected = 1e3 * np.mean([1 / 30, 0.1, 0.3])
+    assert _real_comparison.registration_error(recording, 0) == pytest.approx(expected, rel=1e-5)
+
+
 def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     millimetres = {"rbpf": [5.0, 6, 7, 8, 9], "pf": [6.0, 7, 8, 9, 10], "registration": [4.0, 5, 6, 7, 8]}
     camera = Pinhole.from_intrinsics(1.0, (0.0, 0.0), (1, 1))
@@ -54,7 +77,8 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     def error_of(name, each, count=1000):
         return millimetres[name][int(each.side)] + 100 / count
 
-    monkeypatch.setattr(_real_comparison, "_recordings", lambda quick: recordings)
+    # At the lower rate only the first four are there.
+    monkeypatch.setattr(_real_comparison, "_recordings", lambda quick, every=1: recordings[: 4 if every == 6 else 5])
     monkeypatch.setattr(_real_comparison, "registration_error", lambda each, seed: error_of("registration", each, 1e9))
     monkeypatch.setattr(_real_comparison, "tracker_error", lambda name, count, each, seed: error_of(name, each, count))
     found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, quick=True).items()}
@@ -63,10 +87,13 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     assert found["p_value_rbpf_better_real"] == pytest.approx(1 / 32)  # all five pairs fall the same way
     assert found["p_value_rbpf_better_than_registration_real"] == pytest.approx(1.0)
     assert found["errors_by_n_real_rbpf_n8"] == pytest.approx(7 + 100 / 8)
+    assert found["joint_error_mm_real_every_6_rbpf"] == pytest.approx(7.5)
+    assert found["p_value_rbpf_better_real_every_6"] == pytest.approx(1 / 16)
+    assert found["p_value_rbpf_better_than_registration_real_every_6"] == pytest.approx(1.0)
 
 
 def test_without_recordings_there_is_nothing_to_compare(monkeypatch):
-    def missing(quick):
+    def missing(quick, every=1):
         raise RecordingError("not here")
 
     monkeypatch.setattr(_real_comparison, "_recordings", missing)
