@@ -42,8 +42,9 @@ QUICK_RECORDINGS, QUICK_NUM_FRAMES = 7, 12
 COUNTS, QUICK_COUNTS = (8, 64, 512, 4096), (8, 64)
 """Numbers of particles."""
 EVERY, QUICK_EVERY = (4, 6), (6,)
-"""Lower frame rates: each how manieth frame is taken. On the motions of the development the three ways cannot be told
-apart up to every third one."""
+"""One of so many frames is taken. On the motions of the development (two seeds) the three ways differ by less than 1 mm
+up to every third frame; registration alone, plain and Rao-Blackwellized filter have 8.3, 9.5 and 7.1 mm with every
+fourth, 14.2, 13.1 and 10.1 mm with every sixth."""
 LOW_RATE_NUM_FRAMES = 24
 """Frames that are taken: even the shortest motion has nearly as many at the lowest rate."""
 SIX_STEPS = RegistrationConfig(widths=(0.03,) * 2 + (0.015,) * 4)

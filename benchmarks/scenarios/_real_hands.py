@@ -52,7 +52,7 @@ def load(name: str, num_frames: int = NUM_FRAMES, *, every: int = 1, evenly: boo
     Args:
         name: Of the recording.
         num_frames: How many frames, or as many as there are.
-        every: Each how manieth frame is taken: a camera of a lower rate.
+        every: One of so many frames is taken, as by a camera of a lower rate.
         evenly: The frames of a motion are spread over all of it, so that the times are no longer those of the motion.
 
     Raises:

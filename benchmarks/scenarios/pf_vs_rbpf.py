@@ -33,7 +33,7 @@ from jaxfilters.benchmarks.scenarios._accuracy import (
     run_all,
 )
 from jaxfilters.benchmarks.scenarios._pf_vs_rbpf_plots import plot_times, plot_tracks
-from jaxfilters.benchmarks.scenarios._real_comparison import real_metrics
+from jaxfilters.benchmarks.scenarios._real_comparison import real_metrics, registered
 from jaxfilters.benchmarks.scenarios._step_time import StepTimes, measure, measure_variants
 from jaxfilters.filter import Filter
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm

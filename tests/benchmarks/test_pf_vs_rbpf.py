@@ -15,6 +15,7 @@ from jaxfilters.benchmarks.scenarios._step_time import StepTimes
 from jaxfilters.filter import init
 from jaxfilters.models.hand.skeleton import forward_kinematics, hand_geometry, open_palm
 from jaxfilters.models.synthetic.hand import HandSequence, kinect_v2
+from jaxfilters.trackers.tracker import Tracker
 
 
 def made_up(data, filter, seed, joint_mm):
@@ -82,6 +83,18 @@ def test_the_tracker_is_tested_against_registration_alone_on_data_b():
     assert metrics["p_value_rbpf_guided_better_b"].value == pytest.approx(2.0**-8)
     assert metrics["p_value_rbpf_guided_better_than_registration_b"].value == pytest.approx(1.0)
     assert "mean_ess_registration_b" not in metrics
+
+
+def test_registration_alone_starts_where_the_tracker_does(monkeypatch):
+    """A stand-in returns what it is given: the first frame as the state, the frames as poses, the times as joints."""
+    tracker = Tracker(lambda key, frame: frame, lambda state, frames, times: None)
+    monkeypatch.setattr(pf_vs_rbpf.hand_depth, "build", lambda *arguments: tracker)
+    monkeypatch.setattr(pf_vs_rbpf, "registered", lambda setup, state, frames, dt: (frames - state, dt))
+    frames = jnp.arange(3.0)[:, None, None] + jnp.ones((1, 2, 2))
+    found = pf_vs_rbpf._registration(jax.random.key(0), frames)
+    np.testing.assert_array_equal(found.pose, np.arange(3.0)[:, None, None] * np.ones((1, 2, 2)))
+    np.testing.assert_allclose(found.joints, 3 * [1 / 30], rtol=1e-6)
+    assert np.isnan(found.ess).all()
 
 
 def test_a_run_without_estimates_is_lost():
