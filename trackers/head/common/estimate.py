@@ -5,22 +5,25 @@ model, each landmark as loose as it has proved to be, or as expressions of sever
 say how far each is to be believed; a face that rests keeps the accuracy of a rigid one.
 """
 
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters._full_precision import dot, tensordot
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.models.face.alignment import Alignment, align
+from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.patches import Slopes, learn_slopes
 from jaxfilters.models.face.pose import rotation, turning_axes
 from jaxfilters.models.face.refinement import Refined, displaced, refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
-from jaxfilters.models.face.shape_model import FaceModel, rigid, shape
+from jaxfilters.models.face.shape_model import FaceModel, shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common import recent
 from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
@@ -36,6 +39,8 @@ MODEL_VARIANCE = (0.02**2, 10.0**2)
 RESIDUAL_SCALE = (0.05, 20.0)
 STRENGTHS = (0.0, 1.0, 3.0)
 """Of expressions that no mode describes, in those of `EXPRESSION_STD`."""
+FIRST_LOOK = STRENGTHS.index(1.0)
+"""The face that is assumed where landmarks are looked for the first time."""
 ALIKE, ALIKE_ANEW = 4.0, 2.0
 """The landmarks of a face move together in an expression: ten of them say no more than some three would; and as much
 again that the next frame, with another expression, does not profit."""
@@ -43,6 +48,19 @@ ORDINARY_EXPRESSION = float(np.linalg.norm(EXPRESSION_STD))
 """Millimetres, root of the sum over all landmarks."""
 MEASURED_STD = 10.0
 """Millimetres about the model within which a landmark's place is measured."""
+
+
+class _Assumed(NamedTuple):
+    """What a fit takes the face to be."""
+
+    prior: Gaussian
+    mean: Float[Array, "K 3"]
+    """Of its model, as the next."""
+    basis: Float[Array, "3*K B"]
+    looseness: Float[Array, "K 3 3"]
+    """Covariance of each landmark about the model, mm^2."""
+    deforms: Bool[ArrayLike, ""]
+    """Whether the fit begins with the mode coefficients that are expected, or without any."""
 
 
 class Estimate(NamedTuple):
@@ -100,15 +118,22 @@ def refined(
         moved: What the head was predicted to move since the last estimate, millimetres and radians.
     """
     prior = predicted(search, state.belief, model, moved)
-    x = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
-    found, _, _ = looked_for(align, state, model, images, rig, x)
-    x = refine(prior, found, state.slopes, model, _looseness(state, 1.0), rig, x).belief.mean
-    found, anchored, is_followed = looked_for(anywhere, state, model, images, rig, x)
+    faces = _assumed(prior, state, model)
 
-    fit = lambda strength: refine(prior, found, state.slopes, model, _looseness(state, strength), rig, x, ~is_followed)
-    # One by one: batches of factorisations can stand still on two cores.
-    fits = jax.lax.map(fit, jnp.asarray(STRENGTHS, x.dtype))
-    rest, rest_belief = _at_rest(prior, found, state, model, rig, x, ~is_followed)
+    def looked(x: Array, is_last: Array) -> tuple[Array, tuple[Array, Alignment, Array, Array, Refined]]:
+        """Landmarks near a state, and the fit to them; in the last look also from elsewhere, and every fit."""
+        found, anchored, is_followed = looked_for(partial(anywhere, beyond=is_last), state, model, images, rig, x)
+        wanted = is_last | (jnp.arange(len(STRENGTHS) + 1) == FIRST_LOOK)
+        fits = _fits(faces, wanted, found, state, model, rig, x, ~is_followed)
+        return fits.belief.mean[FIRST_LOOK], (x, found, anchored, is_followed, fits)
+
+    # One program for both looks and all fits: it compiles in half the time.
+    start = jnp.concatenate([search.estimate[:POSE], prior.mean[POSE:]])
+    _, looks = jax.lax.scan(looked, start, jnp.array([False, True]))
+    x, found, anchored, is_followed, every = jax.tree.map(lambda leaf: leaf[-1], looks)
+    fits, rest = (jax.tree.map(lambda leaf, part=part: leaf[part], every) for part in (slice(-1), -1))
+    a = dot(model.basis.T, (state.registered.shape - model.mean).ravel())
+    rest_belief = Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
     resting, among = _shares(rest, fits)
     average = lambda values: tensordot(among, values, 1)
     is_unknown = jnp.asarray(STRENGTHS) > 0
@@ -157,18 +182,40 @@ def _looseness(state: HeadState, strength: Array | float) -> Array:
     return state.registered.covariance + jax.vmap(jnp.diag)(jnp.maximum(learned, strength**2 * expression))
 
 
-def _at_rest(
-    prior: Gaussian, found: Alignment, state: HeadState, model: FaceModel, rig: CameraRig, x: Array, is_own: Array
-) -> tuple[Refined, Gaussian]:
-    """The fit of the registered face, and its belief with the mode coefficients of that face."""
-    face = rigid(state.registered.shape, model.templates, num_modes=NUM_MODES)
+def _assumed(prior: Gaussian, state: HeadState, model: FaceModel) -> _Assumed:
+    """Faces whose expressions are as strong as those of `STRENGTHS`, and behind them the registered one at rest."""
+    free = [_Assumed(prior, model.mean, model.basis, _looseness(state, strength), True) for strength in STRENGTHS]
     tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
     covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
     covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
-    prior = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
-    rest = refine(prior, found, state.slopes, face, tight, rig, x.at[POSE:].set(0.0), is_own)
-    a = dot(model.basis.T, (state.registered.shape - model.mean).ravel())
-    return rest, Gaussian(rest.belief.mean.at[POSE:].set(a), rest.belief.covariance)
+    at_rest = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
+    rest = _Assumed(at_rest, state.registered.shape, jnp.zeros_like(model.basis), tight, False)
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *free, rest)
+
+
+def _fits(
+    faces: _Assumed,
+    wanted: Bool[Array, " fits"],
+    found: Alignment,
+    state: HeadState,
+    model: FaceModel,
+    rig: CameraRig,
+    x: Array,
+    is_own: Array,
+) -> Refined:
+    """The fit of each face that is wanted, zeros in place of the others."""
+
+    def one(inputs: tuple[_Assumed, Array]) -> Refined:
+        face, is_wanted = inputs
+        assumed = replace(model, mean=face.mean, basis=face.basis)
+        start = jnp.where(face.deforms, x, x.at[POSE:].set(0.0))
+        # Traced once for its shapes and its program.
+        fit = jax.jit(lambda: refine(face.prior, found, state.slopes, assumed, face.looseness, rig, start, is_own))
+        nothing = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fit))
+        return jax.lax.cond(is_wanted, fit, nothing)
+
+    # One by one: batches of factorisations can stand still on two cores.
+    return jax.lax.map(one, (faces, wanted))
 
 
 def _with_gauge(belief: Gaussian, deformation: Array, state: HeadState, model: FaceModel) -> Gaussian:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfilters._full_precision import dot
-from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.compiled_quickly import compiled_lightly, compiled_quickly
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.diffusion import DiffusionFit
@@ -108,7 +108,7 @@ def begin(
     )
 
 
-@partial(jax.jit, static_argnames="options")
+@partial(compiled_lightly, static_argnames="options")
 def advance(
     rig: CameraRig,
     searches: Searches,
