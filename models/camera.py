@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 
 
 @pytree_dataclass
@@ -39,7 +40,7 @@ class Pinhole:
         c = _checked_pair("center", np.asarray(center))
         if np.any(f <= 0):
             raise ValueError(f"focal must be positive, in pixels; got {f}.")
-        return cls(jnp.asarray(f, float), jnp.asarray(c, float), _checked_shape("shape", shape))
+        return cls(from_host(f), from_host(c), _checked_shape("shape", shape))
 
     @classmethod
     def from_matrix(cls, K: ArrayLike | Sequence, shape: Sequence[int]) -> "Pinhole":

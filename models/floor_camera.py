@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 
 STEEP = np.cos(np.deg2rad(10.0))
 """An optical axis nearer to the vertical than this has no useful direction on the floor."""
@@ -60,7 +61,7 @@ class FloorCamera:
             raise ValueError(
                 "P shows the floor above the horizon: P is mirrored, or the image upside down (turn it by 180 degrees)."
             )
-        return cls(jnp.asarray(P, float), (rows, cols))
+        return cls(from_host(P), (rows, cols))
 
     def position(self) -> Float[Array, " 3"]:
         """Camera centre in the world, metres."""

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 
 GAMMA = math.sqrt(math.pi / 2)
 """Ratio of the standard deviation of a centred Gaussian to its mean absolute value."""
@@ -66,7 +67,7 @@ def start(
         >>> print(diffusion.velocity_change_std(fit, jnp.array([3.0])))
         [5.]
     """
-    scale = jnp.asarray(scale, dtype=float)
+    scale = from_host(scale)
     if scale.ndim != 1:
         raise ValueError(f"scale must be a vector (d,); got {scale.shape}.")
     check_positive("scale", scale)
@@ -75,9 +76,9 @@ def start(
     # NumPy makes the constants: each would otherwise be a program of its own.
     last = np.zeros((size + 1, size))
     last[-1] = 1.0
-    coefficients = jnp.asarray(slope * np.eye(size + 1, size) + offset * last, dtype=float)
-    covariance = jnp.asarray(np.eye(size + 1) / strength, dtype=float)
-    return DiffusionFit(coefficients, covariance, scale, jnp.asarray(strength, dtype=float))
+    coefficients = from_host(slope * np.eye(size + 1, size) + offset * last)
+    covariance = from_host(np.eye(size + 1) / strength)
+    return DiffusionFit(coefficients, covariance, scale, from_host(strength))
 
 
 def update(

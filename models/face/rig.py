@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfilters._full_precision import qr
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face import pose as head
 
@@ -57,7 +58,7 @@ class CameraRig:
         rotation, translation = np.asarray(rotations, float), np.asarray(translations, float)
         _check_intrinsics(cameras, focal, center)
         _check_poses(len(cameras), rotation, translation)
-        f, c, R, t = (jnp.asarray(a, float) for a in (focal, center, rotation, translation))
+        f, c, R, t = (from_host(a) for a in (focal, center, rotation, translation))
         return cls(f, c, R, t, cameras[0].shape)
 
     @property

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE
 from jaxfilters.particle.rao_blackwell import MixedDynamics
 
@@ -53,7 +54,7 @@ class HandMotion:
 
 def per_coordinate(position: float, rotation: float, angle: float) -> Float[Array, " 21"]:
     """One number for each of wrist position, wrist rotation and joint angles, spread over the tangent space."""
-    return jnp.asarray(np.repeat([position, rotation, angle], PER_COORDINATE), dtype=float)
+    return from_host(np.repeat([position, rotation, angle], PER_COORDINATE))
 
 
 def paper_motion(frame_interval: float = 1 / 30) -> HandMotion:

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face.landmarks import MOUTH, NOSTRILS
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
@@ -68,13 +69,11 @@ class FaceSequence:
         return pieces(self.frames, len(self), size)
 
     def _image(self, index):
-        shape, pose = jnp.asarray(self.shapes[index], float), jnp.asarray(self.poses[index], float)
+        shape, pose = from_host(self.shapes[index]), from_host(self.poses[index])
         key = jax.random.fold_in(self.key, index)
         # Opacity 0 rather than no occluder: one compiled program for all frames.
-        occluder = _before_mouth(shape, pose, jnp.asarray(self.covered[index], float))
-        return render_face(
-            key, self.scene, self.rig, pose, shape, gain=jnp.asarray(self.gain[index], float), occluder=occluder
-        )
+        occluder = _before_mouth(shape, pose, from_host(self.covered[index]))
+        return render_face(key, self.scene, self.rig, pose, shape, gain=from_host(self.gain[index]), occluder=occluder)
 
 
 def rendered(
@@ -158,7 +157,7 @@ def face_sequence(
     identity_key, looks, noise = jax.random.split(key, 3)
     identity, num_frames = make_identity(identity_key), len(poses)
     expressions = np.zeros((num_frames, 2)) if expressions is None else expressions
-    shapes, uv = _truth(identity, rig, jnp.asarray(poses, float), jnp.asarray(expressions, float))
+    shapes, uv = _truth(identity, rig, from_host(poses), from_host(expressions))
     return FaceSequence(
         key=noise,
         identity=identity,

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
@@ -55,8 +56,8 @@ def looking(position: tuple[float, float, float], heading_deg: float, pitch_deg:
     right = np.array([math.sin(a), -math.cos(a), 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
     return RigidTransform(
-        jax.jit(quaternion_from_matrix)(jnp.asarray(rotation, jnp.float32)),
-        jnp.asarray(-rotation @ np.asarray(position), jnp.float32),
+        jax.jit(quaternion_from_matrix)(from_host(rotation, jnp.float32)),
+        from_host(-rotation @ np.asarray(position), jnp.float32),
     )
 
 

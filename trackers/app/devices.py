@@ -11,7 +11,7 @@ _MALLOC = {-3: 32 << 20, -1: 512 << 20, -2: 16 << 20}
 """Of glibc's `mallopt`, bytes: from what size on an array is mapped on its own (the largest allowed), how much free
 memory is kept at the end of the heap, and by how much more than is needed the heap grows."""
 
-_OBJECTS, _YOUNG, _OLD = 50_000, 20, 100
+_OBJECTS, _YOUNG, _OLD = 200_000, 20, 100
 """For `gc.set_threshold`: by how many objects the memory grows until Python looks for unreachable ones among the newest
 ones, and after how many such rounds it looks among the older and the oldest ones."""
 

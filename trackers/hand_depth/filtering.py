@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxfilters import weights
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.lie import quaternion_mean, quaternion_normalize, quaternion_to_matrix
@@ -51,8 +52,8 @@ PATIENCE = 5
 FRAME_INTERVAL = 1 / 30
 """Seconds before the first frame."""
 MOTION = HandMotion(
-    per_coordinate(0.008, 0.064, math.radians(12)) ** 2 * 30,
-    per_coordinate(0.04, 0.2, math.radians(24)) ** 2 * 30,
+    from_host(np.square(per_coordinate(0.008, 0.064, math.radians(12))) * 30),
+    from_host(np.square(per_coordinate(0.04, 0.2, math.radians(24))) * 30),
     per_coordinate(0.0, 0.0, 1 / 0.3),
 )
 """A real hand: a joint may move 35 mm from one frame to the next; joint velocities are damped over 0.3 s."""

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face.landmarks import PEOPLE_SHAPE
 from jaxfilters.models.face.mirroring import Pairs, mirror_map
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
@@ -96,7 +97,7 @@ def load_face_model(path: str | Path) -> FaceModelFile:
     for name in ("identity_covariance", "expression_covariance"):
         _check_covariance(arrays[name], name, path)
     names, pairs = _landmarks(header, sizes["K"], path)
-    model = MultilinearFace(**{name: jnp.asarray(arrays[name], float) for name in _ARRAYS})
+    model = MultilinearFace(**{name: from_host(arrays[name]) for name in _ARRAYS})
     return FaceModelFile(model, names, pairs, str(header.get("source", "")), header["parameters"])
 
 

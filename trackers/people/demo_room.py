@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, UInt8
 
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import mesh_depth
@@ -66,11 +67,11 @@ class DemoRoom:
     def image(self, camera: int, index: int) -> UInt8[np.ndarray, "rows cols 3"]:
         """Blue, green, red of a frame of a camera."""
         people = Walker(
-            *(jnp.asarray(leaf[index], jnp.float32) for leaf in self.routes),
-            *(jnp.asarray(size, jnp.float32) for size in np.transpose(SIZES_M)[:, : self.routes.xy.shape[1]]),
+            *(from_host(leaf[index], jnp.float32) for leaf in self.routes),
+            *(from_host(size, jnp.float32) for size in np.transpose(SIZES_M)[:, : self.routes.xy.shape[1]]),
         )
         key = jax.random.fold_in(jax.random.key(self.seed), index * len(PLACES) + camera)
-        clothes = jnp.asarray(CLOTHES[: self.routes.xy.shape[1]], jnp.float32)
+        clothes = from_host(CLOTHES[: self.routes.xy.shape[1]], jnp.float32)
         return np.asarray(room_image(key, self.rooms[camera], people, clothes, self.present(index))[0])
 
     def present(self, index: int) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters._full_precision import dot, einsum
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person import foreground
@@ -96,7 +97,7 @@ def cells_of(
     low, high = floor.min(axis=0), floor.max(axis=0)
     axes = [np.arange(a + config.cell_m / 2, b, config.cell_m) for a, b in zip(low, high, strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
-    xy = jnp.asarray(_filled(points), jnp.float32)
+    xy = from_host(_filled(points), jnp.float32)
     looks = [_look(camera, depth, config, xy) for camera, depth in zip(cameras, furniture, strict=True)]
     observed = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE
     (kept,) = np.nonzero((observed & np.asarray(walkable(jnp.asarray(floor), xy)))[: len(points)])

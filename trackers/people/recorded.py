@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
@@ -164,11 +165,11 @@ def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:
     # One compilation for each power of two.
     padding = (1 << (length - 1).bit_length()) - length
     beliefs = Gaussian(
-        jnp.asarray(np.stack([sighting.mean for sighting in piece] + [piece[-1].mean] * padding), float),
-        jnp.asarray(np.stack([sighting.covariance for sighting in piece] + [piece[-1].covariance] * padding), float),
+        from_host(np.stack([sighting.mean for sighting in piece] + [piece[-1].mean] * padding)),
+        from_host(np.stack([sighting.covariance for sighting in piece] + [piece[-1].covariance] * padding)),
     )
     steps = np.diff([sighting.time_s for sighting in piece], append=piece[-1].time_s)
-    found = _backward(config, beliefs, jnp.asarray(np.append(steps, np.zeros(padding)), float), length)
+    found = _backward(config, beliefs, from_host(np.append(steps, np.zeros(padding))), length)
     mean, covariance = np.asarray(found.mean, np.float64), np.asarray(found.covariance, np.float64)
     return [sighting._replace(mean=mean[i], covariance=covariance[i]) for i, sighting in enumerate(piece)]
 

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot, einsum
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.consider import consider
@@ -93,7 +94,7 @@ def people_scene(
         )
     images = tuple(jnp.asarray(depth, jnp.float32) for depth in depths)
     cells = padded(cells_of(tuple(cameras), images, corners, config))
-    return PeopleScene(tuple(cameras), images, jnp.asarray(corners, jnp.float32), cells, config)
+    return PeopleScene(tuple(cameras), images, from_host(corners, jnp.float32), cells, config)
 
 
 def start(scene: PeopleScene) -> People:

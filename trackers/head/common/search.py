@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.filter import Filter
 from jaxfilters.math import diffusion
 from jaxfilters.math.diffusion import DiffusionFit
@@ -80,10 +81,10 @@ def searches(rig: CameraRig, options: HeadConfig) -> Searches:
         FaceLikelihood(nobody, templates, rig),
         first_diffusion(options),
         num_particles=options.num_particles,
-        mode_scale=jnp.asarray([*(MODE_SCALE * UNITS), *[LEAST_DEVIATION] * NUM_MODES], float),
+        mode_scale=from_host([*(MODE_SCALE * UNITS), *[LEAST_DEVIATION] * NUM_MODES]),
         steady_std=jnp.zeros(NUM_MODES),
-        low=jnp.asarray(LOW, float),
-        high=jnp.asarray(HIGH, float),
+        low=from_host(LOW),
+        high=from_host(HIGH),
         update_fit=diffusion.update if options.diffusion == "online" else diffusion.fixed,
     )
     return Searches(build(), build(partitions=Partitions(consecutive(POSE, NUM_MODES))))
@@ -93,7 +94,7 @@ def first_diffusion(options: HeadConfig) -> DiffusionFit:
     """`A = I` and a unit of each coordinate a frame; no `A` if it is fixed."""
     # Its arguments are checked by value, also where a caller is being traced.
     with jax.ensure_compile_time_eval():
-        scale = jnp.asarray(UNITS, float)
+        scale = from_host(UNITS)
         if options.diffusion == "fixed":
             return diffusion.start(scale, slope=0.0, offset=options.fixed_diffusion)
         return diffusion.start(scale)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face.correlation import cut, score_points
 from jaxfilters.models.face.rig import CameraRig
 
@@ -76,7 +77,7 @@ def projected_at(
 
 def windows(image: UInt8[np.ndarray, "rows cols"], points: Float[np.ndarray, "K 2"]) -> Float[Array, "K T T"]:
     """Windows about points, as templates."""
-    return _cut(jnp.asarray(image), jnp.asarray(points, float))
+    return _cut(jnp.asarray(image), from_host(points))
 
 
 def _inverse_depths(rig: CameraRig, points: np.ndarray, source: int, target: int) -> Float[np.ndarray, " n"]:
@@ -101,7 +102,7 @@ def _refined(image: np.ndarray, templates: Array, start: np.ndarray) -> tuple[np
 
 def _scores(image: np.ndarray, templates: Array, places: np.ndarray) -> np.ndarray:
     """Correlation (K, ...) of each template with the windows about its own places (K, ..., 2)."""
-    flat = jnp.asarray(places.reshape(len(places), -1, 2), float)
+    flat = from_host(places.reshape(len(places), -1, 2))
     return np.asarray(_all_scores(jnp.asarray(image), templates, flat)).reshape(places.shape[:-1])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from scipy.optimize import least_squares
 
+from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face import pose as head
 from jaxfilters.models.face import rig as cameras
 from jaxfilters.models.face.landmarks import EYES, MEAN_SHAPE, MOUTH, NAMES, NOSTRILS
@@ -142,8 +143,8 @@ def _registration(
     images: np.ndarray, rig: CameraRig, world: np.ndarray, axes: np.ndarray, num_modes: int
 ) -> Registration:
     middle = world.mean(axis=0)
-    mean = jnp.asarray((world - middle) @ axes, float)
-    pose, uv = _placed(rig, mean, jnp.asarray(middle, float), jnp.asarray(axes, float))
+    mean = from_host((world - middle) @ axes)
+    pose, uv = _placed(rig, mean, from_host(middle), from_host(axes))
     templates = jnp.stack([epipolar.windows(image, np.asarray(at)) for image, at in zip(images, uv, strict=True)])
     return Registration(rigid(mean, templates, num_modes=num_modes), pose, uv)
 
@@ -161,7 +162,7 @@ def _triangulated(images: np.ndarray, points: np.ndarray, rig: CameraRig) -> Flo
         if scores.min() < LEAST_SCORE or returned.max() > MOST_RETURN:
             raise RegistrationError(why_unmatched(images, rig, points, c, scores, returned))
         uv.append(there)
-    world, observed, in_front = _nearest(rig, jnp.asarray(np.stack(uv), float))
+    world, observed, in_front = _nearest(rig, from_host(np.stack(uv)))
     errors = np.linalg.norm(np.asarray(observed) - np.stack(uv), axis=-1)
     if not np.all(in_front) or errors.max() > MOST_REPROJECTION:
         c, k = np.unravel_index(np.nan_to_num(errors, nan=np.inf).argmax(), errors.shape)
