@@ -153,8 +153,8 @@ def _step(
     search, info = variant.search(run, searches, model)
     estimate, search = variant.estimate(search, state, model, images, rig, moved, steps, options)
     belief = _held(estimate, search, model, state)
-    score = score_at(model, templates, rig, belief.mean, images)
-    likeness = jnp.maximum(score, score_at(model, looks, rig, belief.mean, images))
+    likenesses = jax.vmap(lambda views: score_at(model, views, rig, belief.mean, images))(jnp.stack([templates, looks]))
+    score, likeness = likenesses[0], jnp.max(likenesses)
     is_strange = estimate.num_anchored < FEWEST_ANCHORED
     num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
