@@ -54,7 +54,7 @@ CLEAR = 0.5
 HEIGHT_DRIFT, WIDTH_DRIFT = 0.01, 0.05
 """Metres per root second: posture; arms, stride and which side is visible."""
 WHOLE = 0.95
-"""Share of the silhouette from which on a person's height is measured: who touches somebody else (0.9) is taken to be
+"""Share of the silhouette from which on a person's height is measured: who touches another person (0.9) is taken to be
 too tall or too short, and height decides the distance of people far away."""
 _LEAST_HEIGHT_M = 0.5
 LEAST_DT_S = 1e-3
