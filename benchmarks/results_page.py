@@ -63,11 +63,11 @@ class Row(NamedTuple):
     metric_of_simplest: str
 
 
-_ICT = "people of the ICT face model, heads and faces moving as recorded"
+_ICT = "rendered people of the ICT face model, heads and faces moving as recorded"
 ON_RECORDINGS = (
     Row(
         "hand in depth images",
-        "12 recordings of real hands",
+        "12 motions of real hands, 11 of them rendered from scans",
         "joints",
         "registration alone",
         "pf-vs-rbpf",
@@ -154,8 +154,8 @@ ON_RECORDINGS = (
 )
 _OF_RECORDINGS = """## The six systems on recordings
 
-Each tracker on recordings that are not its own, beside the simplest thing that follows the same without a filter: mean
-errors, of heads root mean squares. What the recordings are, and on which of them constants were chosen, is on the pages
+Each tracker on data that are not its own, beside the simplest thing that follows the same without a filter: mean errors,
+of heads root mean squares. What the recordings are, and on which of them constants were chosen, is on the pages
 of the trackers. The numbers are those of the runs below.
 
 | system | recording | quantity | jaxfilters | simplest | which is |
