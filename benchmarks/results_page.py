@@ -154,8 +154,8 @@ ON_RECORDINGS = (
 )
 _OF_RECORDINGS = """## The six systems on recordings
 
-Each tracker on data that are not its own, beside the simplest thing that follows the same without a filter: mean errors,
-of heads root mean squares. What the recordings are, and on which of them constants were chosen, is on the pages
+Each tracker on data that are not its own, beside the simplest thing that follows the same without a filter: mean
+errors, of heads root mean squares. What the recordings are, and on which of them constants were chosen, is on the pages
 of the trackers. The numbers are those of the runs below.
 
 | system | recording | quantity | jaxfilters | simplest | which is |

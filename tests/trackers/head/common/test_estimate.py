@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH
+from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence
 from jaxfilters.trackers.head.common import estimate as module
@@ -46,6 +47,21 @@ class Face:
 @pytest.fixture(scope="module")
 def face():
     return Face()
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_displaced_images_move_a_head_by_the_pseudoinverse_of_its_pixels(cameras):
+    """Beside NumPy's pseudoinverse of central differences of the projection; of one camera the depth stays."""
+    rig = nominal()
+    rig = jax.tree.map(lambda leaf: leaf[:cameras], rig) if cameras == 1 else rig
+    place = np.array([30.0, -20, 640])
+    project = lambda at: np.asarray(project_shape(rig, jnp.zeros((1, 3)), jnp.array([*at, 0.1, -0.3, 0.2]))[0], float)
+    steps = np.eye(3)
+    by_place = np.stack([(project(place + d) - project(place - d)).ravel() / 2 for d in steps], axis=-1)
+    inverse = np.linalg.pinv(by_place, rcond=1e-3)
+    found = np.asarray(module.matching_covariance(rig, jnp.array([*place, 0.1, -0.3, 0.2])), float)
+    # Differences of float32 pixels are right to 1e-4 of a pixel, and the damping takes 4 % of the variance of depth.
+    np.testing.assert_allclose(found / module.MATCHING_STD**2, inverse @ inverse.T, rtol=0.06, atol=0.03)
 
 
 @pytest.mark.system
