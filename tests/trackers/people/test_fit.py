@@ -10,8 +10,8 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people.fit import MOST_SHIFT_M, Fit, _nearest_first, as_measurement, fit_people
-from jaxfilters.trackers.people.state import STATE, CameraFrame, PeopleConfig
-from jaxfilters.trackers.people.tracker import people_scene
+from jaxfilters.trackers.people.state import HEIGHT, STATE, CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.tracker import people_scene, updated
 
 pytestmark = pytest.mark.system
 
@@ -119,6 +119,20 @@ def test_everybody_is_found_where_drawn_though_two_overlap(found):
     assert fit.flatness[:3].min() > 0
     assert fit.share_seen[0] > 0.9 > fit.share_seen[1]
     assert fit.share_in_view[:3].min() > 0.9
+
+
+def test_heights_are_measured_of_whole_silhouettes_only(found, camera, floor):
+    """Of 1.72 m as predicted and 1.75 m as drawn; who touches another person keeps the height, and is still placed."""
+    run, *_ = found
+    fit = jax.tree.map(jnp.asarray, run({0: 0}))
+    scene = people_scene([camera], floor, config=PeopleConfig(capacity=SLOTS, spread_px=0.0))
+    mean = jnp.zeros((SLOTS, STATE)).at[0, :6].set(jnp.array([*(PLACES[0][:2] + OFF_M[0]), 0, 0, 1.72, 0.45]))
+    before = Gaussian(mean, jnp.broadcast_to(0.01 * jnp.eye(STATE), (SLOTS, STATE, STATE)))
+    for share, is_measured in ((0.93, False), (0.97, True)):
+        after, _ = updated(scene, before, fit._replace(shares_seen=jnp.full((SLOTS, 1), share)), jnp.array(0.1))
+        moved = np.abs(np.asarray(after.mean - mean))[0]
+        assert (moved[HEIGHT] > 0.005) == is_measured
+        assert np.linalg.norm(moved[:2]) > 0.02
 
 
 def test_slots_mean_nothing_to_the_search(found):
