@@ -27,13 +27,13 @@ Times in seconds hold for the machine and the load of the run: these machines we
 ![Share of truths within two standard deviations, by system](results/coverage.webp)
 """
 _SYSTEMS = {
-    "hand_depth_joints_mm": ("hand in depth images", "joints", "registration alone"),
+    "hand_depth_joints_mm": ("hand in depth images", "joints", "registration alone, of the true hand"),
     "articulated_angles_deg": ("articulated hand", "angles", "least squares of each frame"),
     "articulated_lengths_px": ("articulated hand", "lengths", "least squares of each frame"),
     "people_mota": ("people on a floor", "MOTA, higher is better", "blobs, projected back"),
     "people_error_m": ("people on a floor", "places", "blobs, projected back"),
-    "head_stereo_z_mm": ("head before two cameras", "distance", "optical flow, triangulated"),
-    "head_stereo_yaw_deg": ("head before two cameras", "yaw", "optical flow, triangulated"),
+    "head_stereo_z_mm": ("head before two cameras", "distance", "optical flow, triangulated, with the true shape"),
+    "head_stereo_yaw_deg": ("head before two cameras", "yaw", "optical flow, triangulated, with the true shape"),
     "head_mono_z_mm": ("face before one camera", "distance", "optical flow and PnP with the true shape"),
     "head_mono_yaw_deg": ("face before one camera", "yaw", "optical flow and PnP with the true shape"),
     "fingertips_count": ("fingertips", "frames with the right number, higher is better", "convex hull"),
@@ -43,8 +43,8 @@ _SYSTEMS = {
 _OF_SYSTEMS = """## The six systems
 
 Each tracker on synthetic recordings whose truth is known, beside the simplest thing that follows the same, without a
-filter, and beside what its paper prints of data of its own: a comparison of size only. `jaxfilters bench systems` says
-how each was measured.
+filter, and beside what its paper prints of data of its own: a comparison of size only. Where the simplest thing knows
+the true hand or face, the tracker does not. `jaxfilters bench systems` says how each was measured.
 
 | system | quantity | jaxfilters | simplest | which is | paper |
 |---|---|---:|---:|---|---:|
