@@ -147,7 +147,7 @@ def real_metrics(stills: Stills, method: object, out: Path | None) -> dict[str, 
         _draw(out / "fit_hand.png", others, fitted.theta)
     return {
         "real_error_average_mm": Metric(1000 * float(before.mean()), "mm", "lower"),
-        "real_error_learnt_mm": Metric(1000 * float(after.mean()), "mm", "lower"),
+        "real_error_fitted_mm": Metric(1000 * float(after.mean()), "mm", "lower"),
         "real_reduction_percent": Metric(100 * (1 - float(after.mean() / before.mean())), "%", "higher"),
         "real_noise_mm": Metric(1000 * float(learned.noise), "mm", "lower"),
     }
