@@ -155,8 +155,9 @@ ON_RECORDINGS = (
 _OF_RECORDINGS = """## The six systems on recordings
 
 Each tracker on data that are not its own, beside the simplest thing that follows the same without a filter: mean
-errors, of heads root mean squares. What the recordings are, and on which of them constants were chosen, is on the pages
-of the trackers. The numbers are those of the runs below.
+errors, of heads root mean squares, of the distance before one camera the mean over people of how far each is off on
+average. What the recordings are, and on which of them constants were chosen, is on the pages of the trackers. The
+numbers are those of the runs below.
 
 | system | recording | quantity | jaxfilters | simplest | which is |
 |---|---|---|---:|---:|---|
