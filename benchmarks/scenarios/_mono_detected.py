@@ -132,7 +132,7 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
         detector: Of the landmarks.
         seed: Of the particles.
     """
-    images = np.concatenate([part for _, part in made.chunks(PIECE)])
+    images = made.frames(0, len(made))
     track = followed(made, images, face, detector, seed)
     located = [
         pnp(face, made.rig, detector, image) if i % EVERY == 0 else np.full(6, np.nan)

@@ -151,7 +151,7 @@ def modelled(model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int
 def followed(made: IctSequence, seed: int) -> Modelled:
     """A modelled person, tracked, beside the truth."""
     session = HeadSession(made.rig, HeadConfig(seed=seed), np.asarray(made.uv[0, 0], float))
-    images = np.concatenate([part for _, part in made.chunks(PIECE)])
+    images = made.frames(0, len(made))
     track = follow(session, images, made.times)
     is_tracked = np.isin(track.status, TRACKED)
     errors = pose_errors(track.pose, made.poses)

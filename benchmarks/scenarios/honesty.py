@@ -112,8 +112,8 @@ def mono_people_claims(quick: bool, seed: int) -> Claims:
     film, recordings = _mono_detected.filming(quick, seed), []
     for person, stretch in _mono_real.PEOPLE[: 1 if quick else None]:
         made = film(person, stretch)
-        images = np.concatenate([part for _, part in made.chunks()])
-        track = _mono_detected.followed(made, images, people_face_model().model, DETECTORS["cascades"](), person + seed)
+        face, detector, images = people_face_model().model, DETECTORS["cascades"](), made.frames(0, len(made))
+        track = _mono_detected.followed(made, images, face, detector, person + seed)
         errors = pose_errors(track.pose, made.poses)
         recordings.append(_where(np.isin(track.status, TRACKED), errors, np.asarray(track.pose_std) * DISPLAY))
     return Claims("head_mono", "ict", POSE, recordings)

@@ -3,16 +3,17 @@
 Needs the folder `caviar_corridor` of JAXFILTERS_DATA: the camera is calibrated from four points of the floor, the
 background comes from the recording, and everybody is followed, as by `jaxfilters calibrate points` and
 `jaxfilters track people`. Truth are the places on the floor below the annotated boxes, where these stand whole in the
-image and on the part of the floor that is tracked. `walker` is the one
-who walks alone through the corridor with feet in the image.
-Scores change by 10 to 20 with rounding at this distance: they are means over three runs, in two of which the grey
-levels of all images are changed by one at random; `mota_least` and `mota_most` are those of single runs. `_simple` is
-without a tracker: blobs that differ from the background, projected back to the floor and linked to the nearest.
+image and on the part of the floor that is tracked. `walker` is the one who walks alone through the corridor with feet
+in the image. Scores change by 10 to 20 with rounding at this distance: they are means over three runs, in two of which
+the grey levels of all images are changed by one at random; `mota_least` and `mota_most` are those of single runs.
+`_simple` is without a tracker: blobs that differ from the background, projected back to the floor and linked to the
+nearest.
 """
 
 import csv
 import itertools
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -23,13 +24,14 @@ from jaxfilters.benchmarks.metrics import Direction, Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, evaluate, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
+from jaxfilters.benchmarks.scenarios.people_pets import positions
 from jaxfilters.models.calibration import calibrate_floor
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.video_input import VideoFile
 from jaxfilters.trackers.io.xml_files import read_xml
-from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleSession
+from jaxfilters.trackers.people.state import PeopleScene
 from jaxfilters.trackers.people.tracker import people_scene
 
 FLOOR = np.array([[-1.0, -3.0], [4.5, -3.0], [4.5, 28.0], [-1.0, 28.0]])
@@ -70,21 +72,37 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     true = FloorTracks(*(column[true.frame < len(moments)] for column in true))
     evaluated = partial(_scores, true, np.asarray(camera.position())[:2])
     scene, rng = people_scene([camera], FLOOR), np.random.default_rng(seed)
-    runs = []
-    for number in range(QUICK_RUNS if quick else RUNS):
-        changed = (lambda image: _by_a_level(rng, image)) if number else (lambda image: image)
-        session = PeopleSession(scene)
-        session.prime([[changed(image) for image in samples]])
-        for time_s, image in moments:
-            session.process([changed(image)], time_s)
-        runs.append(evaluated(_rows(session.tracks.smoothed())))
+    disturbed = partial(_changed_by_a_level, rng)
+    runs = [
+        evaluated(_followed(scene, samples, moments, disturbed if number else _unchanged))
+        for number in range(QUICK_RUNS if quick else RUNS)
+    ]
     empty = np.median(np.stack(samples), axis=0).astype(np.uint8)
     blobs = followed_blobs((image for _, image in moments), empty, camera)
     simple = evaluated([row for row in blobs if _is_on_floor(np.array(row[2:]))])
     return _metrics(runs, "") | _metrics([simple], "_simple")
 
 
-def _by_a_level(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+def _followed(
+    scene: PeopleScene,
+    samples: list[np.ndarray],
+    moments: list[tuple[float, np.ndarray]],
+    disturb: Callable[[np.ndarray], np.ndarray],
+) -> list[tuple[int, int, float, float]]:
+    """Frame, identity, X and Y of smoothed tracks of disturbed images."""
+    session = PeopleSession(scene)
+    session.prime([[disturb(image) for image in samples]])
+    for time_s, image in moments:
+        session.process([disturb(image)], time_s)
+    return positions(session.tracks.smoothed())
+
+
+def _unchanged(image: np.ndarray) -> np.ndarray:
+    return image
+
+
+def _changed_by_a_level(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Every grey level by -1, 0 or 1 at random."""
     return np.clip(image + rng.integers(-1, 2, image.shape), 0, 255).astype(np.uint8)
 
 
@@ -115,15 +133,6 @@ def annotated(path: Path, camera: FloorCamera) -> FloorTracks:
 def _is_on_floor(xy: np.ndarray) -> np.ndarray:
     """(...) which places (..., 2) are on the part of the floor that is tracked."""
     return np.all((xy > FLOOR.min(axis=0)) & (xy < FLOOR.max(axis=0)), axis=-1)
-
-
-def _rows(tracks: dict[int, list[Sighting]]) -> list[tuple[int, int, float, float]]:
-    """Frame, identity, X and Y."""
-    return [
-        (one.frame, identity, float(one.mean[0]), float(one.mean[1]))
-        for identity, track in tracks.items()
-        for one in track
-    ]
 
 
 def _scores(true: FloorTracks, camera_xy_m: np.ndarray, rows: list[tuple[int, int, float, float]]) -> dict[str, float]:

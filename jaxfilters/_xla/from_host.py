@@ -16,9 +16,9 @@ def from_host(values: Any, dtype: DTypeLike = float) -> Array:
     and compile in every run; a tracker begins with dozens of such arrays.
 
     Args:
-        values: Numbers, sequences of numbers, or an array; none of them traced, but as a whole.
+        values: Numbers, sequences of numbers, or an array. What is traced, or on the device, is left to JAX.
         dtype: As of `jnp.asarray`: `float` is single precision, unless `jax_enable_x64` is set.
     """
-    if not isinstance(values, jax.Array):
+    if not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(values)):
         values = np.asarray(values, jax.dtypes.canonicalize_dtype(dtype))
     return jnp.asarray(values, dtype)

@@ -35,6 +35,7 @@ def test_double_precision_stays_double(x64):
 
 def test_traced_arrays_stay_traced():
     np.testing.assert_array_equal(jax.jit(from_host)(jnp.arange(3)), [0.0, 1, 2])
+    assert jax.grad(lambda x: from_host([x, 2.0]).sum())(1.0) == 1
 
 
 def test_nothing_is_compiled():

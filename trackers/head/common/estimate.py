@@ -26,7 +26,7 @@ from jaxfilters.models.face.rigid import EXPRESSION_STD, motion_covariance
 from jaxfilters.models.face.shape_model import FaceModel, shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common import recent
-from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD, anywhere, looked_for, predicted, spread
+from jaxfilters.trackers.head.common.near_mode import UNKNOWN_STD, anywhere, looked_for, predicted, spread
 from jaxfilters.trackers.head.common.state import NUM_MODES, POSE, HeadState, Recent
 
 FEWEST_OBSERVED = 4
@@ -187,7 +187,7 @@ def matching_covariance(rig: CameraRig, pose: Float[Array, " 6"]) -> Float[Array
     by_pose = jacobian(rig, jnp.zeros((1, 3), pose.dtype), pose)[1]
     by_place = by_pose[..., :3].reshape(-1, 3)
     information = dot(by_place.T, by_place)
-    # A slight damping leaves out what one camera cannot tell: the distance.
+    # A slight damping leaves out what one camera does not measure: the distance.
     inverse = jnp.linalg.inv(information + _DAMPING * jnp.trace(information) * jnp.eye(3, dtype=pose.dtype))
     return MATCHING_STD**2 * dot(dot(inverse, information), inverse)
 
@@ -213,7 +213,7 @@ def _assumed(prior: Gaussian, state: HeadState, model: FaceModel) -> _Assumed:
     free = [_Assumed(prior, model.mean, model.basis, _looseness(state, strength), True) for strength in STRENGTHS]
     tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
     covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
-    covariance = covariance.at[POSE:, POSE:].set(UNLEARNT_STD**2 * jnp.eye(NUM_MODES))
+    covariance = covariance.at[POSE:, POSE:].set(UNKNOWN_STD**2 * jnp.eye(NUM_MODES))
     at_rest = Gaussian(prior.mean.at[POSE:].set(0.0), covariance)
     rest = _Assumed(at_rest, state.registered.shape, jnp.zeros_like(model.basis), tight, False)
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *free, rest)

@@ -18,7 +18,7 @@ from jaxfilters.trackers.head.common import recent
 from jaxfilters.trackers.head.common.search import KAPPA
 from jaxfilters.trackers.head.common.state import POSE, Recent
 
-UNLEARNT_STD = 0.01
+UNKNOWN_STD = 0.01
 """Millimetres: of the coefficient of a mode that is not estimated yet, or not used."""
 
 
@@ -60,7 +60,7 @@ def predicted(
         moved: What the head was predicted to move since, millimetres and radians.
     """
     pose_covariance = before.covariance[:POSE, :POSE] + jnp.diag(jnp.square(search.spread[:POSE]))
-    usual = jnp.square(jnp.where(model.deviation > 0, model.deviation, UNLEARNT_STD))
+    usual = jnp.square(jnp.where(model.deviation > 0, model.deviation, UNKNOWN_STD))
     walked = jnp.maximum(jnp.diagonal(before.covariance)[POSE:], 0.0) + KAPPA**2 * usual
     variance = 1 / (1 / walked + 1 / usual)
     mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])

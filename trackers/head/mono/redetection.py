@@ -19,7 +19,7 @@ from jaxfilters.models.face.alignment import Alignment
 from jaxfilters.models.face.refinement import refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import shape
-from jaxfilters.trackers.head.common.near_mode import UNLEARNT_STD
+from jaxfilters.trackers.head.common.near_mode import UNKNOWN_STD
 from jaxfilters.trackers.head.common.recent import CHANGED_SCORE, nothing_changed
 from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
@@ -112,7 +112,7 @@ def _pose(
     model, dtype = replace(state.model, mean=state.model.mean + beside), points.dtype
     modes, K, S = state.belief.mean[POSE:], len(points), state.slopes.covariance.shape[-1]
     facing = jnp.concatenate([facing_pose(rig, shape(model, jnp.zeros_like(modes)), points), jnp.zeros_like(modes)])
-    usual = jnp.where(model.deviation > 0, model.deviation, UNLEARNT_STD)
+    usual = jnp.where(model.deviation > 0, model.deviation, UNKNOWN_STD)
     prior = Gaussian(facing, jnp.diag(jnp.square(jnp.concatenate([jnp.asarray(ANYWHERE_STD, dtype), usual]))))
     found = Alignment(
         uv=points[None],
