@@ -68,6 +68,7 @@ from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
 from .particle.correlated_bootstrap import correlated_bootstrap as correlated_bootstrap
 from .particle.guided_rao_blackwell import Guidance as Guidance
+from .particle.guided_rao_blackwell import Jump as Jump
 from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
 from .particle.locally_optimal import locally_optimal as locally_optimal
 from .particle.mixed_model import LinearObservation as LinearObservation

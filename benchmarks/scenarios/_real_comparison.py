@@ -26,8 +26,8 @@ from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.hand_depth.filtering import (
     FRAME_INTERVAL,
-    MOTION,
     REGISTRATION_STRIDE,
+    UNGUIDED_MOTION,
     WINDOW,
     Setup,
     TrackState,
@@ -133,7 +133,7 @@ def registered(setup: Setup, state: TrackState, frames: Array, elapsed: Array) -
 
     def follow(pose: Array, inputs: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         frame, dt = inputs
-        root = jnp.diag(jnp.sqrt(MOTION.pose_variance_rate * dt))
+        root = jnp.diag(jnp.sqrt(UNGUIDED_MOTION.pose_variance_rate * dt))
         image = look(setup, state, filled(frame, state.missing_is_background), pose)
         camera = image.camera.crop(jnp.zeros(2), shape, REGISTRATION_STRIDE)
         target = target_from_image(camera, image.observed[::REGISTRATION_STRIDE, ::REGISTRATION_STRIDE])

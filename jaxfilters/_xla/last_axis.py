@@ -231,12 +231,12 @@ def _reduce_sum(eqn, size, values):
 def _dot_general(eqn, size, values):
     contracted, batch = eqn.params["dimension_numbers"]
     shapes = [_shape(value) for value in values]
-    if batch != ((), ()) or len(contracted[0]) != 1 or not 0 < max(*shapes[0], *shapes[1]) <= LARGEST:
+    sizes = (*shapes[0], *shapes[1])
+    # Of empty matrices the product has no outer products, or its derivative none.
+    if batch != ((), ()) or len(contracted[0]) != 1 or min(sizes) == 0 or max(sizes) > LARGEST:
         return NotImplemented
     (left,), (right,) = contracted
     count = shapes[0][left]
-    if count == 0:
-        return NotImplemented
     a, b = (_full(value, size).astype(eqn.outvars[0].aval.dtype) for value in values)
     a = jnp.moveaxis(a, left, -2).reshape(-1, count, size)
     b = jnp.moveaxis(b, right, 0).reshape(count, -1, size)

@@ -60,7 +60,8 @@ def matmul(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"
     """
     if a.shape[1] != b.shape[0]:
         raise ValueError(f"a and b must be (n, k) and (k, m); got {a.shape} and {b.shape}.")
-    if len(a) > LARGEST or not 0 < len(b) <= LARGEST_WIDTH >= b.shape[1]:
+    n, k, m = len(a), len(b), b.shape[1]
+    if min(n, k, m) == 0 or n > LARGEST or max(k, m) > LARGEST_WIDTH:
         return jnp.matmul(a, b, precision="highest")
     kind = jnp.result_type(a, b)
     return materialized(small_product(a.astype(kind), b.astype(kind)))

@@ -311,6 +311,14 @@ def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
     check_covariance("information of guide", guidance.information, size, "an information matrix")
 
 
+def check_jump(jump: Any, size: int) -> None:
+    """Require a probability between 0 and 1 where it is concrete, and a covariance of the tangent space."""
+    if not (hasattr(jump, "probability") and hasattr(jump, "covariance")):
+        raise TypeError(f"jump must return a Jump; got {_kind(jump)}.")
+    check_scalar("probability of jump", jump.probability, "between 0 and 1", lambda value: 0 < value < 1)
+    check_covariance("covariance of jump", jump.covariance, size)
+
+
 def check_history(history: Any) -> None:
     """Require the ensembles of a run: leaves with time as first and the particles as last axis, integer ancestors."""
     if not all(hasattr(history, name) for name in ("particles", "log_weights", "ancestors")):

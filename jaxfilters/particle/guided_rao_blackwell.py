@@ -7,6 +7,10 @@ transition that bounds the weights (defensive mixture: T. Hesterberg, "Weighted 
 defensive mixture distributions", Technometrics 37, 1995), and its weight is multiplied by the ratio of transition and
 proposal density (A. Doucet, S. Godsill and C. Andrieu, "On sequential Monte Carlo sampling methods for Bayesian
 filtering", Statistics and Computing 10, 2000, section II-D). A rough guide costs efficiency, not correctness.
+
+The increments may be heavy-tailed: with a small probability a particle jumps, which adds a wide normal number to its
+increment (a scale mixture; D. F. Andrews and C. L. Mallows, "Scale mixtures of normal distributions", Journal of the
+Royal Statistical Society B 36, 1974). What is not observed then stays where it is, while a sudden movement is followed.
 """
 
 import math
@@ -16,7 +20,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
@@ -27,7 +31,7 @@ from jaxfilters.particle import checks, rao_blackwell
 from jaxfilters.particle.proposals import exact
 from jaxfilters.particle.rao_blackwell import Increments, RaoBlackwell, RaoBlackwellState
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.typing import AnyKey, as_pytree, taking_inputs
+from jaxfilters.typing import AnyKey, as_pytree, only_inputs, taking_inputs
 
 
 class Guidance(NamedTuple):
@@ -48,11 +52,32 @@ class Guide(Protocol):
     ) -> Guidance: ...
 
 
+class Jump(NamedTuple):
+    """A rare increment of the nonlinear state beside the usual one, in all of its coordinates at once."""
+
+    probability: Float[Array, ""]
+    """Of a jump in one step, in (0, 1)."""
+    covariance: Float[Array, "n n"]
+    """Of the jump, in the tangent space; what jumps has the increment of `MixedDynamics` as well."""
+
+
+class Jumps(NamedTuple):
+    """Which particles jumped in the last prediction, and how far; fields as those of `Increments`."""
+
+    jumped: Bool[Array, " k"]
+    spread: Float[Array, "n n"]
+    """Covariance of the increment of a particle that jumps, given the past."""
+    gain: Float[Array, "l n"]
+    """What one unit of its increment adds to the mean of its linear state."""
+
+
 class GuidedState(NamedTuple):
     """The ensemble, and the increments by which the last prediction moved it."""
 
     ensemble: RaoBlackwellState
     increments: Increments
+    jumps: Jumps | None = None
+    """`None` for a filter without jumps."""
 
 
 @pytree_dataclass
@@ -62,6 +87,7 @@ class Guided:
     inner: RaoBlackwell
     guide: Guide
     local: Callable
+    jump: Callable | None
     prior_share: float = field(metadata={"static": True})
 
 
@@ -75,6 +101,7 @@ def guided_rao_blackwell(
     guide: Guide,
     *,
     local: Callable[[PyTree, PyTree], Float[Array, " n"]] = subtract,
+    jump: Callable[[PyTree], Jump] | None = None,
     prior_share: float = 0.2,
 ) -> Filter:
     """Give a filter made by `rao_blackwell_shared` a proposal that depends on the current observation.
@@ -82,11 +109,17 @@ def guided_rao_blackwell(
     A tempered `inner` tempers the likelihood and the importance correction of the proposal together, against the
     weights before both: see `AdaptiveTempering`.
 
+    With `jump`, the nonlinear state is sampled from its exact posterior distribution. The covariance of the linear
+    state, which is smaller after a usual increment than after a jump, remains one that all particles share: the mean of
+    both, weighted by their probabilities (moment matching, as in generalized pseudo-Bayesian filters). The evidence is
+    differentiable with respect to the probability by its score function.
+
     Args:
         inner: A filter made by `rao_blackwell_shared` with the proposal `exact`.
         guide: `(particles, log_weights, y) -> Guidance`; leaves of `particles` have the ensemble axis last.
             It may take the inputs of the step as one more argument, see `jf.typing`.
         local: `(x, other) -> delta`, the inverse of the filter's `retract`; subtraction by default.
+        jump: `inputs -> Jump`, the jumps of a step; none by default.
         prior_share: Fraction of the particles that are drawn from the transition alone, in (0, 1). No importance
             correction is larger than `1 / prior_share`.
 
@@ -111,16 +144,21 @@ def guided_rao_blackwell(
     params = getattr(inner, "params", None)
     if not isinstance(params, RaoBlackwell) or params.covariance_axis is not None or params.proposal is not exact:
         raise ValueError("inner must be a filter made by rao_blackwell_shared with the exact proposal.")
-    checks.check_callables(guide=guide, local=local)
+    checks.check_callables(guide=guide, local=local, jump=jump)
     if isinstance(prior_share, bool) or not 0 < prior_share < 1:
         raise ValueError(f"prior_share must be between 0 and 1; got {prior_share!r}.")
     guide = taking_inputs("guide", guide, "particles", "log_weights", "y")
-    return Filter(Guided(params, guide, as_pytree(local), float(prior_share)), _init, _predict, _update)
+    jump = None if jump is None else only_inputs("jump", jump)
+    return Filter(Guided(params, guide, as_pytree(local), jump, float(prior_share)), _init, _predict, _update)
 
 
 def _init(model: Guided, key: AnyKey) -> GuidedState:
     ensemble = rao_blackwell.init(model.inner, key)
-    return GuidedState(ensemble, _zero_increments(ensemble))
+    increments = _zero_increments(ensemble)
+    if model.jump is None:
+        return GuidedState(ensemble, increments)
+    nobody = jnp.zeros(model.inner.num_particles, bool)
+    return GuidedState(ensemble, increments, Jumps(nobody, increments.spread, increments.gain))
 
 
 def _zero_increments(ensemble: RaoBlackwellState) -> Increments:
@@ -131,13 +169,67 @@ def _zero_increments(ensemble: RaoBlackwellState) -> Increments:
 
 
 def _predict(model: Guided, key: AnyKey, state: GuidedState, inputs: PyTree) -> GuidedState:
-    return GuidedState(*rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, inputs))
+    if model.jump is None:
+        return GuidedState(*rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, inputs))
+    key, choice_key, noise_key = jax.random.split(key, 3)
+    ensemble, increments = rao_blackwell.predict_ensemble(model.inner, key, state.ensemble, inputs)
+    jump = model.jump(inputs)
+    checks.check_jump(jump, increments.delta.shape[0])
+    probability = jnp.asarray(jump.probability, ensemble.log_weights.dtype)
+    jumped = jax.random.uniform(choice_key, ensemble.log_weights.shape) < probability
+    spread, gain, larger = _of_jumps(increments, jump.covariance)
+    jumps = Jumps(jumped, spread, gain)
+    noise = dot(cholesky(jump.covariance), standard_normal(noise_key, increments.delta.shape))
+    delta = increments.delta + jnp.where(jumped, noise, 0.0)
+    ensemble = ensemble._replace(
+        covariance=ensemble.covariance + probability * larger,
+        log_weights=ensemble.log_weights + _score(jnp.where(jumped, probability, 1 - probability)),
+    )
+    shift = _shift(increments, jumps, delta) - _shift(increments, None, increments.delta)
+    return _moved(model, GuidedState(ensemble, increments, jumps), delta, shift)
+
+
+def _of_jumps(usual: Increments, covariance: Float[Array, "n n"]) -> tuple[Array, Array, Array]:
+    r"""Spread and gain of what jumps, and how much larger the covariance of its linear state is.
+
+    With $N$ and $L$ of a usual increment and $J$ of a jump: $L N$ is the covariance of linear state and increment,
+    whatever noise the increment has, so that $L_J = L N (N + J)^{-1}$, and the covariance of the linear state is larger
+    by $L N L^T - L_J (N + J) L_J^T$.
+    """
+    spread = usual.spread + covariance
+    root = cholesky(spread)
+    shared = matmul(usual.gain, usual.spread)
+    whitened = solve_triangular(root, shared.T)
+    gain = solve_triangular(root, whitened, transpose=True).T
+    return spread, gain, matmul(usual.gain, shared.T) - matmul(whitened.T, whitened)
+
+
+def _score(probability: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Zeros, whose derivative is that of the logarithm of the probability of what was drawn."""
+    log_probability = jnp.log(probability)
+    return log_probability - jax.lax.stop_gradient(log_probability)
+
+
+def _shift(increments: Increments, jumps: Jumps | None, delta: Float[Array, "n k"]) -> Float[Array, "l k"]:
+    """What increments add to the means of the linear state."""
+    usual = dot(increments.gain, delta)
+    return usual if jumps is None else jnp.where(jumps.jumped, dot(jumps.gain, delta), usual)
+
+
+def _moved(model: Guided, state: GuidedState, delta: Float[Array, "n k"], shift: Float[Array, "l k"]) -> GuidedState:
+    """The state with other increments than those that moved it, and the means of the linear state shifted."""
+    ensemble, increments, jumps = state
+    retract = jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)
+    ensemble = ensemble._replace(
+        particles=retract(increments.origin, increments.drift + delta), linear_mean=ensemble.linear_mean + shift
+    )
+    return GuidedState(ensemble, increments._replace(delta=delta), jumps)
 
 
 def _update(
     model: Guided, key: AnyKey, state: GuidedState, observation: PyTree, inputs: PyTree
 ) -> tuple[GuidedState, ParticleInfo]:
-    ensemble, predicted = state
+    ensemble, predicted, jumps = state
     guidance = model.guide(ensemble.particles, ensemble.log_weights, observation, inputs)
     size = predicted.delta.shape[0]
     checks.check_guidance(guidance, jax.tree.map(lambda leaf: leaf[..., 0], ensemble.particles), size)
@@ -149,12 +241,13 @@ def _update(
 
     towards = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)(predicted.origin, guidance.point) - predicted.drift
     delta, log_ratio = draw(key, predicted.spread, guidance.information, towards, model.prior_share)
-    ensemble = ensemble._replace(
-        particles=jax.vmap(model.inner.retract, in_axes=-1, out_axes=-1)(predicted.origin, predicted.drift + delta),
-        linear_mean=ensemble.linear_mean + dot(predicted.gain, delta - predicted.delta),
-    )
-    ensemble, info = rao_blackwell.update_ensemble(model.inner, ensemble, observation, inputs, log_ratio)
-    return GuidedState(ensemble, predicted._replace(delta=delta)), info
+    if jumps is not None:
+        wide, log_ratio_wide = draw(key, jumps.spread, guidance.information, towards, model.prior_share)
+        delta = jnp.where(jumps.jumped, wide, delta)
+        log_ratio = jnp.where(jumps.jumped, log_ratio_wide, log_ratio)
+    state = _moved(model, state, delta, _shift(predicted, jumps, delta - predicted.delta))
+    ensemble, info = rao_blackwell.update_ensemble(model.inner, state.ensemble, observation, inputs, log_ratio)
+    return state._replace(ensemble=ensemble), info
 
 
 def draw(

@@ -25,7 +25,7 @@ from jaxfilters.models.hand.motion import HandMotion, per_coordinate
 from jaxfilters.models.hand.observation import HandImage, HandLikelihood, crop, hand_image, isolate, window_stride
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, HandGeometry, forward_kinematics, hand_center, local, retract
-from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, guided_rao_blackwell
+from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, Jump, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
@@ -51,13 +51,29 @@ PATIENCE = 5
 """Frames in a row without the hand before it is searched anew."""
 FRAME_INTERVAL = 1 / 30
 """Seconds before the first frame."""
-MOTION = HandMotion(
-    from_host(np.square(per_coordinate(0.008, 0.064, math.radians(12))) * 30),
-    from_host(np.square(per_coordinate(0.04, 0.2, math.radians(24))) * 30),
-    per_coordinate(0.0, 0.0, 1 / 0.3),
-)
-"""A real hand: a joint may move 35 mm from one frame to the next; joint velocities are damped over 0.3 s."""
-START_STD = per_coordinate(0.005, 0.04, math.radians(5))
+
+
+def _rate(position: float, rotation: float, angle: float) -> Float[Array, " 21"]:
+    """Variance a second of a random walk with these standard deviations a frame: metres, and twice degrees."""
+    std = per_coordinate(position, math.radians(rotation), math.radians(angle))
+    return from_host(np.square(std) / FRAME_INTERVAL)
+
+
+_WIDE = _rate(0.008, 3.667, 12.0)
+"""A real hand: a joint may move 35 mm from one frame to the next."""
+UNGUIDED_MOTION = HandMotion(_WIDE, _rate(0.04, 11.46, 24.0), per_coordinate(0.0, 0.0, 1 / 0.3))
+"""So wide that each frame may jump; joint velocities are damped over 0.3 s."""
+MOTION = HandMotion(_rate(0.0038, 1.94, 2.0), _rate(0.0168, 7.92, 10.0), per_coordinate(1 / 0.68, 1 / 0.68, 1 / 0.47))
+"""Between jumps: one to three times the standard deviations of the largest likelihood for the true motions of the
+development, with the time constants of that."""
+WALK = replace(MOTION, pose_variance_rate=_rate(0.0038, 1.94, 3.4))
+"""Likewise, of a hand without a velocity: twice the standard deviations."""
+JUMP_SHARE, DOUBTFUL_JUMP_SHARE = 0.4, 0.98
+"""Probability of a jump as wide as `_WIDE` from one frame to the next; and while another pose explains the frames about
+as well, which the ensemble is to reach."""
+UNGUIDED_START_STD = per_coordinate(0.005, 0.04, math.radians(5))
+START_STD = per_coordinate(0.02, 0.16, math.radians(20))
+"""Wide, since another pose often explains the first frame as well; without a guide, too few particles would be near."""
 START_VELOCITY_STD = per_coordinate(0.08, 0.3, math.radians(25))
 """Per second."""
 
@@ -135,18 +151,19 @@ class Setup:
 @jax.jit
 def placed(key: Array, setup: Setup, pose: Array, scale: Array, side: Array) -> Any:
     """An ensemble about a pose of the hand of a size and a side."""
-    filter = build_filter(setup, pose, setup.sized(scale, side))
+    filter = build_filter(setup, pose, setup.sized(scale, side), jnp.asarray(False))
     return filter.init(filter.params, key)
 
 
-def build_filter(setup: Setup, pose: Array, likelihood: HandLikelihood) -> Filter:
-    """The filter of a hand that starts about `pose`."""
-    with_velocity = setup.config.filter == "rbpf"
+def build_filter(setup: Setup, pose: Array, likelihood: HandLikelihood, doubt: Array) -> Filter:
+    """The filter of a hand that starts about `pose`; with `doubt`, another pose explains the frames about as well."""
+    with_velocity, guide = setup.config.filter == "rbpf", setup.config.guide
+    motion = (MOTION if with_velocity else WALK) if guide else UNGUIDED_MOTION
     velocity = START_VELOCITY_STD if with_velocity else START_VELOCITY_STD[:0]
     inner = rao_blackwell_shared(
-        jax.tree_util.Partial(_sample_about, pose),
+        jax.tree_util.Partial(_sample_about, pose, START_STD if guide else UNGUIDED_START_STD),
         Gaussian(jnp.zeros_like(velocity), jnp.diag(velocity**2)),
-        MOTION.dynamics if with_velocity else MOTION.walk,
+        motion.dynamics if with_velocity else motion.walk,
         likelihood.log_likelihood,
         num_particles=setup.config.num_particles,
         noise_dim=TANGENT_SIZE,
@@ -154,13 +171,18 @@ def build_filter(setup: Setup, pose: Array, likelihood: HandLikelihood) -> Filte
         ess_threshold=1.0,
         temper=AdaptiveTempering(TEMPERED_SHARE),
     )
-    if not setup.config.guide:
+    if not guide:
         return inner
-    return guided_rao_blackwell(inner, jax.tree_util.Partial(_look, likelihood.geometry), local=local, prior_share=0.1)
+    registered, jump = jax.tree_util.Partial(_look, likelihood.geometry), jax.tree_util.Partial(_jump, doubt)
+    return guided_rao_blackwell(inner, registered, local=local, jump=jump, prior_share=0.1)
 
 
-def _sample_about(pose: Array, key: Array) -> Array:
-    return retract(pose, START_STD * jax.random.normal(key, (TANGENT_SIZE,)))
+def _jump(doubt: Array, dt: Array) -> Jump:
+    return Jump(jnp.where(doubt, DOUBTFUL_JUMP_SHARE, JUMP_SHARE), jnp.diag(dt * _WIDE))
+
+
+def _sample_about(pose: Array, std: Array, key: Array) -> Array:
+    return retract(pose, std * jax.random.normal(key, (TANGENT_SIZE,)))
 
 
 def _look(geometry: HandGeometry, particles: Array, log_weights: Array, image: HandImage) -> Guidance:

@@ -180,7 +180,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
     likelihood = setup.hand(state)
-    filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood)
+    filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood, state.doubt)
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
     expected, _ = pose_moments(*particles_of(predicted))

@@ -256,6 +256,10 @@ PARTICLE = [
     Case("proposal vector", lambda: run_proposed(density=lambda a, x, y: x), ("log_density of proposal", "(1,)")),
     Case("no transition density", lambda: run_proposed(log_transition=None), ("log_transition", "None")),
     Case("transition vector", lambda: run_proposed(log_transition=lambda a, x: x), ("log_transition", "(1,)")),
+    Case("jump, no function", lambda: run_guided(jump=0.1), ("jump", "callable", "0.1")),
+    Case("jump, a number", lambda: run_guided(jump=lambda inputs: 0.1), ("jump", "Jump", "float")),
+    Case("jump, sure", lambda: run_guided(jump=lambda inputs: jf.Jump(1.0, ONE)), ("probability of jump", "1.0")),
+    Case("jump (2, 2)", lambda: run_guided(jump=lambda u: jf.Jump(0.1, jnp.eye(2))), ("covariance of jump", "(2, 2)")),
     Case("guided noise", lambda: run_proposed(noise=lambda key, n: jnp.zeros(1)), ("noise", "8", "(1,)")),
     Case(
         "guided, a filter",
