@@ -47,6 +47,10 @@ up to every third frame; registration alone, plain and Rao-Blackwellized filter 
 fourth, 14.2, 13.1 and 10.1 mm with every sixth."""
 LOW_RATE_NUM_FRAMES = 24
 """Frames that are taken: even the shortest motion has nearly as many at the lowest rate."""
+HIDDEN = ((10, 20), (32, 42))
+"""Frames of a motion, from and to, in which the fingers are hidden: a third of a second each."""
+HIDDEN_MARGIN_PX = 12
+"""Of the hidden rectangle about the joints of the fingers beyond the first."""
 SIX_STEPS = RegistrationConfig(widths=(0.03,) * 2 + (0.015,) * 4)
 
 Follow = Callable[[HandRecording, int], float]
@@ -69,13 +73,35 @@ def real_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
         found[f"errors_by_n_real_rbpf_n{count}"] = Metric(float(each.mean()), "mm", "lower")
     for every in QUICK_EVERY if quick else EVERY:
         found |= low_rate_metrics(num_particles, every, quick)
-    return found
+    return found | hidden_metrics(num_particles, quick)
 
 
 def low_rate_metrics(num_particles: int, every: int, quick: bool) -> dict[str, Metric]:
     """The same errors and p-values where the camera delivers only each `every`-th frame."""
     seeds = range(1 if quick else NUM_SEEDS)
     return _metrics(_errors_of_all(num_particles, _recordings(quick, every), seeds), f"_every_{every}")
+
+
+def hidden_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
+    """The same errors and p-values in the frames in which the fingers of the motions are hidden."""
+    seeds = range(1 if quick else NUM_SEEDS)
+    names = _real_hands.HELD[: QUICK_RECORDINGS if quick else None]
+    recordings = [with_hidden_fingers(_real_hands.load(name)) for name in names]
+    return _metrics(_errors_of_all(num_particles, recordings, seeds), "_hidden")
+
+
+def with_hidden_fingers(recording: HandRecording) -> HandRecording:
+    """A motion without readings about the fingers in two spells; its joints are NaN where they are not hidden."""
+    depth, hidden = recording.depth.copy(), np.zeros(len(recording.depth), bool)
+    fingers = recording.joints[:, 5:].reshape(-1, 4, 4, 3)[:, :, 1:].reshape(-1, 12, 3)
+    pixels = np.asarray(recording.camera.project(jnp.asarray(fingers, dtype=float)))
+    for first, end in HIDDEN:
+        hidden[first:end] = True
+        for frame in range(first, min(end, len(depth))):
+            left, top = np.maximum(np.floor(pixels[frame].min(axis=0)).astype(int) - HIDDEN_MARGIN_PX, 0)
+            right, bottom = np.ceil(pixels[frame].max(axis=0)).astype(int) + HIDDEN_MARGIN_PX
+            depth[frame, top:bottom, left:right] = np.nan
+    return recording._replace(depth=depth, joints=np.where(hidden[:, None, None], recording.joints, np.nan))
 
 
 def _errors_of_all(num_particles: int, recordings: list[HandRecording], seeds: range) -> dict[str, np.ndarray]:

@@ -55,6 +55,21 @@ def test_a_lower_rate_takes_frames_at_its_own_times(data_dir):
     assert np.abs(every.depth - all_of_them.depth[::2]).max() < 12 * _real_hands.NOISE_M
 
 
+def test_hidden_fingers_have_no_readings_and_only_they_count():
+    camera = Pinhole.from_intrinsics(100.0, (50.0, 50.0), (100, 100))
+    joints = np.zeros((48, 21, 3)) + [0.0, 0.0, 1.0]
+    joints[:, 5:, 0] = np.tile([-0.3, 0.1, 0.1, 0.2], 4)  # metres, in a plane: a pixel is a centimetre
+    depth, times = np.ones((48, 100, 100), np.float32), np.arange(48, dtype=np.float32) / 30
+    found = _real_comparison.with_hidden_fingers(_real_hands.HandRecording(camera, times, depth, joints, 1.0))
+    hidden = np.isnan(found.depth)
+    assert np.flatnonzero(hidden.any(axis=(1, 2))).tolist() == [*range(10, 20), *range(32, 42)]
+    # From the second joints to the tips, columns 60 to 70, with 12 pixels on each side; rows about 50.
+    rows, columns = (np.flatnonzero(hidden[12].any(axis=1 - axis)) for axis in range(2))
+    assert (rows[0], rows[-1], columns[0], columns[-1]) == (38, 61, 48, 81)
+    assert np.isfinite(found.joints).all(axis=(1, 2)).tolist() == hidden.any(axis=(1, 2)).tolist()
+    assert not np.isnan(depth).any()
+
+
 def test_registration_alone_is_told_the_time_between_frames(monkeypatch):
     """A stand-in puts every joint as many metres aside as the frame comes seconds after the one before."""
     camera = Pinhole.from_intrinsics(1.0, (0.0, 0.0), (1, 1))
@@ -79,6 +94,7 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
 
     # At the lower rate only the first four are there.
     monkeypatch.setattr(_real_comparison, "_recordings", lambda quick, every=1: recordings[: 4 if every == 6 else 5])
+    monkeypatch.setattr(_real_comparison, "hidden_metrics", lambda num_particles, quick: {})
     monkeypatch.setattr(_real_comparison, "registration_error", lambda each, seed: error_of("registration", each, 1e9))
     monkeypatch.setattr(_real_comparison, "tracker_error", lambda name, count, each, seed: error_of(name, each, count))
     found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, quick=True).items()}
