@@ -57,7 +57,7 @@ def test_a_lower_rate_takes_frames_at_its_own_times(data_dir):
 
 def test_hidden_fingers_have_no_readings_and_only_they_count():
     camera = Pinhole.from_intrinsics(100.0, (50.0, 50.0), (100, 100))
-    joints = np.zeros((48, 21, 3)) + [0.0, 0.0, 1.0]
+    joints = np.tile([0.0, 0.0, 1.0], (48, 21, 1))
     joints[:, 5:, 0] = np.tile([-0.3, 0.1, 0.1, 0.2], 4)  # metres, in a plane: a pixel is a centimetre
     depth, times = np.ones((48, 100, 100), np.float32), np.arange(48, dtype=np.float32) / 30
     found = _real_comparison.with_hidden_fingers(_real_hands.HandRecording(camera, times, depth, joints, 1.0))
