@@ -53,16 +53,16 @@ class Guide(Protocol):
 
 
 class Jump(NamedTuple):
-    """A rare increment of the nonlinear state beside the usual one, in all of its coordinates at once."""
+    """A rare increment of the nonlinear state on top of the usual one, in all of its coordinates at once."""
 
     probability: Float[Array, ""]
     """Of a jump in one step, in (0, 1)."""
     covariance: Float[Array, "n n"]
-    """Of the jump, in the tangent space; what jumps has the increment of `MixedDynamics` as well."""
+    """Of the jump, in the tangent space, added to that of the usual increment."""
 
 
 class Jumps(NamedTuple):
-    """Which particles jumped in the last prediction, and how far; fields as those of `Increments`."""
+    """Which particles jumped in the last prediction, and the distribution of the increments of those that did."""
 
     jumped: Bool[Array, " k"]
     spread: Float[Array, "n n"]
@@ -112,7 +112,7 @@ def guided_rao_blackwell(
     With `jump`, the nonlinear state is sampled from its exact posterior distribution. The covariance of the linear
     state, which is smaller after a usual increment than after a jump, remains one that all particles share: the mean of
     both, weighted by their probabilities (moment matching, as in generalized pseudo-Bayesian filters). The evidence is
-    differentiable with respect to the probability by its score function.
+    differentiable with respect to the probability by its score function, which acts until the next resampling.
 
     Args:
         inner: A filter made by `rao_blackwell_shared` with the proposal `exact`.
@@ -129,7 +129,7 @@ def guided_rao_blackwell(
     Raises:
         TypeError: If a callback is not callable.
         ValueError: If `inner` is another kind of filter, or `prior_share` is out of range; and when the filter is
-            traced, if `guide` or `local` returns an array of the wrong shape.
+            traced, if `guide`, `local` or `jump` returns an array of the wrong shape, or a wrong value.
 
     Examples:
         >>> import jax, jax.numpy as jnp, jaxfilters as jf
@@ -157,8 +157,8 @@ def _init(model: Guided, key: AnyKey) -> GuidedState:
     increments = _zero_increments(ensemble)
     if model.jump is None:
         return GuidedState(ensemble, increments)
-    nobody = jnp.zeros(model.inner.num_particles, bool)
-    return GuidedState(ensemble, increments, Jumps(nobody, increments.spread, increments.gain))
+    jumped = jnp.zeros(model.inner.num_particles, bool)
+    return GuidedState(ensemble, increments, Jumps(jumped, increments.spread, increments.gain))
 
 
 def _zero_increments(ensemble: RaoBlackwellState) -> Increments:
