@@ -1,6 +1,7 @@
 """The ten landmarks by MediaPipe's face mesh, for those who have installed it; nothing else here needs it."""
 
 from importlib import import_module
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,14 @@ VERTICES = ((33,), (133,), (362,), (263,), (61,), (291,), (79,), (309,), (55, 10
 class MeshDetector:
     """Landmarks of the most evident face, image by image."""
 
-    def __init__(self, *, refined: bool = False, most_faces: int = 1) -> None:
+    def __init__(self, *, refined: bool = False, most_faces: int = 1, looks: int = 1) -> None:
         """Loads the mesh.
 
         Args:
             refined: With more careful eyes and lips, and five vertices for each iris: 478 in all.
             most_faces: Faces that are looked for in an image, the most evident ones.
+            looks: At each image: the first in the frame of the face's box, each further one in that of the landmarks
+                of the look before.
 
         Raises:
             ImportError: without MediaPipe, or with one that has no face mesh of its own.
@@ -30,16 +33,26 @@ class MeshDetector:
                 "the face mesh needs mediapipe with bundled models, such as mediapipe==0.10.14; landmarks from the "
                 "cascades of OpenCV need nothing."
             ) from error
+        # As a video it begins with the landmarks that it found last: here those in the same image.
         self._mesh = solutions.face_mesh.FaceMesh(
-            static_image_mode=True, max_num_faces=most_faces, refine_landmarks=refined
+            static_image_mode=looks == 1, max_num_faces=most_faces, refine_landmarks=refined
         )
+        self._looks, self._lock = looks, Lock()
 
     def solids(self, image: UInt8[np.ndarray, "rows cols"]) -> list[Float[np.ndarray, "V 3"]]:
         """All vertices of each face in pixels (u, v, and away from the camera as large)."""
         rows, cols = image.shape
-        found = self._mesh.process(np.repeat(image[:, :, None], 3, axis=2)).multi_face_landmarks or []
+        found = self._looked_at(np.repeat(image[:, :, None], 3, axis=2))
         in_pixels = np.array([cols, rows, cols]), np.array([0.5, 0.5, 0.0])
         return [np.array([(p.x, p.y, p.z) for p in face.landmark]) * in_pixels[0] - in_pixels[1] for face in found]
+
+    def _looked_at(self, image: UInt8[np.ndarray, "rows cols 3"]) -> Any:
+        with self._lock:  # a search beside the frames must not come between two looks
+            if self._looks > 1:
+                self._mesh.reset()
+            for _ in range(self._looks - 1):
+                self._mesh.process(image)
+            return self._mesh.process(image).multi_face_landmarks or []
 
     def solid(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "V 3"] | None:
         """All vertices in pixels (u, v, and away from the camera as large), or `None` without a face."""

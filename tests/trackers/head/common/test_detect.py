@@ -1,6 +1,7 @@
 """Faces found by cascades: corners where they are drawn, reasons where there is no start, real video."""
 
 import math
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -156,6 +157,31 @@ def test_the_mesh_says_what_it_needs(monkeypatch):
     monkeypatch.setattr(mesh, "import_module", missing)
     with pytest.raises(ImportError, match="mediapipe"):
         mesh.MeshDetector()
+
+
+def test_each_look_at_an_image_begins_where_the_last_one_ended_and_none_with_another_image(monkeypatch):
+    """A mesh whose landmarks halve their distance from the truth with every look, from 0.4 on in a first one."""
+
+    class Halving:
+        def __init__(self, *, static_image_mode, max_num_faces, refine_landmarks):
+            self.is_static, self.off = static_image_mode, None
+
+        def reset(self):
+            self.off = None
+
+        def process(self, image):
+            self.off = 0.4 if self.off is None or self.is_static else self.off / 2
+            point = SimpleNamespace(x=0.5 + self.off, y=0.5, z=0.0)
+            return SimpleNamespace(multi_face_landmarks=[SimpleNamespace(landmark=[point])] if image.any() else None)
+
+    solutions = SimpleNamespace(face_mesh=SimpleNamespace(FaceMesh=Halving))
+    monkeypatch.setattr(mesh, "import_module", lambda name: SimpleNamespace(solutions=solutions))
+    image = np.ones((100, 200), np.uint8)
+    for looks, off in ((1, 0.4), (2, 0.2), (3, 0.1)):
+        detector = mesh.MeshDetector(looks=looks)
+        for _ in range(2):
+            np.testing.assert_allclose(detector.solid(image), [[200 * (0.5 + off) - 0.5, 49.5, 0.0]])
+        assert detector.solid(0 * image) is None
 
 
 def first_frames(path, count, every):

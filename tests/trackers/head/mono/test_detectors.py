@@ -9,11 +9,13 @@ import pytest
 from jaxfilters.models.face.landmarks import EYES, FROM_68
 from jaxfilters.models.face.mirroring import PAIRS_68
 from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.mesh import MeshDetector
 from jaxfilters.trackers.head.mono import detectors as module
 from jaxfilters.trackers.head.mono.detectors import (
     CHIN,
     DETECTORS,
     IRISES,
+    LOOKS,
     MESH_68,
     CascadeDetector,
     MeshLandmarks,
@@ -21,6 +23,8 @@ from jaxfilters.trackers.head.mono.detectors import (
 )
 
 IMAGE = np.zeros((480, 640), np.uint8)
+SHIFTS = np.array([(0, 0), (11, 5), (-17, 9), (23, -14), (-30, -21), (37, 26)])
+"""Pixels, u and v."""
 
 
 def test_vertices_become_landmarks(monkeypatch):
@@ -64,9 +68,10 @@ def detector_of(monkeypatch, solids):
     """The detector on a mesh whose faces in an image are those of a function."""
 
     class FakeMesh:
-        def __init__(self, *, refined, most_faces):
+        def __init__(self, *, refined, most_faces, looks):
             assert refined
             assert most_faces > 1
+            assert looks > 1
 
         def solids(self, image):
             return solids(image)
@@ -88,6 +93,28 @@ def test_no_vertex_is_two_landmarks_of_one_side():
     single = [vertices for vertices in MESH_68 if len(vertices) == 1]
     assert len(set(single)) == len(single)
     assert all(0 <= vertex < 478 for vertices in (*MESH_68, *IRISES) for vertex in vertices)
+
+
+@pytest.mark.system
+def test_landmarks_move_with_the_image(data_dir):
+    """Of an image that is shifted by whole pixels: one look's are wrong with the box, which is not shifted alike."""
+    if importlib.util.find_spec("mediapipe") is None:
+        pytest.skip("mediapipe is not installed: `pip install jaxfilters[mediapipe]`")
+    read, image = cv2.VideoCapture(str(data_dir / "talking_face_video" / "franck.mp4")).read()
+    if not read:
+        pytest.skip("JAXFILTERS_DATA has no talking_face_video")
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    rows, cols = grey.shape
+
+    def apart(detector):
+        """By how much landmarks of shifted images differ from shifted landmarks, pixels, root mean square."""
+        padded = np.pad(grey, 40, mode="edge")
+        shifted = [padded[40 - v :, 40 - u :][:rows, :cols] for u, v in SHIFTS]
+        found = np.stack([detector.solid(np.ascontiguousarray(one))[:, :2] for one in shifted])
+        return np.sqrt(np.mean(np.var(found - SHIFTS[:, None], axis=0)))
+
+    once, again = (apart(MeshDetector(refined=True, looks=looks)) for looks in (1, LOOKS))
+    assert again < 0.6 * once
 
 
 @pytest.mark.system
