@@ -28,6 +28,8 @@ class Compared(NamedTuple):
     """Of the tracker, perhaps another one."""
     row: Any
     """Of the track in this frame; None where it stays as it is."""
+    is_elsewhere: bool = True
+    """Whether the row contradicts the one that the track had, which is an event."""
 
 
 class Beginning(NamedTuple):
@@ -208,10 +210,12 @@ class Following:
     def _compare(self, images: np.ndarray, time: float, track: Any) -> Any:
         """The track of a chunk, with the last row from where the detector finds the face, if that is better."""
         self._compared = time
-        self.state, better = self._tracker.compared(self.state, jax.tree.map(lambda leaf: leaf[-1], track), images)
+        row = jax.tree.map(lambda leaf: leaf[-1], track)
+        self.state, better, is_elsewhere = self._tracker.compared(self.state, row, images)
         if better is None:
             return track
-        self._say(-1, "found again where it is detected" if self._is_lost else "put where it is detected")
+        if is_elsewhere:
+            self._say(-1, "found again where it is detected" if self._is_lost else "put where it is detected")
         self._is_lost = False
         return jax.tree.map(lambda rows, last: np.concatenate([rows[:-1], np.asarray(last)[None]]), track, better)
 

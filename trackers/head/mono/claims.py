@@ -1,5 +1,7 @@
 """Variances of a pose that are reported: of the frame, the person, the lens, and landmarks that have changed."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -34,8 +36,24 @@ def pose_variance(
         num_sure: Landmarks that look as registered and are where the model has them, 0 to 10; 0 where the face was not
             found.
     """
+    wider, of_changed = _by_looks(num_sure, of_frame.dtype)
+    return wider * of_frame + of_person + of_focal + of_changed
+
+
+def frame_covariance(covariance: Float[Array, "n n"], num_sure: Float[Array, ""]) -> Float[Array, "n n"]:
+    """Covariance of what one view errs by in pose and mode coefficients, if the person is as believed.
+
+    Args:
+        covariance: The same if landmarks err independently of each other.
+        num_sure: As in `pose_variance`.
+    """
+    wider, of_changed = _by_looks(num_sure, covariance.dtype)
+    return wider * covariance + jnp.diag(jnp.pad(of_changed, (0, len(covariance) - of_changed.size)))
+
+
+def _by_looks(num_sure: Float[Array, ""], dtype: Any) -> tuple[Float[Array, ""], Float[Array, " 6"]]:
+    """Factor of the variances, and what landmarks that do not look as registered add to those of the pose."""
     is_sure = num_sure >= FEWEST_SURE
     # Landmarks that are followed from frame to frame are wrong together: only those that look as registered count.
     wider = jnp.where(is_sure, 1.0, jnp.square(NUM_LANDMARKS / jnp.maximum(num_sure, FEWEST_ANCHORED)))
-    of_changed = (1 - num_sure / NUM_LANDMARKS) * jnp.square(jnp.asarray(CHANGED_STD, of_frame.dtype))
-    return wider * of_frame + of_person + of_focal + of_changed
+    return wider, (1 - num_sure / NUM_LANDMARKS) * jnp.square(jnp.asarray(CHANGED_STD, dtype))

@@ -2,17 +2,21 @@
 
 A head that turns far leaves few landmarks that look as registered. The others are followed from frame to frame, and the
 track may slip by tens of degrees while a detector sees the face well; a detector errs by tens of degrees on other views
-(beyond 50 degrees of yaw). So neither is believed: the tracker goes on from both poses in the same image, and the
-correlation of the registered face decides between what it makes of them.
+(beyond 50 degrees of yaw). Where the pose of the detected landmarks is one that the standard deviations of the track
+allow, the tracker goes on from the mean of both, weighted by their covariances. Where they exclude each other neither
+is believed: the tracker goes on from both poses in the same image, and the correlation of the registered face decides
+between what it makes of them.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
+from jaxfilters._full_precision import dot
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
@@ -23,14 +27,19 @@ from jaxfilters.trackers.head.common.near_mode import UNKNOWN_STD
 from jaxfilters.trackers.head.common.recent import CHANGED_SCORE, nothing_changed
 from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
+from jaxfilters.trackers.head.mono.claims import frame_covariance
 from jaxfilters.trackers.head.mono.detections import noise_px
 from jaxfilters.trackers.head.mono.detectors import Detector
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import LEAST_SCORE, REGAINED_SCORE
 
-EVERY_S = 1 / 3
-"""Seconds between two frames in which a track in doubt is compared with a detection."""
+EVERY_S = 0.1
+"""Seconds between two frames in which a track in doubt is compared with a detection.
+
+On 24 videos of people 0 to 3 and 12 to 15 of the ICT face model with the mesh, 8 with glasses and 8 with beards, yaw is
+wrong by 5.7, 4.7 and 5.4 degrees with a comparison every third of a second, 5.4, 4.1 and 4.5 with ten a second.
+"""
 CLEARLY_BETTER = 0.02
 """By how much the registered face must correlate better at another pose."""
 MOST_DISTANCE = 15.1
@@ -43,10 +52,29 @@ ROUNDS = 3
 """Of five Gauss-Newton steps each."""
 
 
+class Located(NamedTuple):
+    """What a detector says of the last image."""
+
+    state: MonoState
+    """With the face where both say that it is if they agree, where the detector finds it if not."""
+    agrees: bool
+    """Whether track and detection allow each other."""
+
+
 def located(
-    state: MonoState, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
-) -> MonoState | None:
-    """The state with the face where a detector finds it in the last image; None if it finds none."""
+    state: MonoState, row: MonoTrack, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
+) -> Located | None:
+    """The state with the face where a detector finds it in the last image; None if none, or the track is beyond doubt.
+
+    Args:
+        state: Of the tracker after that image.
+        row: Of the track in that image.
+        rig: One camera.
+        detector: Of the landmarks.
+        image: The last one.
+    """
+    if row.status == DEFORMABLE:
+        return None
     near = np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
     detected = detector.detect(image, near if np.all(np.isfinite(near)) else None)
     if isinstance(detected, str):
@@ -60,20 +88,32 @@ def located(
     number = lambda a: jnp.asarray(a, state.model.mean.dtype)
     std_px = number(noise)
     found = _pose(state, rig, number(detected.points), std_px, number(beside))
-    return _placed(state, rig, jnp.asarray(image), found, std_px) if np.all(np.isfinite(found.mean)) else None
+    if not np.all(np.isfinite(found.mean)):
+        return None
+    agrees = bool(row.status != LOST and _distance(np.asarray(found.mean[:POSE], float), row) <= MOST_DISTANCE)
+    found = _fused(state, found) if agrees else found
+    return Located(_placed(state, rig, jnp.asarray(image), found, std_px), agrees)
 
 
 def prepare(state: MonoState, rig: CameraRig) -> None:
     """Compiles what `located` runs, so that the frames of a live camera do not wait for it."""
     zero = jnp.zeros_like(state.model.mean)
-    found = _pose(state, rig, zero[:, :2], zero[:, 0] + 1.0, zero)
+    found = _fused(state, _pose(state, rig, zero[:, :2], zero[:, 0] + 1.0, zero))
     _placed(state, rig, jnp.zeros(rig.shape, jnp.uint8), found, zero[:, 0])
 
 
-def is_better(other: MonoTrack, track: MonoTrack) -> bool:
-    """Whether the row from a detected pose is to be believed rather than that of the track in doubt, or lost."""
+def is_better(other: MonoTrack, track: MonoTrack, *, agrees: bool = False) -> bool:
+    """Whether the row from a detected pose is to be believed rather than that of the track in doubt, or lost.
+
+    Args:
+        other: From the detected pose, or from its mean with that of the track if they agree.
+        track: As it was.
+        agrees: Whether they do.
+    """
     if other.status == LOST or not np.all(np.isfinite(other.pose)):
         return False
+    if agrees:
+        return True
     is_sure = other.status == DEFORMABLE
     if track.status == LOST:
         return bool(other.score >= (REGAINED_SCORE if is_sure else CHANGED_SCORE))
@@ -101,6 +141,8 @@ def _pose(
     beside: Float[Array, "K 3"],
 ) -> Gaussian:
     """Pose and mode coefficients from detected landmarks: the likelier of the fits from the last pose and a facing one.
+
+    The covariance contains what a detector is wrong in for seconds.
 
     Args:
         state: Of the last frame.
@@ -135,21 +177,34 @@ def _pose(
 
     beliefs, evidence = jax.vmap(fitted)(jnp.stack([facing, state.belief.mean]))
     best = jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
-    return jax.tree.map(lambda leaf: leaf[best], beliefs)
+    mean, covariance = beliefs.mean[best], beliefs.covariance[best]
+    lasting = jnp.square(jnp.pad(jnp.asarray(LASTING_STD, dtype), (0, mean.size - POSE)))
+    return Gaussian(mean, covariance + jnp.diag(lasting))
+
+
+@compiled_quickly
+def _fused(state: MonoState, found: Gaussian) -> Gaussian:
+    """The product of what the track and a detection say of pose and mode coefficients, if the person is as believed."""
+    num_sure = jnp.sum(jnp.any(~state.recent.has_changed, axis=0)).astype(found.mean.dtype)
+    mean, covariance = state.belief.mean, frame_covariance(state.belief.covariance, num_sure)
+    apart = found.mean - mean
+    turned = (apart[3:POSE] + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    gain = jnp.linalg.solve(covariance + found.covariance, covariance).T
+    both = covariance - dot(gain, covariance)
+    return Gaussian(mean + dot(gain, apart.at[3:POSE].set(turned)), 0.5 * (both + both.T))
 
 
 @compiled_quickly
 def _placed(
     state: MonoState, rig: CameraRig, image: Num[Array, "rows cols"], found: Gaussian, std_px: Float[Array, " K"]
 ) -> MonoState:
-    """The state with the head at a detected pose, where no landmark is known to look as registered."""
+    """The state with the head at another pose, where no landmark is known to look as registered."""
     x = found.mean
     recent = nothing_changed(image[None].astype(x.dtype), shape(state.model, x[POSE:]), x[:POSE], rig)
     recent = recent._replace(drift=jnp.square(std_px)[None], has_changed=jnp.ones_like(recent.has_changed))
-    lasting = jnp.diag(jnp.square(jnp.pad(jnp.asarray(LASTING_STD, x.dtype), (0, x.size - POSE))))
     return state._replace(
         search=gathered(state.search, x)._replace(estimate=x, velocity=jnp.zeros_like(state.search.velocity)),
-        belief=Gaussian(x, found.covariance + lasting),
+        belief=found,
         recent=recent,
         last_good=x,
         misses=jnp.zeros_like(state.misses),

@@ -20,7 +20,7 @@ from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
-from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
+from jaxfilters.trackers.head.common.state import INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
@@ -288,15 +288,15 @@ class _MonoTracker:
         return self._recognised(state), track
 
     def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray) -> Compared:
-        is_sure = row.status == DEFORMABLE
-        found = None if is_sure else redetection.located(state, self.rig, self._detector, images[0])
+        found = redetection.located(state, row, self.rig, self._detector, images[0])
         if found is None:
             return Compared(state, None)
         frames = np.repeat(images[None], self.chunk, axis=0)
         clock = np.full(self.chunk, float(state.time), np.asarray(state.time).dtype)
-        other, track = advance(self._system, found, frames, clock, np.arange(self.chunk) < 1, self._compiled)
+        other, track = advance(self._system, found.state, frames, clock, np.arange(self.chunk) < 1, self._compiled)
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], track)
-        return Compared(other, first) if redetection.is_better(first, row) else Compared(state, None)
+        is_better = redetection.is_better(first, row, agrees=found.agrees)
+        return Compared(other, first, not found.agrees) if is_better else Compared(state, None)
 
     def gallery(self, state: MonoState) -> Gallery:
         return as_gallery(self._system.unknown, self._system.face, state)
