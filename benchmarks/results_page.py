@@ -65,14 +65,21 @@ class Row(NamedTuple):
 
 _ICT = "rendered people of the ICT face model, heads and faces moving as recorded"
 ON_RECORDINGS = (
-    Row(
-        "hand in depth images",
-        "12 motions of real hands, 11 of them rendered from scans",
-        "joints",
-        "registration alone",
-        "pf-vs-rbpf",
-        "joint_error_mm_real_rbpf",
-        "joint_error_mm_real_registration",
+    *(
+        Row(
+            "hand in depth images",
+            recording,
+            "joints",
+            "registration alone",
+            "pf-vs-rbpf",
+            f"joint_error_mm_real{case}_rbpf",
+            f"joint_error_mm_real{case}_registration",
+        )
+        for recording, case in (
+            ("12 motions of real hands, 11 of them rendered from scans", ""),
+            ("the same, 7.5 frames a second", "_every_4"),
+            ("11 of them, while the fingers are hidden", "_hidden"),
+        )
     ),
     *(
         Row(
