@@ -65,29 +65,32 @@ def real_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
         sys.stderr.write(f"real hands left out: {error}\n")
         return {}
     seeds = range(1 if quick else NUM_SEEDS)
-    errors = _errors_of_all(num_particles, recordings, seeds)
-    found = _metrics(errors, "")
+    cases = {"": _errors_of_all(num_particles, recordings, seeds)}
+    for every in QUICK_EVERY if quick else EVERY:
+        cases[f"_every_{every}"] = _errors_of_all(num_particles, _recordings(quick, every), seeds)
+    cases["_hidden"] = _errors_of_all(num_particles, _hidden(quick), seeds)
+    found: dict[str, Metric] = {}
+    for case, errors in (cases | {"_all_cases": _over_all(cases)}).items():
+        found |= _metrics(errors, case)
     for count in QUICK_COUNTS if quick else COUNTS:
         follow = partial(tracker_error, "rbpf", count)
-        each = errors["rbpf"] if count == num_particles else errors_of(follow, recordings, seeds)
+        each = cases[""]["rbpf"] if count == num_particles else errors_of(follow, recordings, seeds)
         found[f"errors_by_n_real_rbpf_n{count}"] = Metric(float(each.mean()), "mm", "lower")
-    for every in QUICK_EVERY if quick else EVERY:
-        found |= low_rate_metrics(num_particles, every, quick)
-    return found | hidden_metrics(num_particles, quick)
+    return found
 
 
-def low_rate_metrics(num_particles: int, every: int, quick: bool) -> dict[str, Metric]:
-    """The same errors and p-values where the camera delivers only each `every`-th frame."""
-    seeds = range(1 if quick else NUM_SEEDS)
-    return _metrics(_errors_of_all(num_particles, _recordings(quick, every), seeds), f"_every_{every}")
+def _over_all(cases: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Of each recording that all cases have, the mean error over the cases; the first ones are the same in all."""
+    count = min(len(each) for errors in cases.values() for each in errors.values())
+    ways = cases[""]
+    return {name: np.mean([errors[name][:count] for errors in cases.values()], axis=0) for name in ways}
 
 
-def hidden_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
-    """The same errors and p-values in the frames in which the fingers of the motions are hidden."""
-    seeds = range(1 if quick else NUM_SEEDS)
-    names = _real_hands.HELD[: QUICK_RECORDINGS if quick else None]
-    recordings = [with_hidden_fingers(_real_hands.load(name)) for name in names]
-    return _metrics(_errors_of_all(num_particles, recordings, seeds), "_hidden")
+def _hidden(quick: bool) -> list[HandRecording]:
+    """The motions with hidden fingers; the camera's recording is too short for two spells."""
+    return [
+        with_hidden_fingers(_real_hands.load(name)) for name in _real_hands.HELD[: QUICK_RECORDINGS if quick else None]
+    ]
 
 
 def with_hidden_fingers(recording: HandRecording) -> HandRecording:
@@ -113,16 +116,16 @@ def _errors_of_all(num_particles: int, recordings: list[HandRecording], seeds: r
     return {name: errors_of(follow, recordings, seeds) for name, follow in ways.items()}
 
 
-def _metrics(errors: dict[str, np.ndarray], rate: str) -> dict[str, Metric]:
-    """Means over the recordings, and the paired tests, of names that end with the rate."""
+def _metrics(errors: dict[str, np.ndarray], case: str) -> dict[str, Metric]:
+    """Means over the recordings, and the paired tests, of names that end with the case."""
     for name, each in errors.items():
-        sys.stdout.write(f"real hands{rate}, {name}, mm: {np.round(each, 1)}\n")
+        sys.stdout.write(f"real hands{case}, {name}, mm: {np.round(each, 1)}\n")
     found = {
-        f"joint_error_mm_real{rate}_{name}": Metric(float(each.mean()), "mm", "lower") for name, each in errors.items()
+        f"joint_error_mm_real{case}_{name}": Metric(float(each.mean()), "mm", "lower") for name, each in errors.items()
     }
     for rival, better in (("pf", "better"), ("registration", "better_than_registration")):
         p = p_value_better(errors["rbpf"], errors[rival])
-        found[f"p_value_rbpf_{better}_real{rate}"] = Metric(p, "", "lower")
+        found[f"p_value_rbpf_{better}_real{case}"] = Metric(p, "", "lower")
     return found
 
 

@@ -94,7 +94,7 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
 
     # At the lower rate only the first four are there.
     monkeypatch.setattr(_real_comparison, "_recordings", lambda quick, every=1: recordings[: 4 if every == 6 else 5])
-    monkeypatch.setattr(_real_comparison, "hidden_metrics", lambda num_particles, quick: {})
+    monkeypatch.setattr(_real_comparison, "_hidden", lambda quick: recordings[1:])
     monkeypatch.setattr(_real_comparison, "registration_error", lambda each, seed: error_of("registration", each, 1e9))
     monkeypatch.setattr(_real_comparison, "tracker_error", lambda name, count, each, seed: error_of(name, each, count))
     found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, quick=True).items()}
@@ -106,6 +106,10 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     assert found["joint_error_mm_real_every_6_rbpf"] == pytest.approx(7.5)
     assert found["p_value_rbpf_better_real_every_6"] == pytest.approx(1 / 16)
     assert found["p_value_rbpf_better_than_registration_real_every_6"] == pytest.approx(1.0)
+    assert found["joint_error_mm_real_hidden_pf"] == pytest.approx(9.5)
+    # Of the first four recordings, 6.5 and twice 7.5, the last without the first one.
+    assert found["joint_error_mm_real_all_cases_rbpf"] == pytest.approx((7.5 + 7.5 + 8.5) / 3)
+    assert found["p_value_rbpf_better_real_all_cases"] == pytest.approx(1 / 16)
 
 
 def test_without_recordings_there_is_nothing_to_compare(monkeypatch):
