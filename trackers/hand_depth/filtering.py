@@ -63,11 +63,10 @@ _WIDE = _rate(0.008, 3.667, 12.0)
 """A real hand: a joint may move 35 mm from one frame to the next."""
 UNGUIDED_MOTION = HandMotion(_WIDE, _rate(0.04, 11.46, 24.0), per_coordinate(0.0, 0.0, 1 / 0.3))
 """So wide that each frame may jump; joint velocities are damped over 0.3 s."""
-MOTION = HandMotion(_rate(0.0038, 1.94, 2.0), _rate(0.0168, 7.92, 10.0), per_coordinate(1 / 0.68, 1 / 0.68, 1 / 0.47))
-"""Between jumps: one to three times the standard deviations of the largest likelihood for the true motions of the
-development, with the time constants of that."""
-WALK = replace(MOTION, pose_variance_rate=_rate(0.0038, 1.94, 3.4))
-"""Likewise, of a hand without a velocity: twice the standard deviations."""
+MOTION = HandMotion(_rate(0.0038, 1.94, 3.4), _rate(0.02, 8.0, 12.0), per_coordinate(1 / 0.68, 1 / 0.68, 1 / 0.47))
+"""Between jumps, of a pose with a velocity and without: twice the standard deviations of the random walk, and up to
+two and a half times those of the velocity, that have the largest likelihood for the true motions of the development,
+with the time constants of that."""
 JUMP_SHARE, DOUBTFUL_JUMP_SHARE = 0.4, 0.98
 """Probability of a jump as wide as `_WIDE` from one frame to the next; and while another pose explains the frames about
 as well, which the ensemble is to reach."""
@@ -158,7 +157,7 @@ def placed(key: Array, setup: Setup, pose: Array, scale: Array, side: Array) -> 
 def build_filter(setup: Setup, pose: Array, likelihood: HandLikelihood, doubt: Array) -> Filter:
     """The filter of a hand that starts about `pose`; with `doubt`, another pose explains the frames about as well."""
     with_velocity, guide = setup.config.filter == "rbpf", setup.config.guide
-    motion = (MOTION if with_velocity else WALK) if guide else UNGUIDED_MOTION
+    motion = MOTION if guide else UNGUIDED_MOTION
     velocity = START_VELOCITY_STD if with_velocity else START_VELOCITY_STD[:0]
     inner = rao_blackwell_shared(
         jax.tree_util.Partial(_sample_about, pose, START_STD if guide else UNGUIDED_START_STD),

@@ -65,13 +65,23 @@ class Detector(Protocol):
         """How far the ten landmarks lie from the model's; `None` for noise of a pixel alone."""
         ...
 
+    @property
+    def is_averaged(self) -> bool:
+        """Whether a track in doubt may be averaged with the landmarks' pose, as it must not where they err grossly."""
+        ...
+
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
         ...
 
 
 class CascadeDetector:
-    """By OpenCV's cascades and the corners of eyes, mouth, nostrils and brows."""
+    """By OpenCV's cascades and the corners of eyes, mouth, nostrils and brows.
+
+    With glasses or a beard it takes a rim for a brow, or an edge of the beard for a corner of the mouth.
+    """
+
+    is_averaged = False
 
     def __init__(self) -> None:
         self.errors = default_detector_errors()["cascades"]
@@ -89,6 +99,8 @@ class CascadeDetector:
 
 class MeshLandmarks:
     """By MediaPipe's face mesh: most of the 68 landmarks, and the irises."""
+
+    is_averaged = True
 
     def __init__(self) -> None:
         """Loads the mesh.

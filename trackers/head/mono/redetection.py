@@ -3,7 +3,8 @@
 A head that turns far leaves few landmarks that look as registered. The others are followed from frame to frame, and the
 track may slip by tens of degrees while a detector sees the face well; a detector errs by tens of degrees on other views
 (beyond 50 degrees of yaw). Where the pose of the detected landmarks is one that the standard deviations of the track
-allow, the tracker goes on from the mean of both, weighted by their covariances. Where they exclude each other neither
+allow, the tracker goes on from the mean of both, weighted by their covariances, if the detector's errors have one (the
+mesh; the cascades err grossly with glasses and beards). Where they exclude each other, or cannot be averaged, neither
 is believed: the tracker goes on from both poses in the same image, and the correlation of the registered face decides
 between what it makes of them.
 """
@@ -34,8 +35,8 @@ from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import LEAST_SCORE, REGAINED_SCORE
 
-EVERY_S = 0.1
-"""Seconds between two frames in which a track in doubt is compared with a detection.
+EVERY_S, EVERY_S_AVERAGED = 1 / 3, 0.1
+"""Seconds between two frames in which a track in doubt is compared with a detection; and where it is averaged with it.
 
 On 24 videos of people 0 to 3 and 12 to 15 of the ICT face model with the mesh, 8 with glasses and 8 with beards, yaw is
 wrong by 5.7, 4.7 and 5.4 degrees with a comparison every third of a second, 5.4, 4.1 and 4.5 with ten a second.
@@ -59,6 +60,11 @@ class Located(NamedTuple):
     """With the face where both say that it is if they agree, where the detector finds it if not."""
     agrees: bool
     """Whether track and detection allow each other."""
+
+
+def seconds_between(detector: Detector) -> float:
+    """How often a track in doubt is compared with what a detector finds."""
+    return EVERY_S_AVERAGED if detector.is_averaged else EVERY_S
 
 
 def located(
@@ -87,10 +93,12 @@ def located(
         beside = detector.errors.mean if state.prior.misplaced is None else beside
     number = lambda a: jnp.asarray(a, state.model.mean.dtype)
     std_px = number(noise)
-    found = _pose(state, rig, number(detected.points), std_px, number(beside))
+    lasting = number(LASTING_STD if detector.is_averaged else np.zeros(POSE))
+    found = _pose(state, rig, number(detected.points), std_px, number(beside), lasting)
     if not np.all(np.isfinite(found.mean)):
         return None
-    agrees = bool(row.status != LOST and _distance(np.asarray(found.mean[:POSE], float), row) <= MOST_DISTANCE)
+    may_agree = detector.is_averaged and row.status != LOST
+    agrees = bool(may_agree and _distance(np.asarray(found.mean[:POSE], float), row) <= MOST_DISTANCE)
     found = _fused(state, found) if agrees else found
     return Located(_placed(state, rig, jnp.asarray(image), found, std_px), agrees)
 
@@ -98,7 +106,7 @@ def located(
 def prepare(state: MonoState, rig: CameraRig) -> None:
     """Compiles what `located` runs, so that the frames of a live camera do not wait for it."""
     zero = jnp.zeros_like(state.model.mean)
-    found = _fused(state, _pose(state, rig, zero[:, :2], zero[:, 0] + 1.0, zero))
+    found = _fused(state, _pose(state, rig, zero[:, :2], zero[:, 0] + 1.0, zero, jnp.zeros(POSE, zero.dtype)))
     _placed(state, rig, jnp.zeros(rig.shape, jnp.uint8), found, zero[:, 0])
 
 
@@ -139,10 +147,9 @@ def _pose(
     points: Float[Array, "K 2"],
     std_px: Float[Array, " K"],
     beside: Float[Array, "K 3"],
+    lasting_std: Float[Array, " 6"],
 ) -> Gaussian:
     """Pose and mode coefficients from detected landmarks: the likelier of the fits from the last pose and a facing one.
-
-    The covariance contains what a detector is wrong in for seconds.
 
     Args:
         state: Of the last frame.
@@ -150,6 +157,7 @@ def _pose(
         points: Landmarks, pixels.
         std_px: Their standard deviations.
         beside: By how much they lie beside the state's, model frame, millimetres.
+        lasting_std: Of what the detector is wrong in for seconds in a pose.
     """
     model, dtype = replace(state.model, mean=state.model.mean + beside), points.dtype
     modes, K, S = state.belief.mean[POSE:], len(points), state.slopes.covariance.shape[-1]
@@ -178,7 +186,7 @@ def _pose(
     beliefs, evidence = jax.vmap(fitted)(jnp.stack([facing, state.belief.mean]))
     best = jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))
     mean, covariance = beliefs.mean[best], beliefs.covariance[best]
-    lasting = jnp.square(jnp.pad(jnp.asarray(LASTING_STD, dtype), (0, mean.size - POSE)))
+    lasting = jnp.square(jnp.pad(lasting_std, (0, mean.size - POSE)))
     return Gaussian(mean, covariance + jnp.diag(lasting))
 
 

@@ -217,7 +217,7 @@ class _MonoTracker:
         """Adjustments when it was last asked who it is."""
         self._detector = detector or CascadeDetector()
         self._collector = Collector(self._detector)
-        self.compare_every_s = math.inf if options.is_published else redetection.EVERY_S
+        self.compare_every_s = math.inf if options.is_published else redetection.seconds_between(self._detector)
         self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
         self._ready: Future[MonoState] | None = None
         """What a face that comes back needs first, compiled beside the frames."""

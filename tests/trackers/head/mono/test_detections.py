@@ -92,6 +92,7 @@ class Mesh:
     """A detector that sees the face where it is told, 68 landmarks and irises with it."""
 
     errors = None
+    is_averaged = True
 
     def __init__(self, dense):
         self.dense = dense

@@ -26,6 +26,7 @@ class KnownLandmarks:
     """A detector of the true landmarks with noise of a pixel, which finds no face where they are not finite."""
 
     errors = None
+    is_averaged = True
 
     def __init__(self, uv):
         self.uv, self.asked = uv, 0
@@ -40,7 +41,7 @@ class KnownLandmarks:
 def followed(rig, face, talking, detected):
     """A session after 32 frames: what it saved, and a function that goes on from there with a detector."""
     made, images = talking
-    session = MonoSession(rig, face, detections=detected)
+    session = MonoSession(rig, face, detections=detected, detector=KnownLandmarks(np.full((10, 2), np.nan)))
     session.process(images[:FIRST], made.times[:FIRST])
 
     def again(uv):
@@ -60,7 +61,7 @@ def test_a_pose_from_detected_landmarks_is_that_of_solve_pnp(followed, rig):
     uv = np.asarray(project_shape(rig, M, jnp.asarray(true, float))[0][0], float)
     slipped = state._replace(belief=replace(state.belief, mean=state.belief.mean.at[4].set(-0.9)))
     zero = jnp.zeros_like(M)
-    found = redetection._pose(slipped, rig, jnp.asarray(uv, float), jnp.full(10, 0.5), zero)
+    found = redetection._pose(slipped, rig, jnp.asarray(uv, float), jnp.full(10, 0.5), zero, jnp.zeros(POSE))
     K = np.array([[800.0, 0, 319.5], [0, 800.0, 239.5], [0, 0, 1]])
     start = np.zeros((3, 1)), np.array([[0.0], [0.0], [600.0]])
     _, turn, place = cv2.solvePnP(np.asarray(M, float), uv, K, None, *start, useExtrinsicGuess=True)
@@ -72,7 +73,7 @@ def test_a_pose_from_detected_landmarks_is_that_of_solve_pnp(followed, rig):
     # What lies beside the landmarks of the person alike is no turn of the head.
     aside = jnp.zeros_like(M).at[:, 2].set(jnp.linspace(-6.0, 6.0, 10))
     moved = np.asarray(project_shape(rig, M + aside, jnp.asarray(true, float))[0][0], float)
-    known = redetection._pose(slipped, rig, jnp.asarray(moved, float), jnp.full(10, 0.5), aside)
+    known = redetection._pose(slipped, rig, jnp.asarray(moved, float), jnp.full(10, 0.5), aside, jnp.zeros(POSE))
     np.testing.assert_allclose(known.mean[3:POSE], true[3:], atol=np.radians(1.0))
 
 
@@ -174,6 +175,12 @@ def test_where_both_allow_each_other_the_track_goes_on_from_between_them(followe
     assert not located.agrees
     assert np.degrees(abs(float(located.state.belief.mean[4]) - true[4])) < 4.0
     assert beside(doubtful._replace(status=DEFORMABLE)) is None
+    # Of a detector that errs grossly the pose is taken as it is.
+    other._tracker._detector.is_averaged = False
+    located = beside(doubtful)
+    assert not located.agrees
+    assert np.degrees(abs(float(located.state.belief.mean[4]) - true[4])) < 4.0
+    assert redetection.seconds_between(other._tracker._detector) > other._tracker.compare_every_s
 
 
 @pytest.mark.system
