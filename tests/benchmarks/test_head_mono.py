@@ -142,6 +142,7 @@ def test_solve_pnp_finds_the_mean_face_where_it_is():
 
     class Detector:
         errors = None
+        is_averaged = False
 
         def detect(self, image, near):
             return Seen(points) if image.any() else "no face"
