@@ -143,7 +143,7 @@ def tracker_error(filter: str, num_particles: int, recording: HandRecording, see
 
 def registration_error(recording: HandRecording, seed: int) -> float:
     """Of registration alone, from the start that the tracker finds."""
-    config = HandDepthConfig(num_particles=64, seed=seed)
+    config = HandDepthConfig(num_particles=64, seed=seed, guide=False)  # particles near the start that is found
     state = hand_depth.build(recording.camera, config).init(jax.random.key(seed), recording.depth[0])
     setup = hand_depth.set_up(recording.camera, config).compiled()  # one program for all seeds
     elapsed = np.diff(recording.times_s, prepend=recording.times_s[0] - np.float32(FRAME_INTERVAL))

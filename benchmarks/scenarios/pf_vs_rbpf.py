@@ -146,7 +146,7 @@ def _guided(name: str, num_particles: int) -> Filtering:
 
 def _registration(key: AnyKey, frames: jax.Array) -> hand.Estimate:
     """Registration alone, from the start that the tracker finds and with what it is given."""
-    config = HandDepthConfig(num_particles=64, hand="right", scale=1.0)
+    config = HandDepthConfig(num_particles=64, hand="right", scale=1.0, guide=False)  # near the start that is found
     state = hand_depth.build(kinect_v2(), config, hand_geometry()).init(key, np.asarray(frames[0]))
     setup = hand_depth.set_up(kinect_v2(), config, hand_geometry())
     poses, joints = registered(setup, state, frames, jax.numpy.full(len(frames), FRAME_INTERVAL))
