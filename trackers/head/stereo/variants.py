@@ -47,6 +47,8 @@ class Variant(NamedTuple):
     """How the skull's motion is taken out of them."""
     sharpens: bool
     """Whether the registered shape is triangulated anew."""
+    may_doubt: bool
+    """Whether a pose at which the face looks little as registered is doubtful, and claimed to be known less well."""
 
 
 def _turned_templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array) -> Templates:
@@ -130,9 +132,25 @@ def _recalculated(state: HeadState, estimate: Estimate, images: Array, rig: Came
 
 
 VARIANTS = {
-    "recommended": Variant(_turned_templates, _rigid_search, _refined, _as_estimated, 0.0, remove_motion, True),
+    "recommended": Variant(
+        templates=_turned_templates,
+        search=_rigid_search,
+        estimate=_refined,
+        measured=_as_estimated,
+        follow=0.0,
+        still=remove_motion,
+        sharpens=True,
+        may_doubt=True,
+    ),
     "published": Variant(
-        _flat_templates, _layered_search, _around_mode, _recalculated, 1.0, learning.without_weighted_motion, False
+        templates=_flat_templates,
+        search=_layered_search,
+        estimate=_around_mode,
+        measured=_recalculated,
+        follow=1.0,
+        still=learning.without_weighted_motion,
+        sharpens=False,
+        may_doubt=False,
     ),
 }
 """By `HeadConfig.variant`."""

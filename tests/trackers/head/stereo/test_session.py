@@ -13,7 +13,7 @@ from jaxfilters.models.synthetic.face_sequence import sequence
 from jaxfilters.trackers.head.common import following, mesh
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, Detection
-from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, LOST, NUM_MODES, RIGID
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, INITIALISING, LOST, NUM_MODES, RIGID
 from jaxfilters.trackers.head.stereo import session as module
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.head.stereo.tracking import PATIENCE
@@ -150,7 +150,7 @@ def test_a_lost_face_is_reported_and_found_again(drawn):
     ends = np.cumsum([len(piece) for piece in pieces])
     for begin in ends[[0, 2, 4]]:
         status = track.status[begin : begin + gone]
-        assert np.all(status[: PATIENCE - 1] == RIGID)
+        assert np.all(status[: PATIENCE - 1] == DOUBTFUL)
         assert np.all(status[PATIENCE - 1 :] == LOST)
         for rows in (track.pose, track.pose_std, track.shape, track.image_points):
             assert np.all(np.isnan(rows[begin + PATIENCE - 1 : begin + gone]))

@@ -10,7 +10,7 @@ from jaxfilters.models.synthetic.face_motion import STEREO_PLACE_MM
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
-from jaxfilters.trackers.head.common.state import LOST, NUM_MODES, RIGID, UNITS
+from jaxfilters.trackers.head.common.state import DOUBTFUL, LOST, NUM_MODES, RIGID, UNITS
 from jaxfilters.trackers.head.stereo import tracking as module
 from jaxfilters.trackers.head.stereo.registration import register
 
@@ -184,12 +184,12 @@ def test_a_face_behind_noise_is_missed_and_then_lost(videos):
     hidden.video = video.video
     hidden.images = np.random.default_rng(0).integers(0, 256, (30, 2, 480, 640), np.uint8)
     after, first = hidden.advance(state, 6, 14, MODERN)
-    np.testing.assert_array_equal(first.status, RIGID)
+    np.testing.assert_array_equal(first.status, DOUBTFUL)
     assert int(after.misses) == 8
     assert np.all(first.score < module.LEAST_SCORE)
     assert np.all(first.pose_std[-1] > first.pose_std[0])
     after, second = hidden.advance(after, 14, 22, MODERN)
-    np.testing.assert_array_equal(second.status, [RIGID] * (module.PATIENCE - 9) + [LOST] * (17 - module.PATIENCE))
+    np.testing.assert_array_equal(second.status, [DOUBTFUL] * (module.PATIENCE - 9) + [LOST] * (17 - module.PATIENCE))
     # Particles gather where the face was last seen, ever farther around, and find it when it shows again.
     kept = np.asarray(state.belief.mean)
     np.testing.assert_array_equal(after.last_good, kept)
