@@ -50,8 +50,9 @@ LEAST_SCORE, REGAINED_SCORE = 0.35, 0.5
 """Mean correlation below which a face is not found; from which on one that was not found is found again."""
 DOUBTFUL_SCORE, DOUBT = 0.45, 6.0
 """Mean correlation below which a pose is doubtful, and by how much of themselves standard deviations grow for each unit
-below it. In 18 runs on six people of the ICT face model, who are not those of the benchmark, 95 % of the errors were
-within 2.0 to 2.9 deviations of the fit at scores of 0.45, 2.1 to 3.2 at 0.15, 4.3 to 7 at 0."""
+below it. In 18 runs on six people of the ICT face model, who are not those of the benchmark, 95 % of the errors in each
+coordinate were within 1.3 to 1.8 deviations of the fit at scores of 0.4 to 0.5, 2.0 to 4.0 at 0.3 to 0.4, 3.4 to 9.1 at
+0.1 to 0.2, and 4.3 to 14 below: the factor is too small for heads that are followed in a wrong pose."""
 MOST_ASTRAY = 10.0
 """Millimetres and degrees to which particles spread about the place where a face was lost, by one more every frame."""
 SHARPENING = (15, 300)
