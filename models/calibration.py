@@ -1,7 +1,8 @@
 """Where a fixed camera stands and how it images, from points in the world whose pixels are known.
 
 World coordinates are metres with Z up, pixels (u, v) with their centres at integers. Everything here runs on the host
-in float64: it is done once for a camera.
+in float64: it is done once for a camera. SciPy is imported by the functions that use it: trackers need no
+more than `Calibration`.
 """
 
 from typing import NamedTuple
@@ -9,9 +10,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import rq
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.floor_camera import canonical
 
@@ -103,6 +101,8 @@ def decompose(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         ValueError: a matrix whose left block is singular.
     """
+    from scipy.linalg import rq
+
     P = np.asarray(P, float)
     if P.shape != (3, 4) or not np.isfinite(P).all() or np.linalg.matrix_rank(P[:, :3]) < 3:
         raise ValueError(f"P must be a finite (3, 4) matrix with an invertible left block; got {P.tolist()}.")
@@ -125,6 +125,9 @@ def refine(points_m: np.ndarray, pixels: np.ndarray, start: Calibration, *, coef
     Raises:
         ValueError: fewer equations than unknowns, wrong shapes, or points behind the camera that was found.
     """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
     if not 0 <= coefficients <= _COEFFICIENTS:
         raise ValueError(f"coefficients must be from 0 to {_COEFFICIENTS}; got {coefficients}.")
     unknowns = 10 + coefficients
@@ -172,6 +175,9 @@ def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[
         ValueError: wrong shapes, too few points, points on a line or of several heights, or a view that leaves the
             focal length open, as one straight down does.
     """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
     points_m = np.asarray(points_m, float)
     if points_m.ndim == 2 and points_m.shape[1] == 2:
         points_m = np.column_stack([points_m, np.zeros(len(points_m))])

@@ -9,7 +9,6 @@ from dataclasses import field
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
@@ -94,6 +93,8 @@ def matern_unit(order):
 
     The spectral density is proportional to (1 + w^2)^-(p+1), that of white noise through (s + 1)^-(p+1).
     """
+    import scipy.linalg  # it takes as long to import as the rest of a model of motion
+
     n = order + 1
     A = np.eye(n, k=1)
     A[-1] = [-math.comb(n, k) for k in range(n)]

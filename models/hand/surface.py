@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.mesh import hand_mesh, part_meshes
 from jaxfilters.models.hand.parts import part_transforms
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics
 from jaxfilters.models.rendering.comparison import DepthTerms, compare_capsules, compare_convex_parts
@@ -73,4 +72,7 @@ class MeshHand:
 
 def triangle_hand(geometry: HandGeometry) -> MeshHand:
     """The procedural mesh of 608 triangles of a (concrete) hand."""
+    # Imported here, since trimesh, which makes the parts, takes a quarter of a second.
+    from jaxfilters.models.hand.mesh import hand_mesh, part_meshes
+
     return MeshHand(geometry, convex_parts(part_meshes(hand_mesh(geometry))))

@@ -6,15 +6,18 @@ checked at run time.
 
 from collections.abc import Sequence
 from dataclasses import field, replace
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jaxtyping import Array, Float, Int
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.math.lie import RigidTransform, quaternion_multiply
+
+if TYPE_CHECKING:  # it takes a quarter of a second to import, and only those who load meshes need it
+    import trimesh
 
 
 @pytree_dataclass
@@ -78,7 +81,7 @@ class Mesh:
         return replace(self, vertices=T_target_source.apply(self.vertices))
 
 
-def mesh_from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
+def mesh_from_trimesh(mesh: "trimesh.Trimesh") -> Mesh:
     """A mesh in metres, its faces reordered along a space-filling curve.
 
     Raises:
@@ -106,7 +109,7 @@ def _morton_codes(points):
     return codes
 
 
-def convex_parts(meshes: Sequence[trimesh.Trimesh]) -> ConvexParts:
+def convex_parts(meshes: Sequence["trimesh.Trimesh"]) -> ConvexParts:
     """The convex hulls of meshes in metres, coplanar triangles merged into one face.
 
     Raises:

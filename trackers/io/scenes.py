@@ -4,18 +4,20 @@ import io
 import logging
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.scene import mesh_depth, patch_depth, upright_depth
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.input_files import are_finite, read_bytes
 from jaxfilters.trackers.io.json_files import read_json, refuse_unknown
+
+if TYPE_CHECKING:
+    import trimesh
 
 _KEYS = {"floor", "patches", "meshes", "outlines", "note"}
 _WANTED = (
@@ -38,7 +40,7 @@ class SceneFile(NamedTuple):
     """(corners, 2) metres."""
     patches: np.ndarray
     """(n, 3, 3): a corner and two edges each, metres."""
-    meshes: list[trimesh.Trimesh]
+    meshes: "list[trimesh.Trimesh]"
     outlines: list[dict[str, Any]]
 
 
@@ -119,7 +121,9 @@ def _array(path: Path, name: str, value: Any, shape: tuple[int | None, ...]) -> 
     return array
 
 
-def _mesh(path: Path, name: Any) -> trimesh.Trimesh:
+def _mesh(path: Path, name: Any) -> "trimesh.Trimesh":
+    import trimesh  # a tenth of a second, for scenes with meshes
+
     if not isinstance(name, str) or Path(name).suffix.lower() not in _MESHES:
         raise InputError(f"{path}: meshes must be names of files ({', '.join(sorted(_MESHES))}); got {shown(name)}.")
     file = path.parent / name

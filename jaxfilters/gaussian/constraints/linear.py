@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.optimize import linprog
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
@@ -193,6 +192,8 @@ def _some_point_satisfies(normals, lower, upper):
     present = np.isfinite(bounds)
     if not present.any():
         return True
+    from scipy.optimize import linprog  # a fifth of a second, and trackers have no inequalities to check
+
     result = linprog(np.zeros(normals.shape[1]), sides[present], bounds[present], bounds=(None, None))
     return result.status == 0
 
