@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, UInt8
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.noise import standard_normal
 from jaxfilters.models.face.pose import place, rotation, turn
 from jaxfilters.models.face.rig import NEAREST, CameraRig
 from jaxfilters.models.synthetic.face_texture import AXES, NORMALS, FaceScene, patch
@@ -70,7 +71,7 @@ def render_face(
         )
     cameras = range(rig.num_cameras)
     clean = jnp.stack([_camera_image(c, scene, rig, pose, shape, occluder) for c in cameras])
-    noise = NOISE_STD * jax.random.normal(key, clean.shape, clean.dtype)
+    noise = NOISE_STD * standard_normal(key, clean.shape, clean.dtype)
     return jnp.clip(jnp.round(gain * clean + offset + noise), 0, 255).astype(jnp.uint8)
 
 

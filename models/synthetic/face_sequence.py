@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
@@ -69,11 +69,8 @@ class FaceSequence:
         return pieces(self.frames, len(self), size)
 
     def _image(self, index):
-        shape, pose = from_host(self.shapes[index]), from_host(self.poses[index])
-        key = jax.random.fold_in(self.key, index)
-        # Opacity 0 rather than no occluder: one compiled program for all frames.
-        occluder = _before_mouth(shape, pose, from_host(self.covered[index]))
-        return render_face(key, self.scene, self.rig, pose, shape, gain=from_host(self.gain[index]), occluder=occluder)
+        looks = self.shapes[index], self.poses[index], self.covered[index], self.gain[index]
+        return _frame(self.key, index, self.scene, self.rig, *looks)
 
 
 def rendered(
@@ -180,6 +177,21 @@ def _truth(identity, rig, poses, expressions):
 
 
 @jax.jit
+def _frame(
+    key: AnyKey,
+    index: Int[ArrayLike, ""],
+    scene: FaceScene,
+    rig: CameraRig,
+    shape: Float[Array, "10 3"],
+    pose: Float[Array, " 6"],
+    covered: Bool[Array, ""],
+    gain: Float[Array, ""],
+) -> UInt8[Array, "C rows cols"]:
+    # Opacity 0 rather than no occluder: one compiled program for all frames.
+    occluder = _before_mouth(shape, pose, covered.astype(shape.dtype))
+    return render_face(jax.random.fold_in(key, index), scene, rig, pose, shape, gain=gain, occluder=occluder)
+
+
 def _before_mouth(shape, pose, opacity):
     """An occluder between the cameras and the mouth and nostrils, wherever the head is."""
     points = place(shape, pose)[jnp.asarray((*MOUTH, *NOSTRILS))]

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
+from jaxfilters._xla.noise import standard_normal
 from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
@@ -45,7 +47,7 @@ class RoomCamera:
 def floor_camera(pinhole: Pinhole, T_camera_world: RigidTransform) -> FloorCamera:
     """The projection matrix of a pinhole camera."""
     K = np.asarray(pinhole.matrix(), float)
-    rotation = np.asarray(jax.jit(quaternion_to_matrix)(T_camera_world.rotation))
+    rotation = np.asarray(compiled_quickly(quaternion_to_matrix)(T_camera_world.rotation))
     return FloorCamera.from_matrix(K @ np.column_stack([rotation, T_camera_world.translation]), pinhole.shape)
 
 
@@ -56,7 +58,7 @@ def looking(position: tuple[float, float, float], heading_deg: float, pitch_deg:
     right = np.array([math.sin(a), -math.cos(a), 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
     return RigidTransform(
-        jax.jit(quaternion_from_matrix)(from_host(rotation, jnp.float32)),
+        compiled_quickly(quaternion_from_matrix)(from_host(rotation, jnp.float32)),
         from_host(-rotation @ np.asarray(position), jnp.float32),
     )
 
@@ -67,7 +69,7 @@ def room_camera(key: AnyKey, pinhole: Pinhole, T_camera_world: RigidTransform, f
     return RoomCamera(pinhole, T_camera_world, jnp.asarray(furniture), empty, pinhole.shape)
 
 
-@jax.jit
+@compiled_quickly
 def _empty_room(key: AnyKey, camera: FloorCamera, furniture: Array) -> Float[Array, "rows cols 3"]:
     v, u = jnp.meshgrid(*[jnp.arange(n, dtype=float) for n in camera.shape], indexing="ij")
     xy, depth = camera.floor_points(jnp.stack([u, v], axis=-1))
@@ -105,7 +107,7 @@ def room_image(
     cloth = jnp.where((share > LEGS)[..., None], clothes[visible_person, 0], clothes[visible_person, 1])
     color = jnp.where((share > NECK)[..., None], jnp.array(SKIN), cloth)
     lit = camera.empty * _light(camera, rays, origin, people, here)[..., None]
-    image = jnp.where(observed[..., None], color, lit) + NOISE_STD * jax.random.normal(key, (*camera.shape, 3))
+    image = jnp.where(observed[..., None], color, lit) + NOISE_STD * standard_normal(key, (*camera.shape, 3))
     return jnp.clip(jnp.round(image), 0, 255).astype(jnp.uint8), jnp.where(observed, visible_person, -1)
 
 

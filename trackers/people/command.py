@@ -166,14 +166,18 @@ class _DemoSource:
         rows, cols = room.cameras[camera].shape
         self.image_size = (cols, rows)
         self._room, self._camera = room, camera
+        self._sampled: dict[int, np.ndarray] = {}
+        """Images that the recording will show once more."""
 
     def sample(self, most: int) -> list[np.ndarray]:
         every = max(1, len(self._room) // most)
-        return [self._room.image(self._camera, i) for i in range(0, len(self._room), every)][:most]
+        self._sampled = {i: self._room.image(self._camera, i) for i in range(0, len(self._room), every)[:most]}
+        return list(self._sampled.values())
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         for i in range(len(self._room)):
-            yield i / self.fps, self._room.image(self._camera, i)
+            sampled = self._sampled.pop(i, None)
+            yield i / self.fps, self._room.image(self._camera, i) if sampled is None else sampled
 
     def trouble(self) -> str | None:
         return None

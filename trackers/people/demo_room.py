@@ -5,15 +5,17 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
-from jaxtyping import Array, UInt8
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
-from jaxfilters.models.person.scene import mesh_depth
+from jaxfilters.models.person.scene import patch_depth
 from jaxfilters.models.synthetic.room import RoomCamera, floor_camera, looking, room_camera, room_image
 from jaxfilters.models.synthetic.walkers import Routes, Walker, along_routes
+from jaxfilters.typing import AnyKey
 
 FLOOR_M = np.array([(-3.6, -1.2), (3.6, -1.2), (3.6, 6.0), (-3.6, 6.0)])
 """Where people walk; the doors are in the left and the right wall."""
@@ -59,25 +61,34 @@ class DemoRoom:
     routes: Routes
     fps: float
     rooms: tuple[RoomCamera, ...]
-    seed: int
+    key: AnyKey
+    """Of the noise."""
 
     def __len__(self) -> int:
         return len(self.routes.xy)
 
     def image(self, camera: int, index: int) -> UInt8[np.ndarray, "rows cols 3"]:
         """Blue, green, red of a frame of a camera."""
-        people = Walker(
-            *(from_host(leaf[index], jnp.float32) for leaf in self.routes),
-            *(from_host(size, jnp.float32) for size in np.transpose(SIZES_M)[:, : self.routes.xy.shape[1]]),
-        )
-        key = jax.random.fold_in(jax.random.key(self.seed), index * len(PLACES) + camera)
-        clothes = from_host(CLOTHES[: self.routes.xy.shape[1]], jnp.float32)
-        return np.asarray(room_image(key, self.rooms[camera], people, clothes, self.present(index))[0])
+        leaves = [leaf[index] for leaf in self.routes]
+        number = index * len(PLACES) + camera
+        return np.asarray(_image(self.key, number, self.rooms[camera], leaves, self.present(index)))
 
     def present(self, index: int) -> np.ndarray:
         """(people,) who is on the floor."""
         low, high = FLOOR_M.min(axis=0) - 0.6, FLOOR_M.max(axis=0) + 0.6
         return np.all((self.routes.xy[index] > low) & (self.routes.xy[index] < high), axis=-1)
+
+
+@jax.jit
+def _image(
+    key: AnyKey, number: Int[ArrayLike, ""], camera: RoomCamera, leaves: list[Array], present: Bool[Array, " people"]
+) -> UInt8[Array, "rows cols 3"]:
+    """The image with the `number`th noise, of people on their routes."""
+    count = len(present)
+    sizes = [from_host(size[:count], jnp.float32) for size in np.transpose(SIZES_M)]
+    people = Walker(*(leaf.astype(jnp.float32) for leaf in leaves), *sizes)
+    clothes = from_host(CLOTHES[:count], jnp.float32)
+    return room_image(jax.random.fold_in(key, number), camera, people, clothes, present)[0]
 
 
 def demo_room(seed: int, *, cameras: int = 1, frames: int = 240, fps: float = 10.0) -> DemoRoom:
@@ -91,22 +102,24 @@ def demo_room(seed: int, *, cameras: int = 1, frames: int = 240, fps: float = 10
     rng = np.random.default_rng(seed)
     speeds = [speed * rng.uniform(0.92, 1.08) for speed in SPEEDS_M_PER_S]
     routes = along_routes([np.array(path) for path in WAYPOINTS], speeds, list(STARTS_S), frames, fps)
-    vertices, faces = _furniture()
     pinhole = Pinhole.from_intrinsics(FOCAL_PX, ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), SHAPE)
     transforms = [looking(*place) for place in PLACES[:cameras]]
     views = tuple(floor_camera(pinhole, transform) for transform in transforms)
-    furniture = tuple(mesh_depth(view, vertices, faces) for view in views)
+    furniture = tuple(compiled_quickly(patch_depth)(view, _furniture()) for view in views)
     keys = jax.random.split(jax.random.key(seed), cameras)
     rooms = tuple(
         room_camera(key, pinhole, transform, depth)
         for key, transform, depth in zip(keys, transforms, furniture, strict=True)
     )
-    return DemoRoom(views, FLOOR_M, furniture, routes, fps, rooms, seed)
+    return DemoRoom(views, FLOOR_M, furniture, routes, fps, rooms, jax.random.key(seed))
 
 
-def _furniture() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) in metres and triangles (m, 3) of all boxes."""
-    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in BOXES]
-    first = np.cumsum([0, *[len(box.vertices) for box in boxes[:-1]]])
-    vertices = np.concatenate([np.asarray(box.vertices) for box in boxes])
-    return vertices, np.concatenate([np.asarray(box.faces) + i for box, i in zip(boxes, first, strict=True)])
+def _furniture() -> Float[np.ndarray, "faces 3 3"]:
+    """The faces of all boxes as `patch_depth` takes them: a corner and two edges each, metres."""
+    faces = []
+    for size, middle in BOXES:
+        corner, edges = np.subtract(middle, np.divide(size, 2)), np.diag(size)
+        for axis in range(3):
+            sides = edges[axis - 2], edges[axis - 1]
+            faces += [(corner, *sides), (corner + edges[axis], *sides)]
+    return np.array(faces, np.float32)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfilters._full_precision import dot, einsum
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
@@ -141,7 +142,7 @@ class _Look(NamedTuple):
     area: Float[Array, " cells"]
 
 
-@partial(jax.jit, static_argnums=2)
+@partial(compiled_quickly, static_argnums=2)
 def _look(camera, furniture, config, xy):
     offsets = _offsets()
     rows, cols = camera.shape

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
@@ -174,7 +175,7 @@ def _smoothed(config: PeopleConfig, piece: list[Sighting]) -> list[Sighting]:
     return [sighting._replace(mean=mean[i], covariance=covariance[i]) for i, sighting in enumerate(piece)]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compiled_quickly, static_argnums=0)
 def _backward(config: PeopleConfig, beliefs: Gaussian, steps: jax.Array, length: jax.Array) -> Gaussian:
     def back(following: Gaussian, inputs):
         belief, dt, is_last = inputs

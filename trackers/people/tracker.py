@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot, einsum
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
@@ -134,7 +135,7 @@ def step(
     return people, _report(scene, people, fit, nis)
 
 
-@jax.jit
+@compiled_quickly
 def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
     """The outlines of everybody in each camera, one row a slot."""
     bodies = jax.vmap(body_of)(_observed_places(scene, people))

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
-from jaxfilters.models.person.scene import walkable
+from jaxfilters.models.person.scene import mesh_depth, walkable
 from jaxfilters.trackers.people.demo_room import BOXES, FLOOR_M, PLACES, SHAPE, demo_room
 
 pytestmark = pytest.mark.system
@@ -62,3 +63,11 @@ def test_furniture_stands_in_front_of_some_floor_in_every_view(room):
 def test_a_wrong_number_of_cameras_is_named(cameras):
     with pytest.raises(ValueError, match=f"cameras must be 1 to 4; got {cameras}"):
         demo_room(0, cameras=cameras)
+
+
+def test_furniture_has_the_depth_of_boxes_as_meshes(room):
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in BOXES]
+    both = trimesh.util.concatenate(boxes)
+    for camera, found in zip(room.cameras, room.furniture, strict=True):
+        # Both are rounded to float32 at distances of some metres, by different products.
+        np.testing.assert_allclose(found, mesh_depth(camera, both.vertices, both.faces), rtol=0, atol=1e-4)
