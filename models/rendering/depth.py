@@ -39,15 +39,24 @@ def render_capsules(
 
 def capsule_depth(camera: Pinhole, capsules: Capsules) -> Float[Array, "rows cols"]:
     """The values of `render_capsules` without its derivative, which is zero here: a third of the program to compile."""
-    parts = jax.lax.stop_gradient(capsule_parts(camera, capsules))
-    sides = () if camera.shape[0] * camera.shape[1] <= SMALL else COARSE
+    return _depth(capsule_parts(camera, capsules), CAPSULE, camera.shape)
+
+
+def ellipsoid_depth(camera: Pinhole, ellipsoids: Ellipsoids) -> Float[Array, "rows cols"]:
+    """The values of `render_ellipsoids` without its derivative, as `capsule_depth`."""
+    return _depth(ellipsoid_parts(camera, ellipsoids), ELLIPSOID, camera.shape)
+
+
+def _depth(parts: Parts, surface: Surface, shape: tuple[int, int]) -> Array:
+    parts = jax.lax.stop_gradient(parts)
+    sides = () if shape[0] * shape[1] <= SMALL else COARSE
 
     def in_windows(parts: Parts) -> Array:
-        return nearest_inverse(parts, plan_windows(parts.box, camera.shape, sides), CAPSULE, camera.shape)
+        return nearest_inverse(parts, plan_windows(parts.box, shape, sides), surface, shape)
 
     if poses_in_turn():
         return depth_of(sequential_vmap(in_windows)(parts))
-    return depth_of(nearest_inverse(parts, None, CAPSULE, camera.shape))
+    return depth_of(nearest_inverse(parts, None, surface, shape))
 
 
 @jax.jit

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt16
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters._xla.noise import standard_normal
 from jaxfilters.typing import AnyKey
 
 
@@ -31,7 +30,7 @@ class DepthSensor:
         flying = silhouette_edge(rendered) & jax.random.bernoulli(flying_key, self.flying_fraction, shape)
         mixture = jax.random.uniform(depth_key, shape, dtype)
         depth = jnp.where(flying, depth + mixture * (self.background - depth), depth)
-        depth = depth + self.noise_std * standard_normal(noise_key, shape, dtype)
+        depth = depth + self.noise_std * jax.random.normal(noise_key, shape, dtype)
         dropped = jax.random.bernoulli(dropout_key, self.dropout_fraction, shape)
         return jnp.where(dropped, 0, jnp.clip(jnp.round(1000 * depth), 0, 65535)).astype(jnp.uint16)
 

@@ -15,7 +15,7 @@ from jaxfilters._xla.noise import standard_normal
 from jaxfilters.math.lie import RigidTransform, quaternion_from_matrix, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
-from jaxfilters.models.rendering.depth import render_ellipsoids
+from jaxfilters.models.rendering.depth import ellipsoid_depth
 from jaxfilters.models.synthetic.walkers import Walker, body
 from jaxfilters.typing import AnyKey
 
@@ -97,7 +97,7 @@ def room_image(
         clothes: Colours of shirts and trousers, blue, green, red, 0 to 255.
         here: Who is in the room at all.
     """
-    depths = jax.lax.map(lambda one: render_ellipsoids(camera.pinhole, body(one), camera.T_camera_world), people)
+    depths = jax.lax.map(lambda one: ellipsoid_depth(camera.pinhole, body(one).moved(camera.T_camera_world)), people)
     depths = jnp.where(here[:, None, None], depths, jnp.inf)
     visible_person, nearest = jnp.argmin(depths, axis=0), jnp.min(depths, axis=0)
     observed = nearest < camera.furniture

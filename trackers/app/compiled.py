@@ -9,9 +9,9 @@ import platformdirs
 
 from jaxfilters.trackers.app.devices import processor
 
-SECONDS_TO_COMPILE = 0.1
-"""Programs that compile faster are not kept. Of a tracker's hundreds, a dozen take longer, and they are nearly all of
-the time: with them `demo` takes 19 s in place of 55, with all of them as long."""
+SECONDS_TO_COMPILE = 0.02
+"""Programs that compile faster are not kept: reading them takes as long. Of the three dozen of `track people`, which
+starts for the second time, those of a tenth of a second and more leave 1.3 s to read and to compile, these 0.9 s."""
 
 _LEAST_SECONDS = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 """JAX's name for this setting, which a user may have chosen."""

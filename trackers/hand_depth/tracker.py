@@ -186,6 +186,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     expected, _ = pose_moments(*particles_of(predicted))
     image = look(setup, state, filled(frame, state.missing_is_background), expected)
 
+    @jax.jit  # traced once for its shapes and its program
     def update(ensemble: Any) -> tuple[Any, ParticleInfo]:
         return filter.update(filter.params, update_key, ensemble, image, elapsed)
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, Num, UInt8
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.people.config import PeopleConfig as PeopleConfig
@@ -48,7 +49,12 @@ class PeopleScene:
 
     def centers(self) -> Float[Array, "cameras 2"]:
         """Where the cameras are above the floor, metres."""
-        return jnp.stack([camera.position()[:2] for camera in self.cameras])
+        return _centers(self.cameras)
+
+
+@compiled_quickly
+def _centers(cameras: tuple[FloorCamera, ...]) -> Float[Array, "cameras 2"]:
+    return jnp.stack([camera.position()[:2] for camera in cameras])
 
 
 class Cells(NamedTuple):

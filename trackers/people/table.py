@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.trackers.app.results import Columns, TrackTable
 from jaxfilters.trackers.people.recorded import Sighting, as_arrays, from_arrays, spreads
 from jaxfilters.trackers.people.state import HEIGHT, PeopleScene
@@ -42,7 +41,7 @@ class TimedPeopleTrack(NamedTuple):
 
 def people_table(scene: PeopleScene) -> TrackTable:
     """How tracks of people become rows; the cameras of the scene say what is along a line of sight."""
-    centers = np.asarray(compiled_quickly(PeopleScene.centers)(scene))
+    centers = np.asarray(scene.centers())
     columns = (
         Columns(("id",), attrgetter("identity")),
         Columns(("x_m", "y_m", "vx_m_per_s", "vy_m_per_s"), lambda track: track.mean[:, :4]),
