@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-MOST_PROGRAMS = {"articulated": 36, "people": 39, "fingertips": 14}
+MOST_PROGRAMS = {"articulated": 36, "people": 28, "fingertips": 14}
 """Two more than there are now. Every program is traced, lowered and loaded at every start, 20 ms for the smallest. The
-other three systems (hand-depth 39, head-stereo 36, head-mono 43 programs) compile for 20 to 35 s each: too long."""
+other three systems (hand-depth 40, head-stereo 35, head-mono 42 programs) compile for 20 to 35 s each: too long."""
 COUNTED = """
 import sys, jax.monitoring
 from jaxfilters.trackers.app.cli import main
