@@ -82,6 +82,8 @@ class Estimate(NamedTuple):
     is_found: Bool[Array, ""]
     num_anchored: Float[Array, ""]
     """Landmarks that look as registered, and are where the model has them."""
+    is_placed: Bool[Array, "C K"]
+    """Those of them that were found by their own patches, clearly, and not by what the last frame showed."""
     recent: Recent
     slopes: Slopes
     model_variance: Float[Array, " K"]
@@ -100,7 +102,17 @@ def around_mode(search: AdaptiveDiffusionState, state: HeadState, model: FaceMod
     all_of_them = jnp.full((), float(len(M)), x.dtype)
     doubt = jnp.zeros((POSE, POSE), x.dtype)
     return Estimate(
-        belief, doubt, M, M, found, all_of_them, state.recent, state.slopes, state.model_variance, state.residual_scale
+        belief,
+        doubt,
+        M,
+        M,
+        found,
+        all_of_them,
+        jnp.ones_like(state.recent.has_changed),
+        state.recent,
+        state.slopes,
+        state.model_variance,
+        state.residual_scale,
     )
 
 
@@ -165,6 +177,7 @@ def refined(
         measured,
         is_found,
         jnp.sum(jnp.any(~observed.has_changed, axis=0)).astype(x.dtype),
+        ~observed.has_changed & ~is_followed & (found.score > recent.CHANGED_SCORE),
         observed,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
         jnp.clip(MEMORY * state.model_variance + (1 - MEMORY) * average(fits.excess), *MODEL_VARIANCE),

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfilters.models.face.landmarks import EYES
-from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, StableDetector, complete
+from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, StableDetector, complete, detect
 from jaxfilters.trackers.head.common.mesh import MeshDetector
 
 MOST_MOVED_PX = 2.0
@@ -23,6 +23,11 @@ class Finder(Protocol):
 
     def find(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "10 2"] | None:
         """The landmarks in pixels (u, v), or `None`."""
+
+    def glance(
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "10 2"] | None:
+        """The landmarks in one image of a face that may move, of several faces those nearest to a pixel, or `None`."""
 
     def reset(self) -> None:
         """Forget the images so far."""
@@ -47,6 +52,13 @@ class CascadeFinder:
         if points is None:
             self.complaints.append("nostrils or brows are not visible")
         return points
+
+    def glance(
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "10 2"] | None:
+        """The landmarks in one image of a face that may move, of several faces those nearest to a pixel, or `None`."""
+        found = detect(image, near=near)
+        return None if found is None else complete(image, found.points)
 
     def reset(self) -> None:
         """Forget the images so far."""
@@ -80,6 +92,13 @@ class MeshFinder:
         if abs(np.arctan2(across[1], across[0])) >= MOST_TILT:
             self.complaints, self._agreeing = ["the head is tilted"], 0
         return found if self._agreeing >= STABLE_FRAMES else None
+
+    def glance(
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "10 2"] | None:
+        """The landmarks of the most evident face in one image, which may move, or `None`."""
+        del near
+        return self._mesh.detect(image)
 
     def reset(self) -> None:
         """Forget the images so far."""

@@ -13,6 +13,7 @@ from jaxfilters import weights
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.filter import Filter
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math import diffusion
 from jaxfilters.math.diffusion import DiffusionFit
 from jaxfilters.models.face.correlation import score_points
@@ -34,6 +35,8 @@ LEAST_DEVIATION = 0.3
 LOW = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.1]) * UNITS
 HIGH = np.array([40.0, 40.0, 40.0, 15.0, 15.0, 15.0]) * UNITS
 """Limits of the diffusion a frame."""
+LEAST_STEPS = 0.1
+"""Frame times between two images from which on they tell a velocity."""
 MODE_SCALE = 5.0
 """Millimetres and degrees that count as one in the distance to the heaviest particle."""
 
@@ -120,6 +123,26 @@ def gathered(search: AdaptiveDiffusionState, x: Float[Array, " d"]) -> AdaptiveD
     """All particles at one place."""
     particles = jnp.broadcast_to(x[:, None], search.particles.shape)
     return search._replace(particles=particles, log_weights=weights.uniform(particles.shape[1], particles.dtype))
+
+
+def scattered(
+    key: AnyKey, search: AdaptiveDiffusionState, x: Float[Array, " d"], deviation: Float[Array, " 6"]
+) -> tuple[AdaptiveDiffusionState, Gaussian]:
+    """Particles and belief about a state at rest whose pose has these standard deviations.
+
+    Args:
+        key: Random key.
+        search: Before.
+        x: Pose and mode coefficients.
+        deviation: Of the pose, millimetres and radians.
+    """
+    width = jnp.zeros_like(x).at[:POSE].set(deviation)
+    search = gathered(search, x)
+    noise = jax.random.normal(key, search.particles.shape, search.particles.dtype)
+    search = search._replace(
+        particles=search.particles + width[:, None] * noise, estimate=x, velocity=jnp.zeros_like(search.velocity)
+    )
+    return search, Gaussian(x, jnp.diag(width**2) + 1e-4 * jnp.eye(len(width), dtype=width.dtype))
 
 
 def start(x: Float[Array, " d"], options: HeadConfig, fit: DiffusionFit | None = None) -> AdaptiveDiffusionState:

@@ -75,6 +75,20 @@ class Recent(NamedTuple):
     """Millimetres and radians."""
 
 
+class KeyFrames(NamedTuple):
+    """Patches of a face that was turned; V frames, those from `num_kept` on not taken yet."""
+
+    patches: Patches
+    """Every field with V first."""
+    is_valid: Bool[Array, "V C K"]
+    """Which of them show a landmark."""
+    outward: Float[Array, "V 3"]
+    """Where the face looked, in the world."""
+    covariance: Float[Array, "V 6 6"]
+    """Of its pose, which is wrong in the same way wherever the patches are found again; millimetres and radians."""
+    num_kept: Int[Array, ""]
+
+
 class HeadState(NamedTuple):
     """Everything the next frame needs."""
 
@@ -86,6 +100,7 @@ class HeadState(NamedTuple):
     """As estimated so far."""
     registered: Registered
     recent: Recent
+    key_frames: KeyFrames
     slopes: Slopes
     model_variance: Float[Array, " K"]
     """Variance of each landmark about the model on every axis, mm^2."""
@@ -97,7 +112,7 @@ class HeadState(NamedTuple):
     misses: Int[Array, ""]
     """Frames in a row in which the face was not found."""
     num_outliers: Int[Array, ""]
-    """Frames in which hardly any landmark looked as registered, two less for each in which some did."""
+    """Frames in which hardly any landmark looked as registered, or nothing like a face; two less for each other."""
     age: Int[Array, ""]
     """Frames since registration."""
     time: Float[Array, ""]

@@ -19,7 +19,7 @@ from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common.near_mode import spread
 from jaxfilters.trackers.head.common.recent import latest_templates
-from jaxfilters.trackers.head.common.search import KAPPA, Searches, at, gathered, score_at
+from jaxfilters.trackers.head.common.search import KAPPA, LEAST_STEPS, Searches, at, gathered, score_at
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import adjustment
 from jaxfilters.trackers.head.mono.claims import pose_variance
@@ -40,8 +40,6 @@ ESTIMATES = {"aligned": aligned, "recalculated": recalculated, "projected": proj
 
 PUBLISHED_KAPPA = 0.2
 """Diffusion of the expression in its standard deviations (Sugano 2007, section 4.4.2)."""
-LEAST_STEPS = 0.1
-"""Frame times between two images from which on they tell a velocity."""
 
 
 class System(NamedTuple):

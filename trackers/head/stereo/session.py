@@ -18,9 +18,12 @@ from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
 from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
-from jaxfilters.trackers.head.common.state import INITIALISING, NUM_MODES, POSE, HeadState, HeadTrack
+from jaxfilters.trackers.head.common.state import DOUBTFUL, INITIALISING, LOST, NUM_MODES, POSE, HeadState, HeadTrack
+from jaxfilters.trackers.head.stereo import redetection
+from jaxfilters.trackers.head.stereo.known_face import pose_of_known_face
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
 from jaxfilters.trackers.head.stereo.tracking import advance, begin
+from jaxfilters.trackers.head.stereo.variants import VARIANTS
 from jaxfilters.trackers.tracker import checked_times
 
 SAME_FACE_MM = 4.0
@@ -136,7 +139,8 @@ class _HeadTracker:
 
     def __init__(self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
-        self.compare_every_s = math.inf
+        may_compare = VARIANTS[options.variant].may_doubt and rig.num_cameras > 1
+        self.compare_every_s = redetection.EVERY_S if may_compare else math.inf
         self._options, self._points = options, points
         self._compiled, self._diffusion = compiled(options), first_diffusion(options)
         self._searches = searches(rig, options)
@@ -156,25 +160,34 @@ class _HeadTracker:
         if points is None:
             return None, wrong
         try:
-            if self.rig.num_cameras == 1:
-                registration = register_monocular(images[0], points, self.rig, num_modes=NUM_MODES)
-            else:
-                registration = register(images, points, self.rig, num_modes=NUM_MODES)
+            return _Found(self._registered(images, points), images, time), wrong
         except RegistrationError as error:
             return None, [*wrong, str(error)]
-        return _Found(registration, images, time), wrong
+
+    def _registered(self, images: np.ndarray, points: np.ndarray) -> Registration:
+        if self.rig.num_cameras == 1:
+            return register_monocular(images[0], points, self.rig, num_modes=NUM_MODES)
+        return register(images, points, self.rig, num_modes=NUM_MODES)
 
     def forget(self) -> None:
         self._finder.reset()
 
     def begin(self, found: _Found, old: HeadState | None, frame: int) -> Beginning:
-        key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
         face = found.registration
+        if old is not None and math.isfinite(self.compare_every_s):
+            placed = redetection.located(old, face, found.images, self.rig)
+            state, row = self._gone_on(placed, found.images) if placed is not None else (old, None)
+            if row is not None and redetection.is_found(row):
+                state = state._replace(time=jnp.zeros_like(old.time))
+                return Beginning(state, found.time, "registered, a face that is known")
+        key = jax.random.fold_in(jax.random.key(self._options.seed), frame)
         pose = jnp.asarray(face.pose, float)
         start = jnp.zeros((), pose.dtype)
         state = begin(
             key, face.model, pose, found.images, start, self.rig, options=self._compiled, diffusion=self._diffusion
         )
+        if self.is_live and math.isfinite(self.compare_every_s):
+            redetection.prepare(state, found.images, self.rig)
         kept = False
         if old is not None:
             state, kept = _with_known_face(state, old)
@@ -194,8 +207,38 @@ class _HeadTracker:
         return advance(self.rig, self._searches, state, images, clock, is_frame, self._compiled)
 
     def compared(self, state: HeadState, row: HeadTrack, images: np.ndarray) -> Compared:
-        del row, images
+        if row.status not in (DOUBTFUL, LOST):
+            return Compared(state, None)
+        detected = self._at_detected(state, images)
+        if detected is not None:
+            other = self._gone_on(detected, images)
+            if redetection.is_better(other[1], row):
+                return Compared(*other)
+        pose = pose_of_known_face(state, images, self.rig)
+        if pose is not None:
+            other = self._gone_on(redetection.placed(state, pose, images, self.rig, redetection.KNOWN_STD), images)
+            if redetection.is_found(other[1]) and redetection.is_better(other[1], row):
+                return Compared(*other)
         return Compared(state, None)
+
+    def _at_detected(self, state: HeadState, images: np.ndarray) -> HeadState | None:
+        """The state at a detected face, if there is one that has the shape."""
+        near = self.rig.center[0] + self.rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2]
+        points = self._finder.glance(images[0], np.asarray(near, float))
+        if points is None:
+            return None
+        try:
+            found = self._registered(images, points)
+        except RegistrationError:
+            return None
+        return redetection.located(state, found, images, self.rig)
+
+    def _gone_on(self, state: HeadState, images: np.ndarray) -> tuple[HeadState, HeadTrack]:
+        """State and row of the tracker that goes on from a state in the same images."""
+        frames = np.repeat(images[None], self.chunk, axis=0)
+        clock = np.full(self.chunk, float(state.time), np.asarray(state.time).dtype)
+        state, track = self.advance(state, frames, clock, np.arange(self.chunk) < 1)
+        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[0], track)
 
     def empty(self, count: int) -> HeadTrack:
         nothing = lambda *shape: np.full((count, *shape), np.nan, np.float32)

@@ -23,7 +23,7 @@ from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import Estimate, around_mode
 from jaxfilters.trackers.head.common.recent import nothing_changed
-from jaxfilters.trackers.head.common.search import Searches, at, gathered, score_at
+from jaxfilters.trackers.head.common.search import Searches, at, scattered, score_at
 from jaxfilters.trackers.head.common.search import start as start_search
 from jaxfilters.trackers.head.common.state import (
     DEFORMABLE,
@@ -37,22 +37,25 @@ from jaxfilters.trackers.head.common.state import (
     UNITS,
     HeadState,
     HeadTrack,
+    KeyFrames,
     Registered,
 )
+from jaxfilters.trackers.head.stereo.key_frames import nearest_patches, no_key_frames, with_key_frame
 from jaxfilters.trackers.head.stereo.sharpening import first_slopes, sharpened
 from jaxfilters.trackers.head.stereo.variants import VARIANTS, Variant
 from jaxfilters.typing import AnyKey
 
-FEWEST_ANCHORED, MOST_STRANGE = 2, 35
-"""Landmarks that must look as registered, and be where the model has them; for how many frames they need not: eyes may
-close while a mouth opens wide, but not for long."""
+FEWEST_ANCHORED, FEWEST_PLACED, MOST_STRANGE = 2, 3, 60
+"""Landmarks that must look as registered, and be where the model has them; in a doubtful pose, landmarks that must be
+found by their own patches; for how many frames either need not be: eyes may close while a mouth opens wide, but not for
+long."""
 LEAST_SCORE, REGAINED_SCORE = 0.35, 0.5
 """Mean correlation below which a face is not found; from which on one that was not found is found again."""
-DOUBTFUL_SCORE, DOUBT = 0.45, 6.0
-"""Mean correlation below which a pose is doubtful, and by how much of themselves standard deviations grow for each unit
-below it. In 18 runs on six people of the ICT face model, who are not those of the benchmark, 95 % of the errors in each
-coordinate were within 1.3 to 1.8 deviations of the fit at scores of 0.4 to 0.5, 2.0 to 4.0 at 0.3 to 0.4, 3.4 to 9.1 at
-0.1 to 0.2, and 4.3 to 14 below: the factor is too small for heads that are followed in a wrong pose."""
+DOUBTFUL_SCORE, NOTHING_SCORE, DOUBT = 0.45, 0.2, 6.0
+"""Mean correlation below which a pose is doubtful, and below which what is followed is no face; by how much of
+themselves standard deviations grow for each unit below the first. In 33 runs on eleven people of the ICT face model,
+who are not those of the benchmark, 95 % of the errors in each coordinate were within 2.0 to 2.7 deviations of the fit
+at scores of 0.4 to 0.5, 2.3 to 3.3 at 0.3 to 0.4, 2.5 to 2.9 at 0.2 to 0.3, and 2.9 to 9.5 below."""
 MOST_ASTRAY = 10.0
 """Millimetres and degrees to which particles spread about the place where a face was lost, by one more every frame."""
 SHARPENING = (15, 300)
@@ -101,6 +104,7 @@ def begin(
         model=face,
         registered=registered,
         recent=nothing_changed(images, registered.shape, registered.pose, rig),
+        key_frames=no_key_frames(registered.patches),
         slopes=slopes,
         model_variance=jnp.full(len(face.mean), FIRST_MODEL_VARIANCE, x.dtype),
         residual_scale=jnp.ones((), x.dtype),
@@ -148,6 +152,11 @@ def _step(
     deforms = options.learn & (rig.num_cameras > 1) & (state.age >= options.rigid_frames)
     model = _usable(state, deforms)
     moved = state.search.velocity * steps
+    registered, lasting = state.registered, jnp.zeros((POSE, POSE), moved.dtype)
+    if variant.keeps_key_frames:
+        expected = state.belief.mean[:POSE] + moved
+        nearest, lasting = nearest_patches(state.key_frames, registered.patches, registered.pose, expected)
+        state = state._replace(registered=registered._replace(patches=nearest))
     templates, looks = variant.templates(state, model, rig, moved)
 
     def run(filter: Filter, deviation: Array) -> tuple[AdaptiveDiffusionState, ParticleInfo]:
@@ -157,27 +166,34 @@ def _step(
         return filter.update(filter.params, update_key, search, images, steps)
 
     search, info = variant.search(run, searches, model)
+    ahead = state.belief.mean.at[:POSE].add(moved)
+    search = variant.begun(search, ahead, lambda x: score_at(model, looks, rig, x, images))
     estimate, search = variant.estimate(search, state, model, images, rig, moved, steps, options)
+    estimate = estimate._replace(doubt=estimate.doubt + lasting)
     belief = _held(estimate, search, model, state)
     likenesses = jax.vmap(lambda views: score_at(model, views, rig, belief.mean, images))(jnp.stack([templates, looks]))
     score, likeness = likenesses[0], jnp.max(likenesses)
-    is_strange = estimate.num_anchored < FEWEST_ANCHORED
+    doubt = jnp.maximum(DOUBTFUL_SCORE - score, 0.0) if variant.may_doubt else jnp.zeros_like(score)
+    is_strange = (estimate.num_anchored < FEWEST_ANCHORED) | (doubt > DOUBTFUL_SCORE - NOTHING_SCORE)
+    is_strange |= (doubt > 0) & (jnp.sum(jnp.any(estimate.is_placed, axis=0)) < FEWEST_PLACED)
     num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
+    state = state._replace(registered=registered)
+    if variant.keeps_key_frames:
+        state = state._replace(key_frames=_key_frames(state, belief, lasting, estimate, score, missed, rig))
     state = _learned(variant, state, model, search, belief, estimate, score, missed, images, rig, options)
     due = (state.age % SHARPENING[0] == SHARPENING[0] - 1) & (state.age < SHARPENING[1]) & ~missed
     due &= variant.sharpens
     state = jax.lax.cond(due, partial(_sharpened, rig), lambda state: state, state)
     state = state._replace(
-        last_good=jnp.where(missed, state.last_good, state.belief.mean),
+        last_good=jnp.where(missed | (doubt > 0), state.last_good, state.belief.mean),
         misses=jnp.where(missed, state.misses + 1, 0),
         num_outliers=num_outliers,
         age=state.age + 1,
         time=jnp.maximum(time, state.time),
         key=key,
     )
-    doubt = jnp.maximum(DOUBTFUL_SCORE - score, 0.0) if variant.may_doubt else jnp.zeros_like(score)
     return state, _track(state, belief, estimate, score, doubt, info.effective_sample_size, deforms, rig)
 
 
@@ -189,16 +205,9 @@ def at_last_good(key: Array, state: Any) -> Any:
         state: Of any head tracker, with `search`, `belief`, `last_good` and `misses`.
     """
     lost_for = (state.misses - PATIENCE + 1).astype(state.belief.mean.dtype)
-    width = jnp.zeros_like(state.belief.mean).at[:POSE].set(jnp.minimum(lost_for, MOST_ASTRAY) * jnp.asarray(UNITS))
-    search = gathered(state.search, state.last_good)
-    noise = jax.random.normal(key, search.particles.shape, search.particles.dtype)
-    search = search._replace(
-        particles=search.particles + width[:, None] * noise,
-        estimate=state.last_good,
-        velocity=jnp.zeros_like(search.velocity),
-    )
-    covariance = jnp.diag(width**2) + 1e-4 * jnp.eye(len(width), dtype=width.dtype)
-    lost = state._replace(search=search, belief=Gaussian(state.last_good, covariance))
+    width = jnp.minimum(lost_for, MOST_ASTRAY) * jnp.asarray(UNITS, state.belief.mean.dtype)
+    search, belief = scattered(key, state.search, state.last_good, width)
+    lost = state._replace(search=search, belief=belief)
     pick = lambda a, b: a if a is b else jnp.where(state.misses >= PATIENCE, a, b)
     return state._replace(
         search=jax.tree.map(pick, lost.search, state.search), belief=jax.tree.map(pick, lost.belief, state.belief)
@@ -251,6 +260,21 @@ def _learned(
         residual_scale=keep(estimate.residual_scale, state.residual_scale),
         learner=learner,
     )
+
+
+def _key_frames(
+    state: HeadState,
+    belief: Gaussian,
+    lasting: Array,
+    estimate: Estimate,
+    score: Array,
+    missed: Array,
+    rig: CameraRig,
+) -> KeyFrames:
+    """With this frame, if it is one; it is off by what the key frames are off by from which it was placed, too."""
+    is_placed = estimate.is_placed & ~missed
+    pose = Gaussian(belief.mean[:POSE], belief.covariance[:POSE, :POSE] + lasting)
+    return with_key_frame(state.key_frames, state.registered.pose, pose, estimate.recent, is_placed, score, rig)
 
 
 def _carried(

@@ -21,9 +21,11 @@ from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import Estimate, around_mode, refined
 from jaxfilters.trackers.head.common.recent import latest_templates
-from jaxfilters.trackers.head.common.search import Searches, gathered
+from jaxfilters.trackers.head.common.search import LEAST_STEPS, Searches, gathered
 from jaxfilters.trackers.head.common.state import PATIENCE, POSE, HeadState
 
+FAR_BETTER = 0.2
+"""Mean correlation by which the prediction must be better than the particles' mode."""
 Templates = tuple[Array, Array]
 """(C, K, T, T) each: of the registered face, and of the face as it looked last."""
 
@@ -37,6 +39,8 @@ class Variant(NamedTuple):
         [Callable[[Filter, Array], tuple[AdaptiveDiffusionState, ParticleInfo]], Searches, FaceModel], tuple
     ]
     """`(run, searches, model)`: one of the searches, run with a diffusion of the mode coefficients."""
+    begun: Callable[[AdaptiveDiffusionState, Array, Callable[[Array], Array]], AdaptiveDiffusionState]
+    """`(search, predicted state, mean correlation of a state)`: the search with what the estimate begins with."""
     estimate: Callable[..., tuple[Estimate, AdaptiveDiffusionState]]
     """`(search, state, model, images, rig, predicted motion, frame times, options)`, and the search after it."""
     measured: Callable[..., Templates]
@@ -49,6 +53,8 @@ class Variant(NamedTuple):
     """Whether the registered shape is triangulated anew."""
     may_doubt: bool
     """Whether a pose at which the face looks little as registered is doubtful, and claimed to be known less well."""
+    keeps_key_frames: bool
+    """Whether a turned head is compared with what it looked like before when it was turned."""
 
 
 def _turned_templates(state: HeadState, model: FaceModel, rig: CameraRig, moved: Array) -> Templates:
@@ -84,6 +90,21 @@ def _layered_search(run: Callable, searches: Searches, model: FaceModel) -> tupl
     )
 
 
+def _likelier(
+    search: AdaptiveDiffusionState, predicted: Array, score: Callable[[Array], Array]
+) -> AdaptiveDiffusionState:
+    """At the prediction where that is far better than the particles' mode: after a second these are spread thinly."""
+    of_mode, of_predicted = jax.lax.map(score, jnp.stack([search.estimate, predicted]))
+    return search._replace(estimate=jnp.where(of_predicted > of_mode + FAR_BETTER, predicted, search.estimate))
+
+
+def _at_mode(
+    search: AdaptiveDiffusionState, predicted: Array, score: Callable[[Array], Array]
+) -> AdaptiveDiffusionState:
+    del predicted, score
+    return search
+
+
 def _refined(
     search: AdaptiveDiffusionState,
     state: HeadState,
@@ -97,10 +118,14 @@ def _refined(
     """The fit; particles, velocity and diffusion follow it."""
     estimate = refined(search, state, model, images, rig, moved)
     before, x = state.search, estimate.belief.mean
-    velocity = (x - before.estimate)[:POSE] / jnp.maximum(before.elapsed + steps, 1e-3)
+    elapsed = before.elapsed + steps
+    has_gone_on = elapsed > LEAST_STEPS
+    since = (x - before.estimate)[:POSE] / jnp.where(has_gone_on, elapsed, 1.0)
+    velocity = jnp.where(has_gone_on, since, before.velocity)
     fit = before.fit
     if options.diffusion == "online":
-        fit = diffusion.update(fit, before.velocity, velocity - before.velocity)
+        changed = diffusion.update(fit, before.velocity, velocity - before.velocity)
+        fit = jax.tree.map(lambda a, b: jnp.where(has_gone_on, a, b), changed, fit)
     after = gathered(search, x)._replace(estimate=x, velocity=velocity, fit=fit)
     return estimate, jax.tree.map(lambda a, b: jnp.where(estimate.is_found, a, b), after, search)
 
@@ -135,22 +160,26 @@ VARIANTS = {
     "recommended": Variant(
         templates=_turned_templates,
         search=_rigid_search,
+        begun=_likelier,
         estimate=_refined,
         measured=_as_estimated,
         follow=0.0,
         still=remove_motion,
         sharpens=True,
         may_doubt=True,
+        keeps_key_frames=True,
     ),
     "published": Variant(
         templates=_flat_templates,
         search=_layered_search,
+        begun=_at_mode,
         estimate=_around_mode,
         measured=_recalculated,
         follow=1.0,
         still=learning.without_weighted_motion,
         sharpens=False,
         may_doubt=False,
+        keeps_key_frames=False,
     ),
 }
 """By `HeadConfig.variant`."""

@@ -43,6 +43,19 @@ def test_the_cascades_wait_for_a_face_that_holds_still_and_complete_it(draw_face
     assert finder.complaints == ["no face"]
 
 
+def test_a_glance_does_not_wait(mesh, draw_face):
+    image, points = draw_face((330, 220), 70.0)
+    found = CascadeFinder().glance(image, points.mean(axis=0))
+    assert np.linalg.norm(found - points, axis=1).max() < 0.15 * 70
+    assert CascadeFinder().glance(IMAGE, points.mean(axis=0)) is None
+    both = np.maximum(image, draw_face((110, 330), 50.0)[0])
+    assert np.linalg.norm(CascadeFinder().glance(both, np.array([110.0, 330.0])).mean(axis=0) - [110, 330]) < 40
+    finder, answers = mesh
+    answers += [points, None]
+    np.testing.assert_array_equal(finder.glance(IMAGE, np.zeros(2)), points)
+    assert finder.glance(IMAGE, np.zeros(2)) is None
+
+
 def test_the_mesh_waits_for_a_face_that_holds_still(mesh, draw_face):
     finder, answers = mesh
     points = draw_face((330, 220), 70.0)[1]

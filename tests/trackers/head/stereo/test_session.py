@@ -137,7 +137,7 @@ def test_a_clock_that_counts_from_long_ago_does_not_matter(moving, whole):
 
 @pytest.mark.system
 def test_a_lost_face_is_reported_and_found_again(drawn):
-    """Where it was lost it is found by the search; elsewhere it is registered anew, and known or not by its shape."""
+    """Where it was lost it is found by the search; elsewhere where it is detected; another one is registered anew."""
     start, points = drawn(6)
     gone = PATIENCE + 6
     same_place, _ = drawn(7, seed=2)
@@ -157,12 +157,13 @@ def test_a_lost_face_is_reported_and_found_again(drawn):
     for end, middle in zip(ends[[2, 4]], (MIDDLE, (MIDDLE[0] - 60, MIDDLE[1] + 90)), strict=True):
         assert track.status[end - 1] == RIGID
         np.testing.assert_allclose(track.image_points[end - 1, 0, :4].mean(axis=0), middle, atol=2)
-    found = ["found again near where it was lost", "registered, a face that is known", "registered"]
+    found = ["found again near where it was lost", "found again where it is detected", "registered"]
     events = [(i, what) for i, what in session.events if what == "lost" or what in found]
     assert [what for _, what in events] == ["registered", "lost", found[0], "lost", found[1], "lost", found[2]]
     assert [i for i, what in events if what == "lost"] == [e + PATIENCE - 1 for e in ends[[0, 2, 4]]]
     assert events[2][0] in range(ends[1], ends[2])
-    assert events[4][0] == ends[3] + STABLE_FRAMES - 1
+    # A tenth of a second is the longest that a face which is seen well waits for a comparison.
+    assert events[4][0] in range(ends[3], ends[3] + 4)
 
 
 @pytest.mark.system
@@ -179,7 +180,7 @@ def test_what_was_learnt_is_kept_for_a_known_face(drawn):
     )
     assert session.contribution == 1
     lost = session.process(np.concatenate([snow(16), drawn(10, (MIDDLE[0] - 60, MIDDLE[1] + 90))[0]]), times(26, 2))
-    assert said(session)[-1] == "registered, a face that is known"
+    assert said(session)[-1] == "found again where it is detected"
     assert session.contribution > 0.99
     # The same five directions, whichever of them comes first.
     np.testing.assert_allclose(np.linalg.svd(session.model.basis.T @ modes)[1], 1, atol=1e-3)
@@ -261,7 +262,7 @@ def test_a_live_session_follows_and_registers_anew_beside_the_frames(drawn):
         assert np.all(np.isnan(rows[-1].pose))
         time.sleep(0.01)
     np.testing.assert_allclose(rows[-1].image_points[0, 0, :4].mean(axis=0), place, atol=2)
-    assert said(session)[-1] == "registered, a face that is known"
+    assert said(session)[-1] == "found again where it is detected"
 
 
 def test_a_detector_that_is_not_installed_is_refused(monkeypatch):

@@ -12,6 +12,7 @@ from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import DOUBTFUL, LOST, NUM_MODES, RIGID, UNITS
 from jaxfilters.trackers.head.stereo import tracking as module
+from jaxfilters.trackers.head.stereo.redetection import DETECTED_STD, placed
 from jaxfilters.trackers.head.stereo.registration import register
 
 pytestmark = pytest.mark.optimised
@@ -68,6 +69,20 @@ def videos():
 
 def rms(errors):
     return np.sqrt(np.mean(errors**2, axis=0))
+
+
+@pytest.mark.system
+def test_two_images_of_one_time_tell_no_velocity(videos):
+    """A correction of the pose within no time would be a motion of thousands of millimetres a frame."""
+    video, state = videos["fast"], videos["fast"].begin(MODERN)
+    off = state.belief.mean[:6] + jnp.asarray(UNITS * [2.0, -2.0, 3.0, 1.0, 2.0, -1.0])
+    state = placed(state, off, video.images[0], video.video.rig, DETECTED_STD)
+    images, times = np.repeat(video.images[:1], CHUNK, axis=0), np.full(CHUNK, float(state.time), np.float32)
+    filters, is_frame = searches(video.video.rig, MODERN), np.arange(CHUNK) < 1
+    after, track = module.advance(video.video.rig, filters, state, images, times, is_frame, compiled(MODERN))
+    assert np.all(np.abs(track.pose[0] - video.video.poses[0]) < UNITS)
+    np.testing.assert_array_equal(after.search.velocity, 0)
+    jax.tree.map(np.testing.assert_array_equal, after.search.fit, state.search.fit)
 
 
 @pytest.mark.system
