@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32, Num, UInt8
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.people.config import PeopleConfig as PeopleConfig
@@ -52,7 +51,7 @@ class PeopleScene:
         return _centers(self.cameras)
 
 
-@compiled_quickly
+@jax.jit  # also within programs of a caller, which compile it as themselves
 def _centers(cameras: tuple[FloorCamera, ...]) -> Float[Array, "cameras 2"]:
     return jnp.stack([camera.position()[:2] for camera in cameras])
 

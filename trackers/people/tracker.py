@@ -135,7 +135,7 @@ def step(
     return people, _report(scene, people, fit, nis)
 
 
-@compiled_quickly
+@jax.jit
 def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
     """The outlines of everybody in each camera, one row a slot."""
     bodies = jax.vmap(body_of)(_observed_places(scene, people))

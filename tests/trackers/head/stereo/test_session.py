@@ -284,6 +284,7 @@ def test_a_live_session_looks_for_a_face_beside_the_frames(drawn, monkeypatch):
         return SimpleNamespace(model=model)
 
     monkeypatch.setattr(module, "begin", begin)
+    monkeypatch.setattr(module.redetection, "prepare", lambda state, images, rig: None)
     images, _ = drawn(1)
     session = HeadSession(nominal(), HeadConfig(live=True, chunk=1))
     for i in range(1000):
