@@ -13,7 +13,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot, einsum
-from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
