@@ -1,8 +1,8 @@
 """Where a fixed camera stands and how it images, from points in the world whose pixels are known.
 
 World coordinates are metres with Z up, pixels (u, v) with their centres at integers. Everything here runs on the host
-in float64: it is done once for a camera. SciPy is imported by the functions that use it: trackers need no
-more than `Calibration`.
+in float64: it is done once for a camera. SciPy is imported by the functions that use it, since trackers need no more
+than `Calibration`.
 """
 
 from typing import NamedTuple

@@ -6,8 +6,10 @@ from importlib.metadata import version
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 R = TypeVar("R")
+_ZERO = np.zeros((), np.float32)
 
 # Of XLA, for CPUs. The newer emitters take some milliseconds for each of a program's hundreds of loops, for little
 # speed where these are small. From jaxlib 0.11 on there are no others.
@@ -45,7 +47,18 @@ def _compiled(function: Callable[..., R], options: dict[str, bool | int], settin
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
-        is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return (usual if is_traced or jax.default_backend() != "cpu" else quick)(*args, **kwargs)
+        is_traced = any(_is_tracer(leaf) for leaf in jax.tree.leaves((args, kwargs)))
+        if is_traced or jax.default_backend() != "cpu" or _within_program():
+            return usual(*args, **kwargs)
+        return quick(*args, **kwargs)
 
     return call
+
+
+def _is_tracer(leaf: Any) -> bool:
+    return isinstance(leaf, jax.core.Tracer)
+
+
+def _within_program() -> bool:
+    """Whether a program is being traced, though perhaps not the arguments: its options are those of the whole."""
+    return _is_tracer(jax.device_put(_ZERO))

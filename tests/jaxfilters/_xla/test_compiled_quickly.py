@@ -33,6 +33,16 @@ def test_it_may_be_called_from_a_program_and_be_differentiated():
     np.testing.assert_allclose(J, np.linalg.inv(A.astype(float)) * np.cos(b.astype(float)), rtol=1e-5)
 
 
+@pytest.mark.parametrize("compiled", [compiled_quickly, compiled_lightly])
+def test_a_program_may_call_it_with_what_is_known(compiled):
+    """XLA takes options for whole programs alone."""
+    A, b = (jnp.asarray(a) for a in PROBLEM)
+    quick = compiled(solved)
+    np.testing.assert_allclose(jax.jit(lambda x: x + quick(A, b))(b), b + quick(A, b), rtol=1e-6)
+    np.testing.assert_allclose(jax.vmap(lambda x: x + quick(A, b))(b[None])[0], b + quick(A, b), rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(x * quick(A, b)))(b), quick(A, b), rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["_UNOPTIMISED", "_LIGHTLY"])
 def test_xla_knows_the_options(name):
     # XLA refuses names that it does not know.

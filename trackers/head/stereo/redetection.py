@@ -71,15 +71,23 @@ def is_found(row: HeadTrack) -> bool:
 
 
 @compiled_quickly
+def aligned(
+    shape: Float[Array, "K 3"], other: Float[Array, "K 3"]
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, ""]]:
+    """Rotation and translation of a shape to another one, and root mean square distance left, millimetres."""
+    R, t = align(shape, other)
+    return R, t, jnp.sqrt(jnp.mean(jnp.sum((dot(shape, R.T) + t - other) ** 2, axis=-1)))
+
+
+@compiled_quickly
 def _laid_over(
     state: HeadState, detected: Float[Array, "K 3"], detected_pose: Float[Array, " 6"]
 ) -> tuple[Float[Array, " 6"], Float[Array, ""]]:
     """Pose of the face laid over a detected one, and how far the two shapes are apart, millimetres."""
-    R, t = align(state.registered.shape, detected)
-    apart = dot(state.registered.shape, R.T) + t - detected
+    R, t, apart = aligned(state.registered.shape, detected)
     turn = rotation(detected_pose[3:])
     pose = jnp.concatenate([detected_pose[:3] + dot(turn, t), angles(dot(turn, R))])
-    return pose, jnp.sqrt(jnp.mean(jnp.sum(apart**2, axis=-1)))
+    return pose, apart
 
 
 @compiled_quickly

@@ -11,7 +11,6 @@ from jaxtyping import Float, UInt8
 from jaxfilters._full_precision import dot
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.models.face.rigid import align
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
@@ -256,10 +255,8 @@ class _HeadTracker:
 
 def _with_known_face(state: HeadState, old: HeadState) -> tuple[HeadState, bool]:
     """The new state with the deformations of before, if the face is that of before."""
-    R, t = align(old.registered.shape, state.registered.shape)
-    moved = dot(old.registered.shape, R.T) + t
-    apart = float(jnp.sqrt(jnp.mean(jnp.sum((moved - state.registered.shape) ** 2, axis=-1))))
-    if not apart <= SAME_FACE_MM:
+    R, _, apart = redetection.aligned(old.registered.shape, state.registered.shape)
+    if not float(apart) <= SAME_FACE_MM:
         return state, False
     turn = lambda vectors: dot(vectors.reshape(-1, NUM_LANDMARKS, 3), R.T).reshape(vectors.shape)
     basis = turn(old.model.basis.T).T
