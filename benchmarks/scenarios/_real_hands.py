@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -29,6 +30,8 @@ NOISE_M, WALL_M = 0.0015, 1.5
 """Standard deviation of a reading, and the distance of what is behind the hand."""
 _SPLIT = 6
 """Parts of a triangle's side at whose corners it is sampled: a pixel or less."""
+PALM = [0, 5, 9, 17]
+"""Joints whose middle is that of the palm."""
 _DIGITS = (4, 3, 2, 1, 0)
 """Their names of thumb, index, middle, ring and little finger."""
 
@@ -46,7 +49,14 @@ class HandRecording(NamedTuple):
     """+1 for a right hand, -1 for a left one."""
 
 
-def load(name: str, num_frames: int = NUM_FRAMES, *, every: int = 1, evenly: bool = False) -> HandRecording:
+def load(
+    name: str,
+    num_frames: int = NUM_FRAMES,
+    *,
+    every: int = 1,
+    evenly: bool = False,
+    turned_deg: tuple[float, float] = (0.0, 0.0),
+) -> HandRecording:
     """One of `DEVELOPMENT` or `HELD`: the frames in the middle of a motion, the first ones of a camera's recording.
 
     Args:
@@ -54,6 +64,8 @@ def load(name: str, num_frames: int = NUM_FRAMES, *, every: int = 1, evenly: boo
         num_frames: How many frames, or as many as there are.
         every: One of so many frames is taken, as by a camera of a lower rate.
         evenly: The frames of a motion are spread over all of it, so that the times are no longer those of the motion.
+        turned_deg: A motion is turned by this about the x and then the y axis of the camera, in each frame about the
+            middle of the palm.
 
     Raises:
         RecordingError: the data are not there.
@@ -70,14 +82,25 @@ def load(name: str, num_frames: int = NUM_FRAMES, *, every: int = 1, evenly: boo
     first = max(0, (len(motion) - every * num_frames) // 2)
     spread = np.linspace(0, len(motion) - 1, num_frames).round().astype(int)
     motion = motion[spread] if evenly else motion[first : first + every * num_frames : every]
+    lengths = _tip_lengths(recording_folder("tzionas_hand_motion") / f"Model_Hand_{side}.SKEL")
+    if any(turned_deg):
+        motion = _turned(motion, 1000 * _joints(motion, hand, lengths, side)[:, PALM].mean(axis=1), turned_deg)
     shape, rng = (480, 640), np.random.default_rng(int(sequence))
     depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape) for vertices in _skinned(motion, hand)])
     depth = np.round(depth + NOISE_M * rng.normal(size=depth.shape), 3)
     depth = np.where(np.isfinite(depth), depth, WALL_M).astype(np.float32)
-    lengths = _tip_lengths(recording_folder("tzionas_hand_motion") / f"Model_Hand_{side}.SKEL")
     camera = Pinhole.from_matrix(matrix, shape)
     times = np.arange(len(motion), dtype=np.float32) * np.float32(every / RATE)
     return HandRecording(camera, times, depth, _joints(motion, hand, lengths, side), 1.0 if side == "R" else -1.0)
+
+
+def _turned(
+    motion: Float[np.ndarray, "t b 3 4"], about_mm: Float[np.ndarray, "t 3"], degrees: tuple[float, float]
+) -> Float[np.ndarray, "t b 3 4"]:
+    across, upright = (cv2.Rodrigues(np.deg2rad(angle) * np.eye(3)[axis])[0] for axis, angle in enumerate(degrees))
+    turn = upright @ across
+    offset = np.pad((about_mm - about_mm @ turn.T)[:, None, :, None], ((0, 0), (0, 0), (0, 0), (3, 0)))
+    return np.asarray(turn @ motion + offset)
 
 
 def pip_flexion(joints: Float[np.ndarray, "t 21 3"]) -> Float[np.ndarray, "t 4"]:

@@ -26,6 +26,7 @@ from jaxfilters.models.hand.starting_poses import (
     PALM_TO_WRIST,
     Hypotheses,
     multiplied,
+    of_every_gesture,
     second_axis,
     starting_poses,
 )
@@ -46,8 +47,8 @@ BATCH = 20
 """Hypotheses in one compiled call; the variants of one finalist."""
 NUM_VARIED = (4, 2)
 """Finalists that are varied, in the first and in the second round."""
-NUM_REGISTERED, NUM_FINALISTS = 56, 6
-"""Hypotheses that are registered with the middle one of the sizes, and of these with every size."""
+NUM_REGISTERED, NUM_FINALISTS = 60, 6
+"""Orientations that are registered with the middle one of the sizes, and of these with every size."""
 NUM_REPEATED = 2
 """Finalists that are registered with every size once more: the first time they start where the middle size has led."""
 REGISTRATION_STRIDE, SCORING_STRIDE = 4, 2
@@ -99,7 +100,7 @@ def find_starts(
         geometry: The average hand.
         scales: Sizes to try; the middle one comes first.
         sides: Hands to try, 1 for right and -1 for left.
-        num_registered: How many of the hypotheses are registered.
+        num_registered: How many orientations are registered, each with the gesture that explains the image best.
 
     Returns:
         At most `NUM_FINALISTS` different ones.
@@ -108,7 +109,10 @@ def find_starts(
     middle = scales[len(scales) // 2]
     tried = starting_poses(center, middle, sides)
     _, costs = _refined(image, tried, ())
-    tried = tried.rows(np.argsort(costs)[:num_registered])
+    tried = of_every_gesture(tried.rows(np.argsort(costs)[:num_registered]))
+    _, costs = _refined(image, tried, ())
+    gestures = costs.reshape(num_registered, -1)
+    tried = tried.rows(np.argmin(gestures, axis=1) + gestures.shape[1] * np.arange(num_registered))
     tried, costs = _refined(image, tried, COARSE)
     finalists = tried.rows(_distinct(tried, costs))
     tried, costs = _sized(*_refined(image, _of_every_size(finalists, scales), FINE))

@@ -13,15 +13,19 @@ PALM_TO_WRIST = 0.055
 """Metres from the middle of the palm to the wrist of an average hand."""
 GESTURES = np.deg2rad(
     [
+        [10.0, 10.0, 0.0] + [25.0, 0.0, 35.0] * 4,
         [0.0] * 15,
         [0.0] * 3 + [0.0, 12.0, 0.0] + [0.0] * 3 + [0.0, -12.0, 0.0] + [0.0, -27.0, 0.0],
-        [10.0, 10.0, 0.0] + [25.0, 0.0, 35.0] * 4,
         [30.0, 30.0, 0.0] + [75.0, 0.0, 90.0] * 4,
+        [10.0, 10.0, 0.0] + [70.0, 0.0, 15.0] * 4,
+        [20.0, 20.0, 0.0] + [45.0, 0.0, 60.0] * 4,
     ]
 )
-"""Joint angles of an open, a spread, a relaxed and a closed hand, (4, 15)."""
-NUM_ROLLS = 12
-TILTS = np.deg2rad([-45.0, 0.0, 45.0])
+"""Joint angles of a relaxed, an open, a spread and a closed hand, of straight fingers at right angles to the palm, and
+of a hand half closed, (6, 15)."""
+NUM_ROLLS, NUM_FLIPS = 8, 8
+"""Orientations about the optical axis, and about the axis of the forearm: palm, back and both edges to the camera."""
+TILTS = np.deg2rad([-70.0, -35.0, 0.0, 35.0, 70.0])
 """Of the fingers towards the camera and away from it."""
 
 
@@ -38,8 +42,9 @@ class Hypotheses(NamedTuple):
 
 
 def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequence[float]) -> Hypotheses:
-    """Hands about the middle of a palm: rolls about the optical axis, palm or back to the camera, tilts, gestures."""
-    rotation, wrist, angles = _grid()
+    """Relaxed hands about the middle of a palm, in all orientations: rolls, flips, tilts, for each of the sides."""
+    rotation, wrist = _orientations()
+    angles = np.tile(GESTURES[0], (len(rotation), 1))
     poses = np.concatenate([center + scale * wrist, rotation, angles], axis=1).astype(np.float32)
     count = len(poses)
     return Hypotheses(
@@ -49,26 +54,30 @@ def starting_poses(center: Float[np.ndarray, " 3"], scale: float, sides: Sequenc
     )
 
 
+def of_every_gesture(tried: Hypotheses) -> Hypotheses:
+    """Every hypothesis with each of the gestures in place of its own: those of the first one come first."""
+    repeated = tried.rows(np.repeat(np.arange(len(tried.poses)), len(GESTURES)))
+    repeated.poses[:, 7:] = np.tile(GESTURES, (len(tried.poses), 1))
+    return repeated
+
+
 @cache
-def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations (h, 4), wrists from the middle of the palm (h, 3) and angles (h, 15)."""
+def _orientations() -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (h, 4), and wrists from the middle of the palm (h, 3)."""
 
     def about(axis: int, angle: float) -> np.ndarray:
         turn = np.zeros(4)
         turn[[0, 1 + axis]] = math.cos(0.5 * angle), math.sin(0.5 * angle)
         return turn
 
-    rolls = np.arange(NUM_ROLLS) * (2 * math.pi / NUM_ROLLS)
+    rolls, flips = (np.arange(count) * (2 * math.pi / count) for count in (NUM_ROLLS, NUM_FLIPS))
     rotations = np.stack(
         [
             multiplied(multiplied(about(2, roll), about(1, flip)), about(0, tilt))
-            for roll, flip, tilt in product(rolls, (0.0, math.pi), TILTS)
+            for roll, flip, tilt in product(rolls, flips, TILTS)
         ]
     )
-    wrists = PALM_TO_WRIST * np.stack([second_axis(rotation) for rotation in rotations])
-    repeat = len(GESTURES)
-    angles = np.tile(GESTURES, (len(rotations), 1))
-    return np.repeat(rotations, repeat, axis=0), np.repeat(wrists, repeat, axis=0), angles
+    return rotations, PALM_TO_WRIST * np.stack([second_axis(rotation) for rotation in rotations])
 
 
 def multiplied(p: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -9,8 +9,9 @@ from jaxfilters.models.camera import Pinhole
 
 NEAREST, FARTHEST = 0.15, 2.0
 """Metres between which a hand is looked for."""
-JUMP = 0.015
-"""Metres of depth between neighbouring pixels that separate two surfaces, at least."""
+JUMP, FINGER_JUMP = 0.015, 0.06
+"""Metres of depth between neighbouring pixels that separate two surfaces, at least; and where no palm is found so,
+since fingers before it cut it into pieces."""
 STEEPEST = 4.0
 """Depth over width from pixel to pixel that is still one surface."""
 SMALLEST_AREA = 0.002
@@ -19,8 +20,9 @@ LARGEST_AREA = 0.8
 """Square metres above which it is a wall or a floor; a person who reaches out is one surface with the hand."""
 LARGEST_PART = 0.008
 """Square metres above which another surface is not a finger before the palm."""
-PALM_INSET = (0.018, 0.065)
-"""Metres from the middle of a palm to the outline of the hand; a forearm has less than a body or a desk, too."""
+PALM_INSET, EDGE_INSET = (0.018, 0.065), 0.012
+"""Metres from the middle of a palm to the outline of the hand; a forearm has less than a body or a desk, too. And of a
+hand whose edge or fingertips point at the camera."""
 USUAL_INSET = 0.038
 APART = 0.07
 """Metres between the middles of two palms that are tried."""
@@ -68,15 +70,22 @@ class Sighting(NamedTuple):
 def hand_sightings(camera: Pinhole, frame: np.ndarray) -> list[Sighting]:
     """Places of a palm's width in a frame (rows, cols) in metres, at most `MOST_SIGHTINGS`, the likeliest first.
 
-    Likely is what is near the camera and as wide as a palm (distance transform of its surface).
+    Likely is what is near the camera and as wide as a palm (distance transform of its surface). Where there is no such
+    place, a hand may point at the camera: fingers before the palm are then of its surface, and less width is enough.
     """
     depth = _without_small_holes(frame)
     depth = np.where((depth > NEAREST) & (depth < FARTHEST), depth, np.inf).astype(np.float32)
-    surfaces, area = _surfaces(depth, float(camera.focal[0]))
+    facing = _sightings(camera, frame, depth, JUMP, PALM_INSET[0])
+    return facing or _sightings(camera, frame, depth, FINGER_JUMP, EDGE_INSET)
+
+
+def _sightings(camera: Pinhole, frame: np.ndarray, depth: np.ndarray, jump: float, least: float) -> list[Sighting]:
+    """Places on surfaces that a `jump` in depth separates, at least `least` metres from their outlines."""
+    surfaces, area = _surfaces(depth, float(camera.focal[0]), jump)
     labels = np.where((area[surfaces] > SMALLEST_AREA) & (area[surfaces] < LARGEST_AREA), surfaces, 0)
     inset = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, 5)
     inset = np.where(labels > 0, inset * np.where(np.isfinite(depth), depth, 0.0) / float(camera.focal[0]), 0.0)
-    peaks = (inset >= cv2.dilate(inset.astype(np.float32), np.ones((5, 5), np.uint8)) - 1e-6) & (inset > PALM_INSET[0])
+    peaks = (inset >= cv2.dilate(inset.astype(np.float32), np.ones((5, 5), np.uint8)) - 1e-6) & (inset > least)
     rows, cols = np.nonzero(peaks & (inset < PALM_INSET[1]))
     if not len(rows):
         return []
@@ -105,7 +114,7 @@ def _without_small_holes(frame: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(filled), filled, np.where(near > 0, near, np.inf))
 
 
-def _surfaces(depth: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray]:
+def _surfaces(depth: np.ndarray, focal: float, jump: float) -> tuple[np.ndarray, np.ndarray]:
     """(rows, cols) int: numbers of the surfaces, 0 between them; and their areas in square metres, that of 0 being 0.
 
     The farther one of two neighbours across a jump is taken out, so that what is in front keeps its shape.
@@ -114,7 +123,7 @@ def _surfaces(depth: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray]:
     finite = np.isfinite(depth)
     z = np.where(finite, depth, 1.0)
     with np.errstate(invalid="ignore"):
-        jumps = finite & (depth - near > np.maximum(JUMP, STEEPEST * z / focal))
+        jumps = finite & (depth - near > np.maximum(jump, STEEPEST * z / focal))
     mask = (finite & ~jumps).astype(np.uint8)
     count, labels = cv2.connectedComponents(mask, connectivity=4)
     area = np.bincount(labels.ravel(), weights=np.where(mask > 0, (z / focal) ** 2, 0.0).ravel(), minlength=count)
