@@ -19,6 +19,7 @@ from jaxfilters._full_precision import dot
 from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed
+from jaxfilters.models.hand.limits import unusualness
 from jaxfilters.models.hand.motion import per_coordinate
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, Target, gauss_newton, target_from_image
 from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics
@@ -64,6 +65,9 @@ SIZE_STD = 0.1
 """Of the logarithm of the size of hands."""
 UNUSUAL_SIZE = 0.001
 """Metres of cost that a hand one such standard deviation off the average must gain."""
+UNUSUAL_POSE = 0.003
+"""Metres of cost that a hand must gain whose angles are one standard deviation off usual ones, in the mean square. The
+hand of the other side, or one turned over, explains many images as well, with fingers spread or bent in odd ways."""
 COARSE = (0.04,) * 5 + (0.02,) * 3
 FINE = (0.02,) * 3 + (0.01,) * 3
 """Widths of the robust weight, metres, one for each step."""
@@ -79,7 +83,7 @@ class Start(NamedTuple):
     side: float
     """+1 for a right hand, -1 for a left one."""
     cost: float
-    """Metres: mean error over the readings near the hand, at most `MAX_ERROR` and a little more for an unusual size."""
+    """Metres: mean error over the readings near the hand, at most `MAX_ERROR`, and more for an unusual size or pose."""
 
 
 def find_starts(
@@ -115,12 +119,12 @@ def find_starts(
     tried = tried.rows(np.argmin(gestures, axis=1) + gestures.shape[1] * np.arange(num_registered))
     tried, costs = _refined(image, tried, COARSE)
     finalists = tried.rows(_distinct(tried, costs))
-    tried, costs = _sized(*_refined(image, _of_every_size(finalists, scales), FINE))
+    tried, costs = _judged(*_refined(image, _of_every_size(finalists, scales), FINE))
     best = tried.rows(_distinct(tried, costs)[:NUM_REPEATED])
-    tried, costs = _joined((tried, costs), _sized(*_refined(image, _of_every_size(best, scales), FINE)))
+    tried, costs = _joined((tried, costs), _judged(*_refined(image, _of_every_size(best, scales), FINE)))
     for count in NUM_VARIED[:1] if num_registered < NUM_REGISTERED else NUM_VARIED:
         best = tried.rows(_distinct(tried, costs))
-        varied = _sized(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
+        varied = _judged(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
         tried, costs = _joined((tried, costs), varied)
     return [
         Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
@@ -139,9 +143,10 @@ def _joined(one: tuple[Hypotheses, np.ndarray], other: tuple[Hypotheses, np.ndar
     return jax.tree.map(lambda first, second: np.concatenate([first, second]), one, other)
 
 
-def _sized(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray]:
-    """Costs with what an unusual size costs more."""
-    return tried, costs + UNUSUAL_SIZE * (np.log(tried.scales) / SIZE_STD) ** 2
+def _judged(tried: Hypotheses, costs: np.ndarray) -> tuple[Hypotheses, np.ndarray]:
+    """Costs with what an unusual size and unusual angles cost more."""
+    size = (np.log(tried.scales) / SIZE_STD) ** 2
+    return tried, costs + UNUSUAL_SIZE * size + UNUSUAL_POSE * unusualness(tried.poses[:, 7:])
 
 
 def _variants(finalists: Hypotheses, sides: Sequence[float]) -> Hypotheses:
@@ -205,9 +210,8 @@ def registered(
     """One pose after the same registration, with its cost, as `find_starts` would judge it."""
     image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
     one = Hypotheses(start.pose[None], np.full(1, start.scale, np.float32), np.full(1, start.side, np.float32))
-    found, costs = _refined(image, one, FINE)
-    cost = float(costs[0]) + UNUSUAL_SIZE * (math.log(start.scale) / SIZE_STD) ** 2
-    return start._replace(pose=found.poses[0], cost=cost)
+    found, costs = _judged(*_refined(image, one, FINE))
+    return start._replace(pose=found.poses[0], cost=float(costs[0]))
 
 
 def costs_of(
@@ -220,7 +224,7 @@ def costs_of(
     """Costs of hands as they are, as `find_starts` would judge them on this window, metres."""
     image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
     tried = Hypotheses(*(np.asarray([start[i] for start in starts], np.float32) for i in range(3)))
-    return _sized(*_refined(image, tried, ()))[1]
+    return _judged(*_refined(image, tried, ()))[1]
 
 
 def _refined(image: tuple, tried: Hypotheses, widths: tuple[float, ...]) -> tuple[Hypotheses, np.ndarray]:

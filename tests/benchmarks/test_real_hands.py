@@ -3,11 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks.recordings import RecordingError
-from jaxfilters.benchmarks.scenarios import _real_comparison, _real_hands
+from jaxfilters.benchmarks.scenarios import _real_comparison, _real_hands, hand_starts
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics, open_palm
+from jaxfilters.trackers.hand_depth.tracker import DOUBTFUL, SEARCHING, TRACKING
 from jaxfilters.trackers.tracker import Tracker
 
 
@@ -53,6 +55,33 @@ def test_a_lower_rate_takes_frames_at_its_own_times(data_dir):
     np.testing.assert_array_equal(every.joints, all_of_them.joints[::2])
     np.testing.assert_allclose(every.times_s, [0, 2 / 30], atol=1e-7)
     assert np.abs(every.depth - all_of_them.depth[::2]).max() < 12 * _real_hands.NOISE_M
+
+
+@pytest.mark.data
+def test_a_turned_motion_is_the_same_hand_about_the_same_palm(data_dir):
+    del data_dir
+    plain, turned = (_real_hands.load("02_L", 2, evenly=True, turned_deg=turn) for turn in ((0.0, 0.0), (30.0, -40.0)))
+    middle = plain.joints[:, _real_hands.PALM].mean(axis=1, keepdims=True)
+    turn = Rotation.from_euler("xy", [30, -40], degrees=True)
+    expected = turn.apply((plain.joints - middle).reshape(-1, 3)).reshape(plain.joints.shape) + middle
+    np.testing.assert_allclose(turned.joints, expected, atol=1e-6)
+    uv = np.rint(np.asarray(turned.camera.project(jnp.asarray(turned.joints)))).astype(int)
+    shown = turned.depth[np.arange(2)[:, None], uv[..., 1], uv[..., 0]] < 1
+    assert shown.mean() > 0.7
+
+
+def test_starts_are_counted_by_their_errors_and_what_their_status_says():
+    outcomes = [(8.0, TRACKING), (30.0, TRACKING), (60.0, DOUBTFUL), (float("nan"), SEARCHING)]
+    found = hand_starts._metrics(outcomes, np.array([24.0, 26.0, 60.0, np.nan]), "_turned")
+    values = {name: metric.value for name, metric in found.items()}
+    assert values == {
+        "found_turned": 25,
+        "wrong_turned": 25,
+        "searching_turned": 25,
+        "median_error_mm_turned": 30,
+        "found_turned_simple": 25,
+        "median_error_mm_turned_simple": 26,
+    }
 
 
 def test_hidden_fingers_have_no_readings_and_only_they_count():

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.hand.limits import SOFT_LIMITS, limit_excess, limit_log_likelihood
+from jaxfilters.models.hand.limits import FAN, SOFT_LIMITS, limit_excess, limit_log_likelihood, unusualness
 from jaxfilters.models.hand.skeleton import ANGLE_LIMITS, hand_geometry
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -50,3 +50,23 @@ def test_fingers_spread_by_25_degrees_about_their_metacarpals_and_all_else_is_as
     np.testing.assert_allclose(spread, np.stack([np.minimum(-20, fan - 25), np.maximum(20, fan + 25)], 1), atol=1e-9)
     others = np.setdiff1d(np.arange(15), np.arange(4, 15, 3))
     np.testing.assert_array_equal(SOFT_LIMITS[others], ANGLE_LIMITS[others])
+
+
+def test_usual_hands_are_those_of_a_broad_normal_distribution():
+    # Written out: of each flexion a part of its own and one that the fingers share; thumb and spread by themselves.
+    rng, n = np.random.default_rng(0), 20_000
+    own, shared = rng.normal(size=(n, 15)), rng.normal(size=(n, 2, 1))
+    angles = np.array([5.0, 0, 0] + 4 * [20, 0, 30]) + own * np.array([25.0, 20, 30] + 4 * [25, 12, 30])
+    angles[:, 3::3] += 35 * shared[:, 0]
+    angles[:, 5::3] += 40 * shared[:, 1]
+    angles = np.deg2rad(angles)
+    angles[:, 4::3] += FAN
+    values = unusualness(angles)  # chi-squared of 15 degrees of freedom, by 15: mean 1, variance 2 / 15
+    assert values.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 15 / n))
+    assert values.var() == pytest.approx(2 / 15, rel=0.1)
+
+
+def test_fingers_that_bend_together_are_less_unusual_than_one_alone():
+    together, alone = hands = np.zeros((2, 15))
+    together[3::3] = alone[9] = np.deg2rad(80)
+    assert np.diff(unusualness(hands)) > 0

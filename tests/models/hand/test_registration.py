@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand import start as start_module
@@ -109,6 +110,9 @@ def test_nothing_seen_leaves_the_prior():
     np.testing.assert_allclose(found.information, 0, atol=1e-6)
 
 
+PALM = [0, 5, 9, 17]
+
+
 def joints(start):
     geometry = replace(GEOMETRY.scaled(start.scale), side=jnp.asarray(start.side))
     return np.asarray(forward_kinematics(jnp.asarray(start.pose), geometry).joints)
@@ -130,6 +134,22 @@ def test_a_hand_of_either_side_and_of_unknown_size_is_found_without_a_start(side
     assert 1000 * np.linalg.norm(joints(starts[0]) - np.asarray(truth.joints), axis=-1).mean() < 12
     assert starts[0].cost < 0.01
     assert all(start.cost >= starts[0].cost for start in starts)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("degrees", [(100, -90, 20), (75, 45, 50), (200, 0, 65), (310, -135, 50)])
+def test_a_hand_is_found_that_shows_its_edge_or_points_at_the_camera(degrees):
+    # Roll, flip and tilt between those of the starting poses; the hand is larger, its place is known roughly.
+    turn = np.roll(Rotation.from_euler("ZYX", degrees, degrees=True).as_quat(), 1)
+    bent = jnp.deg2rad(jnp.array([15.0, 5, 10, 35, 6, 20, 25, 0, 25, 20, -4, 35, 10, -10, 30]))
+    pose = open_palm(jnp.zeros(3)).at[3:7].set(turn).at[7:].set(bent)
+    hand = GEOMETRY.scaled(1.06)
+    middle = np.asarray(forward_kinematics(pose, hand).joints)[PALM].mean(axis=0)
+    truth = forward_kinematics(pose.at[:3].set(jnp.array([0.0, 0.0, 0.6]) - middle), hand)
+    noise = 0.002 * np.random.default_rng(0).normal(size=NEAR_CAMERA.shape)
+    observed = jax.jit(render_capsules)(NEAR_CAMERA, truth.capsules) + noise
+    starts = find_starts(NEAR_CAMERA, observed, np.array([0.01, -0.006, 0.6]), GEOMETRY, (1.0,), (1.0,))
+    assert 1000 * np.linalg.norm(joints(starts[0]) - np.asarray(truth.joints), axis=-1).mean() < 25
 
 
 @pytest.mark.parametrize("count", [1, 2])

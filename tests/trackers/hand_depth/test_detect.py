@@ -50,6 +50,19 @@ def test_small_holes_and_specks_change_nothing():
     np.testing.assert_allclose(hand_sightings(CAMERA, frame)[0].center, PALM, atol=0.006)
 
 
+def test_fingers_before_the_palm_do_not_cut_it_into_pieces():
+    frame = with_palm(np.full((120, 160), 1.9, np.float32))
+    frame[36:65, 78:104:7] = frame[36:65, 79:104:7] = 0.56  # no piece of palm between them is a palm's width
+    assert nearest_to(hand_sightings(CAMERA, frame), PALM) < 0.06
+
+
+def test_the_edge_of_a_hand_is_wide_enough_where_nothing_is_wider():
+    thin = np.full((120, 160), 1.9, np.float32)
+    thin[46:55, 76:105] = 0.6  # 27 x 87 mm
+    assert nearest_to(hand_sightings(CAMERA, thin), PALM) < 0.05
+    assert nearest_to(hand_sightings(CAMERA, with_palm(thin, row=90)), PALM) > 0.1
+
+
 @pytest.mark.parametrize("value", [np.nan, 2.5, 0.05])
 def test_nothing_within_reach_is_no_hand(value):
     assert hand_sightings(CAMERA, np.full((120, 160), value, np.float32)) == []
