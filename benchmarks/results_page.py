@@ -83,6 +83,21 @@ ON_RECORDINGS = (
     ),
     *(
         Row(
+            "hand in depth images",
+            recording,
+            "right poses, higher is better",
+            "nearest of the rendered hands that the search begins with",
+            "hand-starts",
+            f"found{case}",
+            f"found{case}_simple",
+        )
+        for recording, case in (
+            ("single images of 11 motions", ""),
+            ("the same, turned by 42 to 55 degrees", "_turned"),
+        )
+    ),
+    *(
+        Row(
             "hand from key points",
             f"{name}, key points of a network, size unknown",
             "joints from the wrist",

@@ -24,6 +24,7 @@ from jaxfilters.models.hand.motion import per_coordinate
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, Target, gauss_newton, target_from_image
 from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics
 from jaxfilters.models.hand.starting_poses import (
+    GESTURES,
     PALM_TO_WRIST,
     Hypotheses,
     multiplied,
@@ -49,7 +50,7 @@ BATCH = 20
 NUM_VARIED = (4, 2)
 """Finalists that are varied, in the first and in the second round."""
 NUM_REGISTERED, NUM_FINALISTS = 60, 6
-"""Orientations that are registered with the middle one of the sizes, and of these with every size."""
+"""Orientations that are registered with the middle one of the sizes, and hypotheses of these with every size."""
 NUM_REPEATED = 2
 """Finalists that are registered with every size once more: the first time they start where the middle size has led."""
 REGISTRATION_STRIDE, SCORING_STRIDE = 4, 2
@@ -68,6 +69,9 @@ UNUSUAL_SIZE = 0.001
 UNUSUAL_POSE = 0.003
 """Metres of cost that a hand must gain whose angles are one standard deviation off usual ones, in the mean square. The
 hand of the other side, or one turned over, explains many images as well, with fingers spread or bent in odd ways."""
+POOR, DEEPER = 0.022, 0.025
+"""Metres of cost of the best start from which on hands that much deeper are tried as well: where an edge or fingers
+point at the camera, the middle of the palm is farther behind the visible surface than it is behind a palm's skin."""
 COARSE = (0.04,) * 5 + (0.02,) * 3
 FINE = (0.02,) * 3 + (0.01,) * 3
 """Widths of the robust weight, metres, one for each step."""
@@ -110,14 +114,25 @@ def find_starts(
         At most `NUM_FINALISTS` different ones.
     """
     image = (camera, jnp.asarray(observed), jnp.asarray(center, jnp.float32), geometry)
-    middle = scales[len(scales) // 2]
-    tried = starting_poses(center, middle, sides)
+    tried, costs = _searched(image, center, scales, sides, num_registered)
+    if not np.min(costs) < POOR:
+        deeper = np.asarray(center) + np.array([0.0, 0.0, DEEPER])
+        tried, costs = _joined((tried, costs), _searched(image, deeper, scales, sides, num_registered))
+    return [
+        Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
+        for i in _distinct(tried, costs)
+    ]
+
+
+def _searched(
+    image: tuple, center: np.ndarray, scales: Sequence[float], sides: Sequence[float], num_registered: int
+) -> tuple[Hypotheses, np.ndarray]:
+    """Hypotheses about one place after registration, and their costs."""
+    tried = starting_poses(center, scales[len(scales) // 2], sides)
     _, costs = _refined(image, tried, ())
     tried = of_every_gesture(tried.rows(np.argsort(costs)[:num_registered]))
     _, costs = _refined(image, tried, ())
-    gestures = costs.reshape(num_registered, -1)
-    tried = tried.rows(np.argmin(gestures, axis=1) + gestures.shape[1] * np.arange(num_registered))
-    tried, costs = _refined(image, tried, COARSE)
+    tried, costs = _refined(image, _best_of_every(len(GESTURES), tried, costs), COARSE)
     finalists = tried.rows(_distinct(tried, costs))
     tried, costs = _judged(*_refined(image, _of_every_size(finalists, scales), FINE))
     best = tried.rows(_distinct(tried, costs)[:NUM_REPEATED])
@@ -126,10 +141,12 @@ def find_starts(
         best = tried.rows(_distinct(tried, costs))
         varied = _judged(*_refined(image, _variants(best.rows(slice(count)), sides), FINE))
         tried, costs = _joined((tried, costs), varied)
-    return [
-        Start(tried.poses[i], float(tried.scales[i]), float(tried.sides[i]), float(costs[i]))
-        for i in _distinct(tried, costs)
-    ]
+    return tried, costs
+
+
+def _best_of_every(count: int, tried: Hypotheses, costs: np.ndarray) -> Hypotheses:
+    """The cheapest of every `count` hypotheses in a row."""
+    return tried.rows(np.argmin(costs.reshape(-1, count), axis=1) + count * np.arange(len(costs) // count))
 
 
 def _of_every_size(tried: Hypotheses, scales: Sequence[float]) -> Hypotheses:

@@ -23,7 +23,7 @@ GESTURES = np.deg2rad(
 )
 """Joint angles of a relaxed, an open, a spread and a closed hand, of straight fingers at right angles to the palm, and
 of a hand half closed, (6, 15)."""
-NUM_ROLLS, NUM_FLIPS = 8, 8
+NUM_ROLLS, NUM_FLIPS = 12, 8
 """Orientations about the optical axis, and about the axis of the forearm: palm, back and both edges to the camera."""
 TILTS = np.deg2rad([-70.0, -35.0, 0.0, 35.0, 70.0])
 """Of the fingers towards the camera and away from it."""
