@@ -59,7 +59,7 @@ def _first_estimate(recording: HandRecording, index: int, seed: int) -> Outcome:
     one = slice(index, index + 1)
     config = HandDepthConfig(seed=seed)
     track = hand_depth.track(recording.depth[one], recording.times_s[one], recording.camera, config)
-    return _error_mm(track.joints[0], recording.joints[index]), int(track.status[0])
+    return _error_mm(np.asarray(track.joints[0]), recording.joints[index]), int(track.status[0])
 
 
 def _simplest_error_mm(recording: HandRecording, index: int) -> float:
