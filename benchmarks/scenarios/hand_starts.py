@@ -1,4 +1,4 @@
-"""How often the hand tracker begins right: single depth images of hands that are seen from many sides.
+"""How often the hand tracker begins right: single depth images of hands, from many sides.
 
 The first and the last image of each of the eleven motions of real hands that nothing was chosen on
 (`_real_hands.HELD`), as they were recorded and turned about the middle of the palm by `TURNS`; the tracker knows
