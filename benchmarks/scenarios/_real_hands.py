@@ -22,7 +22,8 @@ from jaxfilters.trackers.io.depth import open_depth
 DEVELOPMENT = ("01_L", "01_R", "03_L", "05_R", "06_L", "07_R", "08_R", "15_R", "hpx")
 """Recordings on which the tracker was developed."""
 HELD = ("02_L", "02_R", "03_R", "04_L", "04_R", "05_L", "06_R", "07_L", "10_R", "17_L", "17_R")
-"""Motions on which nothing was chosen; the two scanned hands are those of the others."""
+"""Motions on which nothing was chosen, except on 17 how much deeper a poor start is looked for again
+(`models.hand.start.DEEPER`); the two scanned hands are those of the others."""
 NUM_FRAMES = 48
 RATE = 30.0
 """Frames a second of the motions."""
