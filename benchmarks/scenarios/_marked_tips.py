@@ -68,7 +68,11 @@ def marked_counts(name: str, folder: Path) -> dict[str, Count]:
         RecordingError: if the video cannot be read.
     """
     marked = marks(name)
-    images = _images(folder / marked["file"])
+    return counts(images_of(folder / marked["file"]), marked)
+
+
+def counts(images: list[np.ndarray], marked: dict[str, Any]) -> dict[str, Count]:
+    """The same of a video's images (rows, cols, 3) uint8, 30 a second, and what `marks` gives of it."""
     report, _ = track(images, np.arange(len(images)) / 30, "colour")
     frames = [int(i) for i in marked["frames"]]
     hulls = {i: tips_by_hull(hand_by_colour(images[i])) for i in frames}
@@ -110,7 +114,12 @@ def _pairs(own: dict[str, Any], tips: Tips, most: float) -> dict[str, int]:
     return {list(fingers)[row]: int(column) for row, column in near}
 
 
-def _images(path: Path) -> list[np.ndarray]:
+def images_of(path: Path) -> list[np.ndarray]:
+    """All images (rows, cols, 3) uint8 of a video.
+
+    Raises:
+        RecordingError: if it cannot be read, or is too short to show an open hand.
+    """
     video, images = cv2.VideoCapture(str(path)), list[np.ndarray]()
     while True:
         ok, image = video.read()

@@ -93,7 +93,7 @@ def presence(
     height: Float[ArrayLike, ""],
     width: Float[ArrayLike, ""],
     uv: Float[Array, "*pixels 2"],
-    spread_px: float = 0.0,
+    spread_px: Float[ArrayLike, ""] = 0.0,
     stride: Float[Array, " 2"] | None = None,
 ) -> Float[Array, "*pixels"]:
     """Probability that a person makes a pixel foreground.

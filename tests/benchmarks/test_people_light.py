@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxfilters.benchmarks.multi_object import floor_tracks
+from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks
 from jaxfilters.benchmarks.scenarios import _pets_two, people_corridor
 from jaxfilters.benchmarks.scenarios.people_light import DRIFT_PX, KNOCK_PX, SHAKE_PX, disturbances
 from jaxfilters.trackers.background.registration import Registration
@@ -62,6 +62,36 @@ def test_the_corridor_has_its_people_on_its_floor(data_dir):
     assert 3 < np.linalg.norm(walker[-1] - walker[0]) < 8
     assert np.median(np.linalg.norm(np.diff(walker, axis=0), axis=1)) < 0.1
     assert len(list(VideoFile(folder / "OneLeaveShop1cor.mpg").images())) == 295
+
+
+def test_a_place_whose_feet_are_hidden_is_between_those_where_they_are_not():
+    """The second person's box ends where that of the first begins in frame 1; in frame 2 it is beside it again."""
+    frame, identity = np.repeat(np.arange(3), 2), np.tile([7, 8], 3)
+    boxes = np.array(
+        [[0, 0, 9, 50], [30, 0, 40, 40], [25, 5, 45, 55], [30, 0, 40, 20], [60, 0, 70, 50], [30, 0, 40, 40]]
+    )
+    feet = np.stack([boxes[:, [0, 2]].mean(axis=1), boxes[:, 3]], axis=-1)
+    hidden = people_corridor.hidden_feet(frame, feet, boxes)
+    np.testing.assert_array_equal(hidden, [False, False, False, True, False, False])
+    floor = np.array([[1.0, 1], [0, 10], [1, 2], [0, 30], [1, 3], [0, 11]])
+    found = people_corridor.interpolated(frame, identity, floor, hidden)
+    np.testing.assert_allclose(found, np.where(hidden[:, None], [0.0, 10.5], floor))
+
+
+@pytest.mark.data
+def test_the_corridor_mirrored_and_backwards_has_its_people_where_its_images_have_them(data_dir):
+    folder = data_dir / "caviar_corridor"
+    camera = people_corridor.corridor_camera(folder / "floor_points.csv", (288, 384))
+    true = people_corridor.annotated(folder / "cols1gt.xml", camera)
+    true = FloorTracks(*(column[true.frame < 3] for column in true))
+    images = np.random.default_rng(0).integers(0, 255, (3, 288, 384, 3), np.uint8)
+    corridor = people_corridor.Corridor(camera, people_corridor.FLOOR, true, list(enumerate(images)), list(images))
+    other = people_corridor.mirrored(people_corridor.backwards(corridor))
+    np.testing.assert_array_equal(other.moments[0][1][:, ::-1], images[2])
+    project = lambda camera, xy: np.asarray(camera.project(np.pad(xy, ((0, 0), (0, 1))))[0])
+    first, last = other.true.xy_m[other.true.frame == 0], true.xy_m[true.frame == 2]
+    np.testing.assert_allclose(project(other.camera, first)[:, 0], 383 - project(camera, last)[:, 0], atol=0.01)
+    np.testing.assert_allclose(project(other.camera, first)[:, 1], project(camera, last)[:, 1], atol=0.01)
 
 
 def test_two_cameras_are_judged_beside_the_better_one(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from jaxfilters.trackers.people.image_shift import best_shift, has_shifts, shift
 from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
     contrasts_of,
+    crowding,
     line_of_sight,
     log_likelihood,
     log_likelihoods,
@@ -82,6 +83,8 @@ class Fit(NamedTuple):
     the best place for that; `inf` without a senior near by."""
     shares_in_view: Float[Array, "slots cameras"]
     """Of the silhouette, how much lies in each image and before furniture, whoever else may be there."""
+    crowding: Float[Array, "slots cameras"]
+    """Share of the surroundings of the silhouette in each image that is foreground which no other person explains."""
 
     @property
     def share_seen(self) -> Float[Array, " slots"]:
@@ -200,6 +203,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
             _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
             shares_seen(scene, places[k], mine, jnp.ones_like(unexplained)),
+            crowding(scene, places[k], mine, unexplained),
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
@@ -215,6 +219,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         jnp.zeros((n, cameras)),
         jnp.zeros(n),
         jnp.full(n, jnp.inf),
+        jnp.zeros((n, cameras)),
         jnp.zeros((n, cameras)),
     )
     order = jnp.argsort(~active)

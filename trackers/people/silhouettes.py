@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfilters._full_precision import dot
@@ -28,6 +29,8 @@ MARGIN = 0.3
 OVERLAP = 2.5
 """Sizes of an outline beyond which a body makes hardly any pixel foreground: one in a thousand."""
 LEAST_SIZE_M = 0.1
+AROUND = 0.15
+"""How far the surroundings of a silhouette reach, in half heights of its outline."""
 
 
 class View(NamedTuple):
@@ -60,12 +63,24 @@ def body_of(place: Float[Array, "*batch shape"]) -> Ellipsoid:
 
 
 def presence_of(
-    config: PeopleConfig, P: Float[Array, "3 4"], place: Float[Array, " shape"], uv: Float[Array, "*pixels 2"]
+    config: PeopleConfig,
+    P: Float[Array, "3 4"],
+    place: Float[Array, " shape"],
+    uv: Float[Array, "*pixels 2"],
+    margin_px: Float[ArrayLike, ""] = 0.0,
 ) -> Float[Array, "*pixels"]:
-    """`presence` of X, Y, height, width and, if it is known, the stride, in the camera of a projection matrix."""
+    """`presence` of X, Y, height, width and, if it is known, the stride, in the camera of a projection matrix.
+
+    Args:
+        config: Constants.
+        P: Projection matrix in canonical scale.
+        place: Metres.
+        uv: Pixels.
+        margin_px: By which the silhouette is enlarged on all sides.
+    """
     height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
     stride = place[STRIDE] if len(place) > STRIDE.start else None
-    return presence(P, place[:2], height, width, uv, config.spread_px, stride)
+    return presence(P, place[:2], height, width, uv, config.spread_px + margin_px, stride)
 
 
 def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -191,5 +206,22 @@ def shares_seen(
     def in_camera(P, view, free):
         mine = presence_of(scene.config, P, place, view.window.uv)
         return jnp.sum(mine * free * view.visible) / jnp.maximum(jnp.sum(mine), 1e-6)
+
+    return jax.vmap(in_camera)(scene.projections(), views, unexplained)
+
+
+def crowding(
+    scene: PeopleScene, place: Float[Array, " shape"], views: View, unexplained: Float[Array, "cameras samples"]
+) -> Float[Array, " cameras"]:
+    """Share of the surroundings of a silhouette in each camera that is foreground which no other person explains.
+
+    Such foreground is of a person who is not tracked yet, of a shadow or of a reflection.
+    """
+
+    def in_camera(P, view, free):
+        margin_px = AROUND * jnp.sqrt(outline(P, body_of(place)).shape[1, 1])
+        mine = presence_of(scene.config, P, place, view.window.uv)
+        around = presence_of(scene.config, P, place, view.window.uv, margin_px) * (1 - mine) * view.visible
+        return jnp.sum(around * view.foreground * free) / jnp.maximum(jnp.sum(around), 1.0)
 
     return jax.vmap(in_camera)(scene.projections(), views, unexplained)

@@ -11,7 +11,7 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people.fit import MOST_SHIFT_M, Fit, _nearest_first, as_measurement, fit_people
 from jaxfilters.trackers.people.state import HEIGHT, STATE, CameraFrame, PeopleConfig
-from jaxfilters.trackers.people.tracker import people_scene, updated
+from jaxfilters.trackers.people.tracker import MOST_CROWDING, people_scene, updated
 
 pytestmark = pytest.mark.system
 
@@ -38,7 +38,11 @@ def parabolas(seed, n):
     steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
     place, axes, shift = jnp.asarray(place), jnp.asarray(axes), jnp.zeros((n, 1, 2))
     share = none[:, None]
-    return Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, share, none, none, share), mean, precision
+    return (
+        Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, share, none, none, share, share),
+        mean,
+        precision,
+    )
 
 
 @pytest.mark.usefixtures("x64")
@@ -128,11 +132,21 @@ def test_heights_are_measured_of_whole_silhouettes_only(found, camera, floor):
     scene = people_scene([camera], floor, config=PeopleConfig(capacity=SLOTS, spread_px=0.0))
     mean = jnp.zeros((SLOTS, STATE)).at[0, :6].set(jnp.array([*(PLACES[0][:2] + OFF_M[0]), 0, 0, 1.72, 0.45]))
     before = Gaussian(mean, jnp.broadcast_to(0.01 * jnp.eye(STATE), (SLOTS, STATE, STATE)))
-    for share, is_measured in ((0.93, False), (0.97, True)):
-        after, _ = updated(scene, before, fit._replace(shares_seen=jnp.full((SLOTS, 1), share)), jnp.array(0.1))
+    full = lambda value: jnp.full((SLOTS, 1), value)
+    for share, crowding, is_measured in ((0.93, 0.2, False), (0.97, 0.2, True), (0.97, 0.4, False)):
+        given = fit._replace(shares_seen=full(share), crowding=full(crowding))
+        after, _ = updated(scene, before, given, jnp.array(0.1))
         moved = np.abs(np.asarray(after.mean - mean))[0]
         assert (moved[HEIGHT] > 0.005) == is_measured
         assert np.linalg.norm(moved[:2]) > 0.02
+
+
+def test_a_silhouette_is_crowded_by_a_person_who_is_not_tracked(found):
+    """The third stands before the second and explains what is drawn there; the first is alone."""
+    run, *_ = found
+    assert run({0: 0}).crowding[0] < MOST_CROWDING
+    assert run({1: 1}).crowding[1] > MOST_CROWDING
+    assert run({1: 1, 2: 2}).crowding[1] < MOST_CROWDING
 
 
 def test_slots_mean_nothing_to_the_search(found):

@@ -49,6 +49,7 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf, share_in_view=1.0):
         full(0),
         full(surplus),
         full(share_in_view)[:, None],
+        full(0)[:, None],
     )
 
 
