@@ -160,6 +160,18 @@ ON_RECORDINGS = (
     ),
     *(
         Row(
+            "fingertips",
+            "both, changed in thirteen ways: turned, mirrored, in other light",
+            quantity,
+            "a threshold in colour, gaps of the convex hull",
+            "fingertips-changed",
+            metric,
+            f"{metric}_simple",
+        )
+        for quantity, metric in (("found, higher is better", "found_pct"), ("false", "false_pct"))
+    ),
+    *(
+        Row(
             "symbols",
             recording,
             "right, higher is better",
