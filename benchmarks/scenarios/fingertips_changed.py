@@ -22,7 +22,6 @@ from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.benchmarks.scenarios import _marked_tips as marked_tips
 from jaxfilters.benchmarks.scenarios._marked_tips import Count
 
-SHARES = ("found_pct", "false_pct")
 NOISE_SD = 8.0
 """Of every colour of every pixel, grey levels."""
 QUICK_CHANGES, QUICK_FRAMES = 2, 60
@@ -52,10 +51,10 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
         metrics[f"names_per_finger_{name}"] = Metric(ways[""][-1]["names_per_finger"], "", "lower")
         sys.stderr.write(f"  {name}: {ways[''][-1]}\n")
     for way, of_all in ways.items():
-        found, false = (np.array([one[share] for one in of_all]) for share in SHARES)
-        metrics |= _shares({"found_pct": float(found.mean()), "false_pct": float(false.mean())}, way)
-        metrics[f"found_pct_least{way}"] = Metric(float(found.min()), "%", "higher")
-        metrics[f"false_pct_most{way}"] = Metric(float(false.max()), "%", "lower")
+        shares = {share: [one[share] for one in of_all] for share in ("found_pct", "false_pct")}
+        metrics |= _shares({share: float(np.mean(values)) for share, values in shares.items()}, way)
+        metrics[f"found_pct_least{way}"] = Metric(min(shares["found_pct"]), "%", "higher")
+        metrics[f"false_pct_most{way}"] = Metric(max(shares["false_pct"]), "%", "lower")
     return metrics
 
 
@@ -102,8 +101,8 @@ def turned(size: tuple[int, int], degrees: float) -> Motion:
     quarter = degrees % 180 == 90
     new = size[::-1] if quarter else size
     matrix = cv2.getRotationMatrix2D(((size[0] - 1) / 2, (size[1] - 1) / 2), degrees, 1.0)
-    matrix[:, 2] += (np.array(new) - size) / 2
-    return Motion(matrix, (new[0], new[1]))
+    middle = (np.array(new) - np.array(size)) / 2
+    return Motion(matrix + np.pad(middle[:, None], ((0, 0), (2, 0))), (new[0], new[1]))
 
 
 def mirrored(size: tuple[int, int]) -> Motion:
@@ -148,7 +147,8 @@ def backwards(video: Changed) -> Changed:
 def total(counts: list[Count]) -> Count:
     """Of several videos; a finger's number of names is the largest of one video."""
     names = {name: max((count.names[name] for count in counts), key=len) for name in counts[0].names}
-    return Count(*(sum(column) for column in zip(*(count[:4] for count in counts), strict=True)), names)
+    marked, found, reported, false = (sum(column) for column in zip(*(count[:4] for count in counts), strict=True))
+    return Count(marked, found, reported, false, names)
 
 
 def _each(change: Callable[[Image], Image]) -> Callable[[Changed], Changed]:
