@@ -31,6 +31,16 @@ def test_a_mark_is_where_the_changed_image_has_what_is_marked(name):
     assert len(u) == pytest.approx(25 * scale**2, abs=8 * scale)
 
 
+def test_quarter_turns_and_mirrored_images_have_all_pixels_where_numpy_has_them():
+    video = marked_video()
+    images = [np.random.default_rng(0).integers(0, 256, image.shape, np.uint8) for image in video.images]
+    changes = fingertips_changed.changes(0)
+    for turns in (1, 2, 3):
+        found = changes[f"turned_{90 * turns}"](video._replace(images=images)).images
+        np.testing.assert_array_equal(found[0], np.rot90(images[0], turns))
+    np.testing.assert_array_equal(changes["mirrored"](video._replace(images=images)).images[0], images[0][:, ::-1])
+
+
 def test_backwards_has_the_marks_of_the_opposite_frames():
     video = marked_video()
     video.marks["frames"]["0"] = {"tips": {}, "cut": {"thumb": [1, 2]}}
