@@ -5,12 +5,12 @@ background comes from the recording, and everybody is followed, as by `jaxfilter
 `jaxfilters track people`. Truth are the places on the floor below the annotated boxes, where these stand whole in the
 image and on the part of the floor that is tracked. Where a nearer person hides the feet, the annotated box ends above
 them; such places are on the line from the last one before to the next one after. `walker` is the one who walks alone
-through the corridor with feet in the image. Scores change by 10 with rounding at this distance: they are means over
-three runs, in two of which the grey levels of all images are changed by one at random; `mota_least` and `mota_most` are
-those of single runs. `_mirrored`, `_backwards` and `_mirrored_backwards` are the same recording with left and right
-exchanged, with its images in the opposite order, and both, two runs each; `mota_four_ways` is the mean of the four.
-`_simple` is without a tracker: blobs that differ from the background, projected back to the floor and linked to the
-nearest.
+through the corridor with feet in the image. Scores change by 10 to 40 with rounding at this distance: they are means
+over three runs, in two of which the grey levels of all images are changed by one at random; `mota_least` and
+`mota_most` are those of single runs. `_mirrored`, `_backwards` and `_mirrored_backwards` are the same recording with
+left and right exchanged, with its images in the opposite order, and both, two runs each; `mota_four_ways` is the mean
+of the four. `_simple` is without a tracker: blobs that differ from the background, projected back to the floor and
+linked to the nearest.
 """
 
 import csv
@@ -191,7 +191,7 @@ def hidden_feet(frame: np.ndarray, feet: np.ndarray, boxes: np.ndarray) -> np.nd
 
     Where a person is hidden in part, the annotated box ends where the person begins who hides.
     """
-    (low_u, low_v), (high_u, high_v) = (np.split(boxes.T, 2)[i] for i in (0, 1))
+    low_u, low_v, high_u, high_v = boxes.T
     u, v = feet.T[:, :, None]
     inside = (u > low_u) & (u < high_u) & (v > low_v) & (v < high_v) & (frame[:, None] == frame)
     return np.any(inside, axis=1)

@@ -34,8 +34,8 @@ class PeopleConfig:
     silhouette_bias_m: float = 0.04
     """Standard deviation of what shape, clothes and thresholds displace feet, head and sides for seconds."""
     silhouette_bias_px: float = 2.0
-    """The same in pixels, of edges and lenses. With 1.25 the places of PETS are as good, and groups far from the camera
-    of CAVIAR's corridor keep the errors of their first frames."""
+    """The same in pixels, of edges and lenses. With 1.25 the places of PETS are as accurate, but two standard
+    deviations across the line of sight cover 89 % of its frames in place of 97 %."""
     silhouette_bias_s: float = 5.0
     """Time in which these displacements change."""
     spread_px: float = 0.75
