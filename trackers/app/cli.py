@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # What computes is imported by the commands: `--help` answers at once, and the number of devices is set by now.
     try:
         with ended_by_signals():
+            import_module("jaxfilters.trackers.app.opencv").check_version()
             if options.command in ("track", "demo"):
                 check_free(options.out)
                 if options.rerun is not None:

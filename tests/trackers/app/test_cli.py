@@ -184,6 +184,15 @@ def test_wrong_arguments_exit_with_two(arguments, message, capsys):
     assert message in error
 
 
+def test_opencv_5_is_refused_with_the_way_to_install_the_right_version(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(cv2, "__version__", "5.0.0")
+    assert run("demo", "--out", tmp_path / "out") == 2
+    line = capsys.readouterr().err
+    assert line.startswith("jaxfilters: error: OpenCV 5.0.0 is installed, and OpenCV 4 is needed: ")
+    assert "pip install --force-reinstall 'opencv-python-headless<5'" in line
+    assert not (tmp_path / "out").exists()
+
+
 def test_bench_is_passed_on(capsys):
     assert run("bench", "no-such-scenario") == 2
     assert "no-such-scenario" in capsys.readouterr().err
