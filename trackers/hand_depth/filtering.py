@@ -37,7 +37,8 @@ MAX_ERROR = 0.1
 """c_max of the paper, metres."""
 SIGMA = 3e-4
 """Scale of the cost, metres: of a mean over thousands of pixels, far below that of one pixel."""
-TEMPERED_SHARE = 0.02
+TEMPERED_SHARE = 0.06
+"""Of the particles that stay effective in a frame: with fewer, what a frame does not show moves with the luck of a few."""
 FEWEST_PIXELS = 50
 """Hand pixels in the window below which nothing is there."""
 LOST_COST = 0.07
@@ -63,11 +64,12 @@ _WIDE = _rate(0.008, 3.667, 12.0)
 """A real hand: a joint may move 35 mm from one frame to the next."""
 UNGUIDED_MOTION = HandMotion(_WIDE, _rate(0.04, 11.46, 24.0), per_coordinate(0.0, 0.0, 1 / 0.3))
 """So wide that each frame may jump; joint velocities are damped over 0.3 s."""
-MOTION = HandMotion(_rate(0.0038, 1.94, 3.4), _rate(0.02, 8.0, 12.0), per_coordinate(1 / 0.68, 1 / 0.68, 1 / 0.47))
-"""Between jumps, of a pose with a velocity and without: twice the standard deviations of the random walk, and up to
-two and a half times those of the velocity, that have the largest likelihood for the true motions of the development,
-with the time constants of that."""
-JUMP_SHARE, DOUBTFUL_JUMP_SHARE = 0.4, 0.98
+MOTION = HandMotion(_rate(0.0027, 1.37, 2.4), _rate(0.02, 8.0, 12.0), per_coordinate(1 / 0.59, 1 / 0.46, 1 / 0.40))
+"""Between jumps, of a pose with a velocity and without. The time constants predict the true motions of the development
+best, 1 to 10 frames ahead (likelihood of a pose with white error, of its walk and of its velocity). The random walk is
+two to seven times as wide as it is there, the velocity up to 1.7 times: with a narrower walk the hand that is observed
+is followed less well, with a wider one its velocity is less known when fingers are hidden."""
+JUMP_SHARE, DOUBTFUL_JUMP_SHARE = 0.2, 0.98
 """Probability of a jump as wide as `_WIDE` from one frame to the next; and while another pose explains the frames about
 as well, which the ensemble is to reach."""
 UNGUIDED_START_STD = per_coordinate(0.005, 0.04, math.radians(5))
