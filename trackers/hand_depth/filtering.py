@@ -38,7 +38,7 @@ MAX_ERROR = 0.1
 SIGMA = 3e-4
 """Scale of the cost, metres: of a mean over thousands of pixels, far below that of one pixel."""
 TEMPERED_SHARE = 0.06
-"""Of the particles that stay effective in a frame: with fewer, what a frame does not show moves with the luck of a few."""
+"""Of the particles that stay effective in a frame: with fewer, what a frame does not show moves as a few of them do."""
 FEWEST_PIXELS = 50
 """Hand pixels in the window below which nothing is there."""
 LOST_COST = 0.07

@@ -7,12 +7,13 @@ from itertools import combinations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.observation import crop
-from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
+from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics, hand_center
 from jaxfilters.models.hand.start import BATCH, SCALES, SEARCH_RADIUS, Start, costs_of, find_starts, registered
+from jaxfilters.models.rendering.depth import capsule_depth
 from jaxfilters.trackers.hand_depth.detect import NEAREST, Sighting, hand_sightings
 from jaxfilters.trackers.hand_depth.filtering import (
     WINDOW,
@@ -43,6 +44,13 @@ DOUBTFUL_COST = 0.024
 """Metres, as `Start.cost`, above which a start explains the frame too badly to be believed."""
 WORST_START = 0.032
 """Metres, likewise, above which nothing is believed to be a hand."""
+
+
+LEAST_READ = 0.75
+"""Share of what the tracked hand shows that needs readings for a race. Where fingers are hidden, many other poses
+explain the rest as well, which says nothing against the track."""
+HOLE = 5
+"""Pixels of the window, rows and columns: what has a reading among so many about it is not hidden."""
 
 
 def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
@@ -87,7 +95,8 @@ def _starts(setup: Setup, state: TrackState, sightings: list[Sighting]) -> list[
 def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
     """Let new starts compete with the track on one frame: the better one goes on, in doubt if they differ in vain.
 
-    They look where the track is. A track that lost the hand altogether is lost by its own cost, and searched for.
+    They look where the track is. A track that lost the hand altogether is lost by its own cost, and searched for. While
+    much of the hand is hidden, the race is put off.
     """
     pose, _ = pose_moments(*particles_of(state.ensemble))
     scale, side = float(state.scale), float(state.side)
@@ -97,6 +106,8 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
     image = filled(jnp.asarray(frame), state.missing_is_background)
     camera, window = _cropped(setup.compiled(), image, jnp.asarray(palm))
     average = setup.likelihood.geometry
+    if _share_read(camera, window, pose, average, state.scale, state.side) < LEAST_READ:
+        return state._replace(race_time=jnp.asarray(time + SECOND_CHANCE, dtype=float))
     track = registered(camera, window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
     starts = find_starts(camera, window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
@@ -148,6 +159,16 @@ def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]
     return crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
 
 
+@jax.jit
+def _share_read(
+    camera: Pinhole, observed: Array, pose: Array, average: HandGeometry, scale: Array, side: Array
+) -> Float[Array, ""]:
+    """Of the pixels of an image in which a hand would show, those that have a reading close by."""
+    read = jax.lax.reduce_window(~jnp.isnan(observed), False, jax.lax.bitwise_or, (HOLE, HOLE), (1, 1), "SAME")
+    shown = jnp.isfinite(capsule_depth(camera, _kinematics(pose, average, scale, side).capsules))
+    return jnp.sum(shown & read) / jnp.maximum(jnp.sum(shown), 1)
+
+
 def _distance(average: HandGeometry, one: Start, other: Start) -> float:
     """Between the joints of two hands, metres, in the mean."""
     joints = [np.asarray(_joints(np.asarray(each.pose), average, each.scale, each.side)) for each in (one, other)]
@@ -156,5 +177,8 @@ def _distance(average: HandGeometry, one: Start, other: Start) -> float:
 
 @jax.jit
 def _joints(pose: Array, average: HandGeometry, scale: Array, side: Array) -> Array:
-    geometry = replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype))
-    return forward_kinematics(pose, geometry).joints
+    return _kinematics(pose, average, scale, side).joints
+
+
+def _kinematics(pose: Array, average: HandGeometry, scale: Array, side: Array) -> HandKinematics:
+    return forward_kinematics(pose, replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype)))

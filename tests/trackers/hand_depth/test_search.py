@@ -51,6 +51,27 @@ def test_a_hand_upside_down_on_the_forearm_must_explain_the_fingers_too(monkeypa
     np.testing.assert_allclose(found.mean(axis=0), np.asarray(true.joints).mean(axis=0), atol=0.01)
 
 
+def test_a_race_waits_while_the_fingers_are_hidden_but_not_for_small_holes(monkeypatch):
+    camera, wrist = kinect_v2(), jnp.array([0.0, 0.05, 0.6])
+    true = forward_kinematics(open_palm(wrist), anatomical_hand())
+    shown = np.asarray(jax.jit(render_capsules)(camera, true.capsules))
+    frame = np.where(np.isfinite(shown), shown, 1.5).astype(np.float32)
+    knuckle = int(camera.project(true.joints[9])[1])
+    hidden = np.where(np.arange(len(frame))[:, None] < knuckle, np.nan, frame)
+    setup = hand_depth.set_up(camera, HandDepthConfig(num_particles=64))
+    start = Start(np.asarray(open_palm(wrist), np.float32), 1.0, 1.0, 0.005)
+    monkeypatch.setattr(search, "find_starts", lambda *_: [start])
+    state = hand_depth.build(camera, setup.config).init(jax.random.key(0), frame)
+    raced = []
+    monkeypatch.setattr(search, "find_starts", lambda *_: raced.append(True) or [])
+    after = search.race(setup, state, hidden, 1.0)
+    assert not raced
+    assert float(after.race_time) == pytest.approx(1.0 + search.SECOND_CHANCE)
+    holes = np.where(np.arange(frame.size).reshape(frame.shape) % 2, np.nan, frame)
+    search.race(setup, state, holes, 1.0)
+    assert len(raced) == 1
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(("number", "quarters"), [(2, 2), (4, 1), (4, 3)])
 def test_the_hand_of_a_real_arm_is_found_however_the_camera_is_turned(data_dir, number, quarters):
