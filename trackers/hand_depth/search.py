@@ -44,8 +44,6 @@ DOUBTFUL_COST = 0.024
 """Metres, as `Start.cost`, above which a start explains the frame too badly to be believed."""
 WORST_START = 0.032
 """Metres, likewise, above which nothing is believed to be a hand."""
-
-
 LEAST_READ = 0.75
 """Share of what the tracked hand shows that needs readings for a race. Where fingers are hidden, many other poses
 explain the rest as well, which says nothing against the track."""
