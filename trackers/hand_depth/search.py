@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.observation import crop
-from jaxfilters.models.hand.skeleton import HandGeometry, HandKinematics, forward_kinematics, hand_center
+from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
 from jaxfilters.models.hand.start import BATCH, SCALES, SEARCH_RADIUS, Start, costs_of, find_starts, registered
 from jaxfilters.models.rendering.depth import capsule_depth
 from jaxfilters.trackers.hand_depth.detect import NEAREST, Sighting, hand_sightings
@@ -103,9 +103,9 @@ def race(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> Tra
         return state._replace(race_time=jnp.asarray(time + RACE_INTERVAL, dtype=float))
     image = filled(jnp.asarray(frame), state.missing_is_background)
     camera, window = _cropped(setup.compiled(), image, jnp.asarray(palm))
-    average = setup.likelihood.geometry
-    if _share_read(camera, window, pose, average, state.scale, state.side) < LEAST_READ:
+    if _share_read(setup.compiled(), camera, window, pose, state.scale, state.side) < LEAST_READ:
         return state._replace(race_time=jnp.asarray(time + SECOND_CHANCE, dtype=float))
+    average = setup.likelihood.geometry
     track = registered(camera, window, palm, average, Start(np.asarray(pose), scale, side, math.nan))
     sizes = (scale,) if setup.config.scale else (0.92 * scale, scale, 1.08 * scale)
     starts = find_starts(camera, window, palm, average, sizes, (1.0, -1.0), NUM_RACING)
@@ -159,11 +159,12 @@ def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]
 
 @jax.jit
 def _share_read(
-    camera: Pinhole, observed: Array, pose: Array, average: HandGeometry, scale: Array, side: Array
+    setup: Setup, camera: Pinhole, observed: Array, pose: Array, scale: Array, side: Array
 ) -> Float[Array, ""]:
     """Of the pixels of an image in which a hand would show, those that have a reading close by."""
     read = jax.lax.reduce_window(~jnp.isnan(observed), False, jax.lax.bitwise_or, (HOLE, HOLE), (1, 1), "SAME")
-    shown = jnp.isfinite(capsule_depth(camera, _kinematics(pose, average, scale, side).capsules))
+    hand = forward_kinematics(pose, setup.sized(scale, side).geometry)
+    shown = jnp.isfinite(capsule_depth(camera, hand.capsules))
     return jnp.sum(shown & read) / jnp.maximum(jnp.sum(shown), 1)
 
 
@@ -175,8 +176,5 @@ def _distance(average: HandGeometry, one: Start, other: Start) -> float:
 
 @jax.jit
 def _joints(pose: Array, average: HandGeometry, scale: Array, side: Array) -> Array:
-    return _kinematics(pose, average, scale, side).joints
-
-
-def _kinematics(pose: Array, average: HandGeometry, scale: Array, side: Array) -> HandKinematics:
-    return forward_kinematics(pose, replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype)))
+    geometry = replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype))
+    return forward_kinematics(pose, geometry).joints
