@@ -2,7 +2,7 @@
 
 import csv
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -88,21 +88,29 @@ def _locals(reference: Float[Array, "t 22"], poses: Float[Array, "t 22"]) -> Flo
     return jax.vmap(local)(reference, poses)
 
 
-def run_all(
-    filters: dict[str, dict[str, Filtering]], seeds: Iterable[int], num_frames: int | None
-) -> Iterator[tuple[list[Run], Track]]:
-    """Every filter of `filters[data]` on a recording of `data` for each seed, data by data within a seed.
+def run_all(filters: dict[str, Filtering], data: str, seed: int, num_frames: int | None) -> tuple[list[Run], Track]:
+    """Every filter on one recording of `data`.
 
     The recording and the random numbers of the filters depend on the seed alone, so that results can be paired.
     """
-    for seed in seeds:
-        recording_key, filter_key = jax.random.split(jax.random.key(seed))
-        for data, chosen in filters.items():
-            truth = simulate_sequence(recording_key, data, num_frames=num_frames)
-            frames = depth_from_millimetres(truth.depth_mm)
-            estimates = {name: jax.block_until_ready(f(filter_key, frames)) for name, f in chosen.items()}
-            runs = [evaluate(data, name, seed, estimate, truth) for name, estimate in estimates.items()]
-            yield runs, Track(truth._replace(depth_mm=truth.depth_mm[:0]), estimates)
+    recording_key, filter_key = jax.random.split(jax.random.key(seed))
+    truth = simulate_sequence(recording_key, data, num_frames=num_frames)
+    frames = depth_from_millimetres(truth.depth_mm)
+    estimates = {name: jax.block_until_ready(filter(filter_key, frames)) for name, filter in filters.items()}
+    runs = [evaluate(data, name, seed, estimate, truth) for name, estimate in estimates.items()]
+    return runs, Track(truth._replace(depth_mm=truth.depth_mm[:0]), estimates)
+
+
+def as_arrays(runs: list[Run]) -> dict[str, np.ndarray]:
+    """(runs,) values of each field, for a file."""
+    return {field.name: np.array([getattr(run, field.name) for run in runs]) for field in dataclasses.fields(Run)}
+
+
+def from_arrays(arrays: dict[str, np.ndarray]) -> list[Run]:
+    """The runs of which `as_arrays` made these."""
+    return [
+        Run(*(arrays[field.name][i].item() for field in dataclasses.fields(Run))) for i in range(len(arrays["seed"]))
+    ]
 
 
 def append_csv(path: Path, runs: list[Run]) -> None:

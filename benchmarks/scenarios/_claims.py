@@ -36,6 +36,22 @@ class Claims(NamedTuple):
     recordings: list[Recording]
 
 
+def as_arrays(claims: Claims) -> dict[str, np.ndarray]:
+    """All of the claims, for a file."""
+    arrays = {"name": np.array([claims.system, claims.data]), "coordinates": np.array(claims.coordinates)}
+    for i, recording in enumerate(claims.recordings):
+        parts = recording._asdict().items()
+        arrays |= {f"{part}_{i}": np.asarray(values) for part, values in parts if values is not None}
+    return arrays
+
+
+def from_arrays(arrays: dict[str, np.ndarray]) -> Claims:
+    """The claims of which `as_arrays` made these."""
+    count = sum(name.startswith("errors_") for name in arrays)
+    recordings = [Recording(*(arrays.get(f"{part}_{i}") for part in Recording._fields)) for i in range(count)]
+    return Claims(*map(str, arrays["name"]), tuple(map(str, arrays["coordinates"])), recordings)
+
+
 class Scores(NamedTuple):
     """Of one system on one kind of data; arrays have one number a coordinate."""
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios import _real_hands
@@ -57,24 +58,31 @@ Follow = Callable[[HandRecording, int], float]
 """`(recording, seed) -> mean joint error in millimetres`, NaN where nothing was estimated."""
 
 
-def real_metrics(num_particles: int, quick: bool) -> dict[str, Metric]:
-    """Errors on the motions that nothing was chosen on, and on that of a camera; nothing where they are not there."""
+def real_metrics(num_particles: int, quick: bool, kept: Finished) -> dict[str, Metric]:
+    """Errors on the motions that nothing was chosen on, and on that of a camera; nothing where they are not there.
+
+    Args:
+        num_particles: Of both filters.
+        quick: Whether few recordings, seeds and frames are enough.
+        kept: Where the errors on each recording are kept.
+    """
     try:
         recordings = _recordings(quick)
     except RecordingError as error:
         sys.stderr.write(f"real hands left out: {error}\n")
         return {}
     seeds = range(1 if quick else NUM_SEEDS)
-    cases = {"": _errors_of_all(num_particles, recordings, seeds)}
-    for every in QUICK_EVERY if quick else EVERY:
-        cases[f"_every_{every}"] = _errors_of_all(num_particles, _recordings(quick, every), seeds)
-    cases["_hidden"] = _errors_of_all(num_particles, _hidden(quick), seeds)
+    of_cases = {"": recordings}
+    of_cases |= {f"_every_{every}": _recordings(quick, every) for every in (QUICK_EVERY if quick else EVERY)}
+    of_cases["_hidden"] = _hidden(quick)
+    cases = {case: _errors_of_all(num_particles, of_case, seeds, case, kept) for case, of_case in of_cases.items()}
     found: dict[str, Metric] = {}
     for case, errors in (cases | {"_all_cases": _over_all(cases)}).items():
         found |= _metrics(errors, case)
     for count in QUICK_COUNTS if quick else COUNTS:
         follow = partial(tracker_error, "rbpf", count)
-        each = cases[""]["rbpf"] if count == num_particles else errors_of(follow, recordings, seeds)
+        name = f"rbpf_n{count}"
+        each = cases[""]["rbpf"] if count == num_particles else _errors(follow, recordings, seeds, name, kept)
         found[f"errors_by_n_real_rbpf_n{count}"] = Metric(float(each.mean()), "mm", "lower")
     return found
 
@@ -107,13 +115,15 @@ def with_hidden_fingers(recording: HandRecording) -> HandRecording:
     return recording._replace(depth=depth, joints=np.where(hidden[:, None, None], recording.joints, np.nan))
 
 
-def _errors_of_all(num_particles: int, recordings: list[HandRecording], seeds: range) -> dict[str, np.ndarray]:
+def _errors_of_all(
+    num_particles: int, recordings: list[HandRecording], seeds: range, case: str, kept: Finished
+) -> dict[str, np.ndarray]:
     ways: dict[str, Follow] = {
         "rbpf": partial(tracker_error, "rbpf", num_particles),
         "pf": partial(tracker_error, "pf", num_particles),
         "registration": registration_error,
     }
-    return {name: errors_of(follow, recordings, seeds) for name, follow in ways.items()}
+    return {name: _errors(follow, recordings, seeds, f"{name}{case}", kept) for name, follow in ways.items()}
 
 
 def _metrics(errors: dict[str, np.ndarray], case: str) -> dict[str, Metric]:
@@ -129,9 +139,14 @@ def _metrics(errors: dict[str, np.ndarray], case: str) -> dict[str, Metric]:
     return found
 
 
-def errors_of(follow: Follow, recordings: list[HandRecording], seeds: range) -> np.ndarray:
-    """(recordings,) millimetres, the mean over the seeds."""
-    return np.array([np.mean([follow(recording, seed) for seed in seeds]) for recording in recordings])
+def _errors(follow: Follow, recordings: list[HandRecording], seeds: range, name: str, kept: Finished) -> np.ndarray:
+    """(recordings,) millimetres, the mean over the seeds; kept with the name and the number of the recording."""
+
+    def of_seeds(recording: HandRecording) -> dict[str, np.ndarray]:
+        return {"mm": np.array([follow(recording, seed) for seed in seeds])}
+
+    each = [kept.arrays(f"real_{name}_{i}", partial(of_seeds, one)) for i, one in enumerate(recordings)]
+    return np.array([errors["mm"].mean() for errors in each])
 
 
 def tracker_error(filter: str, num_particles: int, recording: HandRecording, seed: int) -> float:

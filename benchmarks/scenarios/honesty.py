@@ -7,9 +7,11 @@ all coordinates together: the normalised error squared with its band for as many
 the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is right; `log_score_gain_` is
 what the claim is better than the constant. Last come three filters of the same detected key points, whose errors are
 taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of
-each. Systems whose recordings are missing are named and left out.
+each, and a run that was cut off goes on there after the last system that it had finished. Systems whose recordings are
+missing are named and left out.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -19,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
@@ -30,7 +33,16 @@ from jaxfilters.benchmarks.scenarios import (
     head_real,
     people_pets,
 )
-from jaxfilters.benchmarks.scenarios._claims import Claims, Recording, draw_calibration, judge, metrics_of, table
+from jaxfilters.benchmarks.scenarios._claims import (
+    Claims,
+    Recording,
+    as_arrays,
+    draw_calibration,
+    from_arrays,
+    judge,
+    metrics_of,
+    table,
+)
 from jaxfilters.benchmarks.scenarios._head_runs import HeadRun, follow
 from jaxfilters.benchmarks.scenarios._keypoint_filters import MODELS, Keypoints
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, follow_all, talking_head
@@ -65,9 +77,10 @@ SETTLED = 30
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Run all systems, print the table, return its numbers."""
     evaluated, metrics = [], dict[str, Metric]()
+    kept = Finished(out, scenario="honesty", quick=quick, seed=seed)
     for name, claims_of in SYSTEMS.items():
         try:
-            found = claims_of(quick, seed)
+            found = _measured_once(kept, name, partial(claims_of, quick, seed))
         except RecordingError as error:
             sys.stderr.write(f"  left out: {name} ({error})\n")
             continue
@@ -82,6 +95,10 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
             draw_calibration(out, found, scores)
     sys.stderr.write(f"{table(evaluated)}\n")
     return metrics
+
+
+def _measured_once(kept: Finished, name: str, claims_of: Callable[[], Claims]) -> Claims:
+    return from_arrays(kept.arrays("_".join(re.findall(r"\w+", name)), lambda: as_arrays(claims_of())))
 
 
 def stereo_claims(quick: bool, seed: int) -> Claims:

@@ -8,17 +8,20 @@ wide as what the Rao-Blackwellized one draws (`pf_wide`), the tracker with its g
 registration alone from its start (`registration`). Errors are means after the first ten frames; p-values are those of
 one-sided paired Wilcoxon signed-rank tests over the seeds. Then the tracker with either filter, and registration alone,
 on real hands (`_real_comparison`). A folder given with `--out` receives every run as it finishes, the tables, and
-plots.
+plots; a run that was cut off goes on there after the last recording that it had finished.
 """
 
+import itertools
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from jaxfilters.benchmarks.environment import environment
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _hand_filters as hand
 from jaxfilters.benchmarks.scenarios._accuracy import (
@@ -28,7 +31,9 @@ from jaxfilters.benchmarks.scenarios._accuracy import (
     Run,
     Track,
     append_csv,
+    as_arrays,
     column,
+    from_arrays,
     p_value_better,
     run_all,
 )
@@ -68,11 +73,13 @@ def run(
     num_seeds = num_seeds or (QUICK_NUM_SEEDS if quick else NUM_SEEDS)
     num_frames = num_frames or (QUICK_NUM_FRAMES if quick else None)
     _say(out, _preamble(num_particles, num_seeds, num_frames))
-    times = _measure_times(quick, seed, out)
-    variants = _measure_variants(num_particles, quick, seed, out)
-    runs = _measure_accuracy(_filters(num_particles, quick), range(seed, seed + num_seeds), num_frames, out)
+    kept = Finished(out, scenario="pf-vs-rbpf", quick=quick, num_particles=num_particles, num_frames=num_frames)
+    times = kept.metrics(f"times_{seed}", lambda: time_metrics(_measure_times(quick, seed, out)))
+    variants = kept.metrics(f"variants_{seed}", lambda: _measure_variants(num_particles, quick, seed, out))
+    seeds = range(seed, seed + num_seeds)
+    runs = _measure_accuracy(_filters(num_particles, quick), seeds, num_frames, out, kept)
     _say(out, _accuracy_table(runs))
-    return time_metrics(times) | variants | accuracy_metrics(runs) | real_metrics(num_particles, quick)
+    return times | variants | accuracy_metrics(runs) | real_metrics(num_particles, quick, kept)
 
 
 def time_metrics(times: dict[int, StepTimes]) -> dict[str, Metric]:
@@ -183,20 +190,34 @@ def _measure_variants(num_particles: int, quick: bool, seed: int, out: Path | No
 
 
 def _measure_accuracy(
-    filters: dict[str, dict[str, Filtering]], seeds: range, num_frames: int | None, out: Path | None
+    filters: dict[str, dict[str, Filtering]], seeds: range, num_frames: int | None, out: Path | None, kept: Finished
 ) -> list[Run]:
     runs: list[Run] = []
-    begin, drawn = time.monotonic(), set()
-    for new, track in run_all(filters, seeds, num_frames):
+    begin = time.monotonic()
+    for seed, (data, chosen) in itertools.product(seeds, filters.items()):
+        folder_of_plots = out if seed == seeds.start else None
+        measure = partial(_measure_recording, chosen, data, seed, num_frames, out, folder_of_plots)
+        new = from_arrays(kept.arrays(f"data_{data}_{seed}", measure))
         runs += new
-        if out is not None:
-            append_csv(out / "runs.csv", new)
-            if new[0].data not in drawn:
-                drawn.add(new[0].data)
-                _plot(out, new[0].data, track)
         errors = "  ".join(f"{one.filter} {one.joint_mm:.1f}" for one in new)
-        _report(f"[{time.monotonic() - begin:5.0f} s] seed {new[0].seed} data {new[0].data}, mm: {errors}")
+        _report(f"[{time.monotonic() - begin:5.0f} s] seed {seed} data {data}, mm: {errors}")
     return runs
+
+
+def _measure_recording(
+    filters: dict[str, Filtering],
+    data: str,
+    seed: int,
+    num_frames: int | None,
+    out: Path | None,
+    folder_of_plots: Path | None,
+) -> dict[str, np.ndarray]:
+    runs, track = run_all(filters, data, seed, num_frames)
+    if out is not None:
+        append_csv(out / "runs.csv", runs)
+    if folder_of_plots is not None:
+        _plot(folder_of_plots, data, track)
+    return as_arrays(runs)
 
 
 def _plot(out: Path, data: str, track: Track) -> None:

@@ -62,6 +62,22 @@ def test_frames_without_estimate_or_claim_do_not_count():
     assert _claims.judge(Claims("s", "d", ("x_m",), [Recording(np.full((3, 1), np.nan), np.ones((3, 1)))])) is None
 
 
+@pytest.mark.parametrize("covariances", [None, np.broadcast_to(np.eye(1), (2, 1, 1))])
+def test_a_system_is_judged_once_in_a_folder(tmp_path, monkeypatch, covariances):
+    ones, calls = np.ones((2, 1)), []
+
+    def one_system(quick, seed):
+        calls.append(seed)
+        return Claims("s", "d", ("x_m",), [Recording(ones, ones, covariances), Recording(3 * ones, ones, covariances)])
+
+    monkeypatch.setattr(honesty, "SYSTEMS", {"a system, some data": one_system})
+    first, second = (honesty.run(quick=True, seed=0, out=tmp_path) for _ in range(2))
+    assert calls == [0]
+    assert first == second
+    assert first["coverage2_s_d_x_m"].value == pytest.approx(50.0)
+    assert first["nees_s_d"].value == pytest.approx(5.0)
+
+
 def test_errors_of_people_are_turned_into_the_line_of_sight():
     """A camera at the origin: a person at (0, 4), estimated 0.3 too far and 0.2 to the right."""
     truth = floor_tracks([0], [7], [(0.0, 4.0)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -172,9 +173,13 @@ def test_every_filter_is_judged_on_every_recording(still, tmp_path, monkeypatch)
     monkeypatch.setattr(pf_vs_rbpf, "measure", lambda *arguments: StepTimes(seconds, 2 * seconds, seconds))
     variants = {"rbpf_mesh_stride2": 4 * seconds, "rbpf_guided": 8 * seconds}
     monkeypatch.setattr(pf_vs_rbpf, "measure_variants", lambda *arguments: variants)
-    monkeypatch.setattr(_accuracy, "simulate_sequence", lambda key, data, num_frames: still)
-    monkeypatch.setattr(pf_vs_rbpf, "real_metrics", lambda num_particles, quick: {})
-    metrics = pf_vs_rbpf.run(quick=True, seed=0, out=tmp_path, num_particles=16, num_seeds=2)
+    filtered = []
+    monkeypatch.setattr(_accuracy, "simulate_sequence", lambda key, data, num_frames: filtered.append(data) or still)
+    monkeypatch.setattr(pf_vs_rbpf, "real_metrics", lambda num_particles, quick, kept: {})
+    run = partial(pf_vs_rbpf.run, quick=True, seed=0, out=tmp_path, num_particles=16)
+    run(num_seeds=1)
+    metrics = run(num_seeds=2)
+    assert filtered == ["A", "B"] * 2  # the second run takes the first seed from the folder
     value = {name: metric.value for name, metric in metrics.items()}
     for data, (name, millimetres) in itertools.product("ab", SHIFTS_MM.items()):
         name, cost, _ = name.partition("_paper_cost")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios import _real_comparison, _real_hands, hand_starts
 from jaxfilters.models.camera import Pinhole
@@ -126,7 +127,7 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     monkeypatch.setattr(_real_comparison, "_hidden", lambda quick: recordings[1:])
     monkeypatch.setattr(_real_comparison, "registration_error", lambda each, seed: error_of("registration", each, 1e9))
     monkeypatch.setattr(_real_comparison, "tracker_error", lambda name, count, each, seed: error_of(name, each, count))
-    found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, quick=True).items()}
+    found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, True, Finished(None)).items()}
     assert found["joint_error_mm_real_rbpf"] == pytest.approx(8.0)
     assert found["joint_error_mm_real_registration"] == pytest.approx(6.0)
     assert found["p_value_rbpf_better_real"] == pytest.approx(1 / 32)  # all five pairs fall the same way
@@ -146,4 +147,4 @@ def test_without_recordings_there_is_nothing_to_compare(monkeypatch):
         raise RecordingError("not here")
 
     monkeypatch.setattr(_real_comparison, "_recordings", missing)
-    assert _real_comparison.real_metrics(16, quick=True) == {}
+    assert _real_comparison.real_metrics(16, True, Finished(None)) == {}
