@@ -8,6 +8,7 @@ turned upside down, whose "arm" are the fingers.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfilters._full_precision import dot
+from jaxfilters._xla.compiled_quickly import compiled_lightly
 from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed
@@ -259,7 +261,7 @@ def _refined(image: tuple, tried: Hypotheses, widths: tuple[float, ...]) -> tupl
     return tried._replace(poses=np.concatenate(poses)), np.concatenate(costs)
 
 
-@jax.jit
+@compiled_lightly
 def _refine_batch(
     camera: Pinhole,
     observed: Float[Array, "rows cols"],
@@ -280,17 +282,20 @@ def _refine_each(batch: Hypotheses, shared: tuple) -> tuple[Float[Array, "h 22"]
     scoring_camera, evaluated = _every(SCORING_STRIDE, camera, near)
     root = jnp.diag(per_coordinate(0.06, 0.6, 0.6))
 
-    def refine(pose: Array, scale: Array, side: Array) -> tuple[Array, Array]:
-        hand = replace(geometry.scaled(scale), side=side)
-        target = _without_arm(coarse_camera, coarse, pose)
+    def step(at: Array, start: Array, scale: Array, side: Array, target: Target, width: Array) -> Array:
+        hand, prior = replace(geometry.scaled(scale), side=side), PosePrior(start, root)
+        return gauss_newton(coarse_camera, target, hand, at, prior, width, REGISTRATION)[0]
 
-        def step(i: Array, at: Array) -> Array:
-            return gauss_newton(coarse_camera, target, hand, at, PosePrior(pose, root), widths[i], REGISTRATION)[0]
+    def cost(pose: Array, scale: Array, side: Array) -> Array:
+        hand = forward_kinematics(pose, replace(geometry.scaled(scale), side=side))
+        return explained(scoring_camera, evaluated, hand, pose, scale)
 
-        found = jax.lax.fori_loop(0, num_steps, step, pose)
-        return found, explained(scoring_camera, evaluated, forward_kinematics(found, hand), found, scale)
-
-    return jax.vmap(refine)(*map(jnp.asarray, batch))
+    starts, scales, sides = map(jnp.asarray, batch)
+    targets = jax.vmap(partial(_without_arm, coarse_camera, coarse))(starts)
+    # The loop is around the batch: a loop within it would be traced twice, once for one pose and once for all.
+    steps = jax.vmap(step, (0, 0, 0, 0, 0, None))
+    found = jax.lax.fori_loop(0, num_steps, lambda i, at: steps(at, starts, scales, sides, targets, widths[i]), starts)
+    return found, jax.vmap(cost)(found, scales, sides)
 
 
 def explained(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt16
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import (
     ANGLE_LIMITS,
@@ -47,7 +48,7 @@ FREQUENCY = 0.25
 LARGEST_FLEXION = math.radians(80)
 
 
-@partial(jax.jit, static_argnames=("num_frames", "dt"))
+@partial(compiled_quickly, static_argnames=("num_frames", "dt"))
 def simulate_poses_a(key: AnyKey, num_frames: int = 150, dt: float = FRAME_INTERVAL) -> Float[Array, "{num_frames} 22"]:
     """Data A: a random walk of the pose [66], reflected at the joint limits and at `WRIST_BOUNDS`.
 
@@ -63,7 +64,7 @@ def simulate_poses_a(key: AnyKey, num_frames: int = 150, dt: float = FRAME_INTER
     return jax.lax.scan(advance, pose, jax.random.normal(key, (num_frames, TANGENT_SIZE), pose.dtype))[1]
 
 
-@partial(jax.jit, static_argnames=("num_frames", "dt"))
+@partial(compiled_quickly, static_argnames=("num_frames", "dt"))
 def simulate_poses_b(key: AnyKey, num_frames: int = 150, dt: float = FRAME_INTERVAL) -> Float[Array, "{num_frames} 22"]:
     """Data B: the pose integrates a damped random walk of its velocity [67], reflected at the same bounds as data A.
 
@@ -86,7 +87,7 @@ def simulate_poses_b(key: AnyKey, num_frames: int = 150, dt: float = FRAME_INTER
     return jax.lax.scan(advance, (pose, velocity), noise)[1]
 
 
-@partial(jax.jit, static_argnames=("num_frames", "dt"))
+@partial(compiled_quickly, static_argnames=("num_frames", "dt"))
 def simulate_poses_scripted(
     key: AnyKey, num_frames: int = 240, dt: float = FRAME_INTERVAL
 ) -> Float[Array, "{num_frames} 22"]:

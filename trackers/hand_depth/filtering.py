@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxfilters import weights
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
@@ -149,7 +150,7 @@ class Setup:
         return replace(scaled, surface=scaled.surface.of_side(side))
 
 
-@jax.jit
+@compiled_quickly
 def placed(key: Array, setup: Setup, pose: Array, scale: Array, side: Array) -> Any:
     """An ensemble about a pose of the hand of a size and a side."""
     filter = build_filter(setup, pose, setup.sized(scale, side), jnp.asarray(False))
@@ -198,7 +199,7 @@ def _look(geometry: HandGeometry, particles: Array, log_weights: Array, image: H
     return Guidance(found.pose, found.information)
 
 
-@jax.jit
+@compiled_quickly
 def pose_moments(
     particles: Float[Array, "22 n"], log_weights: Float[Array, " n"]
 ) -> tuple[Float[Array, " 22"], Float[Array, "21 21"]]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.observation import crop
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
@@ -152,12 +153,12 @@ def _window(setup: Setup, sighting: Sighting) -> tuple[Pinhole, Array, np.ndarra
     return camera, depth, sighting.center
 
 
-@jax.jit
+@compiled_quickly
 def _cropped(setup: Setup, frame: Array, center: Array) -> tuple[Pinhole, Array]:
     return crop(setup.camera, frame, center, WINDOW, setup.spacing(center[2]))
 
 
-@jax.jit
+@compiled_quickly
 def _share_read(
     setup: Setup, camera: Pinhole, observed: Array, pose: Array, scale: Array, side: Array
 ) -> Float[Array, ""]:
@@ -174,7 +175,7 @@ def _distance(average: HandGeometry, one: Start, other: Start) -> float:
     return float(np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
 
 
-@jax.jit
+@compiled_quickly
 def _joints(pose: Array, average: HandGeometry, scale: Array, side: Array) -> Array:
     geometry = replace(average.scaled(scale), side=jnp.asarray(side, average.side.dtype))
     return forward_kinematics(pose, geometry).joints
