@@ -48,8 +48,12 @@ def as_arrays(claims: Claims) -> dict[str, np.ndarray]:
 def from_arrays(arrays: dict[str, np.ndarray]) -> Claims:
     """The claims of which `as_arrays` made these."""
     count = sum(name.startswith("errors_") for name in arrays)
-    recordings = [Recording(*(arrays.get(f"{part}_{i}") for part in Recording._fields)) for i in range(count)]
-    return Claims(*map(str, arrays["name"]), tuple(map(str, arrays["coordinates"])), recordings)
+    recordings = [
+        Recording(arrays[f"errors_{i}"], arrays[f"deviations_{i}"], arrays.get(f"covariances_{i}"))
+        for i in range(count)
+    ]
+    system, data = map(str, arrays["name"])
+    return Claims(system, data, tuple(map(str, arrays["coordinates"])), recordings)
 
 
 class Scores(NamedTuple):
