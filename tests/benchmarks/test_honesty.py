@@ -62,8 +62,8 @@ def test_frames_without_estimate_or_claim_do_not_count():
     assert _claims.judge(Claims("s", "d", ("x_m",), [Recording(np.full((3, 1), np.nan), np.ones((3, 1)))])) is None
 
 
-@pytest.mark.parametrize("covariances", [None, np.broadcast_to(np.eye(1), (2, 1, 1))])
-def test_a_system_is_judged_once_in_a_folder(tmp_path, monkeypatch, covariances):
+@pytest.mark.parametrize(("covariances", "nees"), [(None, 5.0), (np.full((2, 1, 1), 4.0), 1.25)])
+def test_a_system_is_judged_once_in_a_folder(tmp_path, monkeypatch, covariances, nees):
     ones, calls = np.ones((2, 1)), []
 
     def one_system(quick, seed):
@@ -75,7 +75,7 @@ def test_a_system_is_judged_once_in_a_folder(tmp_path, monkeypatch, covariances)
     assert calls == [0]
     assert first == second
     assert first["coverage2_s_d_x_m"].value == pytest.approx(50.0)
-    assert first["nees_s_d"].value == pytest.approx(5.0)
+    assert first["nees_s_d"].value == pytest.approx(nees)
 
 
 def test_errors_of_people_are_turned_into_the_line_of_sight():

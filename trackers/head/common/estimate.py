@@ -62,7 +62,7 @@ class _Assumed(NamedTuple):
     mean: Float[Array, "K 3"]
     """Of its model, as the next."""
     basis: Float[Array, "3*K B"]
-    looseness: Float[Array, "K 3 3"]
+    landmark_covariance: Float[Array, "K 3 3"]
     """Covariance of each landmark about the model, mm^2."""
     deforms: Bool[ArrayLike, ""]
     """Whether the fit begins with the mode coefficients that are expected, or without any."""
@@ -214,7 +214,7 @@ def _shares(rest: Refined, fits: Refined) -> tuple[Array, Array]:
     return jnp.where(jnp.isfinite(resting), resting, 0.0), among
 
 
-def _looseness(state: HeadState, strength: Array | float) -> Array:
+def _landmark_covariance(state: HeadState, strength: Array | float) -> Array:
     """Covariance of each landmark about the model of a face whose expression is so strong, mm^2."""
     expression = jnp.asarray(EXPRESSION_STD**2, state.model_variance.dtype)
     learned = jnp.minimum(state.model_variance[:, None], STRENGTHS[-1] ** 2 * expression + 0.25)
@@ -223,7 +223,9 @@ def _looseness(state: HeadState, strength: Array | float) -> Array:
 
 def _assumed(prior: Gaussian, state: HeadState, model: FaceModel) -> _Assumed:
     """Faces whose expressions are as strong as those of `STRENGTHS`, and behind them the registered one at rest."""
-    free = [_Assumed(prior, model.mean, model.basis, _looseness(state, strength), True) for strength in STRENGTHS]
+    free = [
+        _Assumed(prior, model.mean, model.basis, _landmark_covariance(state, strength), True) for strength in STRENGTHS
+    ]
     tight = state.registered.covariance + RESTING_STD**2 * jnp.eye(3)
     covariance = jnp.zeros_like(prior.covariance).at[:POSE, :POSE].set(prior.covariance[:POSE, :POSE])
     covariance = covariance.at[POSE:, POSE:].set(UNKNOWN_STD**2 * jnp.eye(NUM_MODES))
@@ -249,7 +251,9 @@ def _fits(
         assumed = replace(model, mean=face.mean, basis=face.basis)
         start = jnp.where(face.deforms, x, x.at[POSE:].set(0.0))
         # Traced once for its shapes and its program.
-        fit = jax.jit(lambda: refine(face.prior, found, state.slopes, assumed, face.looseness, rig, start, is_own))
+        fit = jax.jit(
+            lambda: refine(face.prior, found, state.slopes, assumed, face.landmark_covariance, rig, start, is_own)
+        )
         nothing = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fit))
         return jax.lax.cond(is_wanted, fit, nothing)
 
