@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxfilters._xla.kept_traces import KeptPrograms, traces_are_kept
+
 R = TypeVar("R")
 _ZERO = np.zeros((), np.float32)
 
@@ -42,15 +44,25 @@ def compiled_lightly(function: Callable[..., R], **settings: Any) -> Callable[..
     return _compiled(function, _LIGHTLY, settings)
 
 
+def compiled_fully(function: Callable[..., R], **settings: Any) -> Callable[..., R]:
+    """`jax.jit`, for a large program: its traced form is kept where the command keeps compiled programs.
+
+    So are those of `compiled_quickly` and `compiled_lightly` (see `kept_traces`).
+    """
+    return _compiled(function, {}, settings)
+
+
 def _compiled(function: Callable[..., R], options: dict[str, bool | int], settings: dict[str, Any]) -> Callable[..., R]:
-    usual, quick = jax.jit(function, **settings), jax.jit(function, compiler_options=options, **settings)
+    usual, quick = jax.jit(function, **settings), jax.jit(function, compiler_options=options or None, **settings)
+    kept = KeptPrograms(function, options, settings)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
         is_traced = any(_is_tracer(leaf) for leaf in jax.tree.leaves((args, kwargs)))
         if is_traced or jax.default_backend() != "cpu" or _within_program():
             return usual(*args, **kwargs)
-        return quick(*args, **kwargs)
+        known = kept.find(args, kwargs) if traces_are_kept() and not jax.config.jax_disable_jit else None
+        return known() if known else quick(*args, **kwargs)
 
     return call
 

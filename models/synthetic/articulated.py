@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.math.lie import quaternion_multiply, so3_exp
 from jaxfilters.models.articulated.features import FULL, PAPER_EXPERIMENT, FeatureSet
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
@@ -110,7 +111,7 @@ def held_states(shape: int = 1, num_frames: int = 500, frame: int = 0) -> Float[
     return jnp.broadcast_to(x, (num_frames, LAYOUT.size))
 
 
-@jax.jit
+@compiled_fully
 def record(
     key: AnyKey, states: Float[Array, "frames n"], hand: ArticulatedHand
 ) -> tuple[Float[Array, "frames rows"], Bool[Array, "frames rows"]]:
@@ -120,7 +121,7 @@ def record(
     return exact + noise, jax.vmap(hand.usable)(states)
 
 
-@partial(jax.jit, static_argnames=("errors", "shape"))
+@partial(compiled_fully, static_argnames=("errors", "shape"))
 def initial_belief(
     key: AnyKey,
     x: Float[Array, " 37"],

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt16
 
-from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.compiled_quickly import compiled_fully, compiled_quickly
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.skeleton import (
     ANGLE_LIMITS,
@@ -174,7 +174,7 @@ def simulate_sequence(
     return film_hand(sensor_key, poses, geometry, camera, sensor or motion.sensor)
 
 
-@jax.jit
+@compiled_fully
 def film_hand(
     key: AnyKey, poses: Float[Array, "t 22"], geometry: HandGeometry, camera: Pinhole, sensor: DepthSensor
 ) -> HandSequence:

@@ -19,6 +19,8 @@ from jaxfilters.models.rendering.depth import ellipsoid_depth
 from jaxfilters.models.synthetic.walkers import Walker, body
 from jaxfilters.typing import AnyKey
 
+_to_matrix, _from_matrix = map(compiled_quickly, (quaternion_to_matrix, quaternion_from_matrix))
+
 SHADOW = 0.7
 """Share of the light that a shadow leaves."""
 SHADOW_AXES_M, SHADOW_AWAY_M = (0.40, 0.22), (0.35, 0.15)
@@ -47,7 +49,7 @@ class RoomCamera:
 def floor_camera(pinhole: Pinhole, T_camera_world: RigidTransform) -> FloorCamera:
     """The projection matrix of a pinhole camera."""
     K = np.asarray(pinhole.matrix(), float)
-    rotation = np.asarray(compiled_quickly(quaternion_to_matrix)(T_camera_world.rotation))
+    rotation = np.asarray(_to_matrix(T_camera_world.rotation))
     return FloorCamera.from_matrix(K @ np.column_stack([rotation, T_camera_world.translation]), pinhole.shape)
 
 
@@ -58,7 +60,7 @@ def looking(position: tuple[float, float, float], heading_deg: float, pitch_deg:
     right = np.array([math.sin(a), -math.cos(a), 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
     return RigidTransform(
-        compiled_quickly(quaternion_from_matrix)(from_host(rotation, jnp.float32)),
+        _from_matrix(from_host(rotation, jnp.float32)),
         from_host(-rotation @ np.asarray(position), jnp.float32),
     )
 

@@ -3,10 +3,12 @@
 import hashlib
 import os
 import platform
+from pathlib import Path
 
 import jax
 import platformdirs
 
+from jaxfilters._xla.kept_traces import keep_traces
 from jaxfilters.trackers.app.devices import processor
 
 SECONDS_TO_COMPILE = 0.02
@@ -40,6 +42,7 @@ def keep_compiled_programs() -> str:
     # Above JAX's own border of a second half of a tracker's programs are compiled in every run.
     if _LEAST_SECONDS not in os.environ:
         jax.config.update(_LEAST_SECONDS.lower(), SECONDS_TO_COMPILE)
+    keep_traces(Path(jax.config.jax_compilation_cache_dir) / "traced")
     return ""
 
 

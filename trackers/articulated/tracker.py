@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters._struct import pytree_dataclass
+from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.gaussian_sum import GaussianSumState, gaussian_sum, map_component
@@ -257,7 +258,7 @@ def _start(setup: _Setup, key: Array, frame: FeatureFrame) -> TrackState:
     return TrackState(bank, jnp.zeros((), dtype=float), misses, _none_observed(setup), key)
 
 
-@jax.jit
+@compiled_fully
 def _first_bank(setup: _Setup, frame: FeatureFrame) -> tuple[GaussianSumState, Array]:
     """The hypotheses before the first frame, and whether there is any."""
     if setup.start is not None:
@@ -293,7 +294,7 @@ def _advance(
     return _scan(setup.compiled(), state, jax.tree.map(jnp.asarray, frames), jnp.asarray(times, dtype=float))
 
 
-@jax.jit
+@compiled_fully
 def _scan(setup: _Setup, state: TrackState, frames: FeatureFrame, times: Array) -> tuple[TrackState, ArticulatedTrack]:
     def body(state: TrackState, inputs: tuple) -> tuple[TrackState, ArticulatedTrack]:
         return _step(setup, _found_again(setup, state, *inputs), *inputs)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32
 
+from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.math import assignment
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles
@@ -50,7 +51,7 @@ def component_of(
     return assignment.match(cost).column
 
 
-@partial(jax.jit, static_argnames=("config", "method"))
+@partial(compiled_fully, static_argnames=("config", "method"))
 def run_hands(
     config: FingertipConfig,
     angles: ThumbAngles,

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.observation import HandLikelihood, union
@@ -156,7 +157,7 @@ def _through_the_host(state: TrackState) -> TrackState:
     return data._replace(key=jax.random.wrap_key_data(data.key, impl=jax.random.key_impl(state.key)))
 
 
-@jax.jit
+@compiled_fully
 def _scan(
     setup: Setup, state: TrackState, frames: Array, times: Array, first: Array
 ) -> tuple[TrackState, tuple[HandTrack, Array]]:

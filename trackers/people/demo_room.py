@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.compiled_quickly import compiled_fully, compiled_quickly
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.floor_camera import FloorCamera
@@ -16,6 +16,8 @@ from jaxfilters.models.person.scene import patch_depth
 from jaxfilters.models.synthetic.room import RoomCamera, floor_camera, looking, room_camera, room_image
 from jaxfilters.models.synthetic.walkers import Routes, Walker, along_routes
 from jaxfilters.typing import AnyKey
+
+_patch_depth = compiled_quickly(patch_depth)
 
 FLOOR_M = np.array([(-3.6, -1.2), (3.6, -1.2), (3.6, 6.0), (-3.6, 6.0)])
 """Where people walk; the doors are in the left and the right wall."""
@@ -79,7 +81,7 @@ class DemoRoom:
         return np.all((self.routes.xy[index] > low) & (self.routes.xy[index] < high), axis=-1)
 
 
-@jax.jit
+@compiled_fully
 def _image(
     key: AnyKey, number: Int[ArrayLike, ""], camera: RoomCamera, leaves: list[Array], present: Bool[Array, " people"]
 ) -> UInt8[Array, "rows cols 3"]:
@@ -105,7 +107,7 @@ def demo_room(seed: int, *, cameras: int = 1, frames: int = 240, fps: float = 10
     pinhole = Pinhole.from_intrinsics(FOCAL_PX, ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), SHAPE)
     transforms = [looking(*place) for place in PLACES[:cameras]]
     views = tuple(floor_camera(pinhole, transform) for transform in transforms)
-    furniture = tuple(compiled_quickly(patch_depth)(view, _furniture()) for view in views)
+    furniture = tuple(_patch_depth(view, _furniture()) for view in views)
     keys = jax.random.split(jax.random.key(seed), cameras)
     rooms = tuple(
         room_camera(key, pinhole, transform, depth)

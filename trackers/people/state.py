@@ -156,7 +156,7 @@ def _empty(n: int, cameras: int) -> People:
         jnp.full(n, -1, jnp.int32),
         jnp.zeros(n),
         jnp.zeros(n),
-        jnp.full((n, APPEARANCE), 1 / 8),
+        jnp.full((n, APPEARANCE), 1 / 8, float),
         no_meetings(n),
         jnp.zeros((), jnp.int32),
         jnp.zeros((n, cameras, 2)),

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot, einsum
+from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.gaussian.arithmetic import joseph
 from jaxfilters.gaussian.belief import Gaussian
@@ -107,7 +108,7 @@ def start(scene: PeopleScene) -> People:
     return nobody(scene.config, len(scene.cameras))
 
 
-@jax.jit
+@compiled_fully
 def step(
     scene: PeopleScene, people: People, frames: tuple[CameraFrame, ...], dt: Float[ArrayLike, ""]
 ) -> tuple[People, Report]:
@@ -138,7 +139,7 @@ def step(
     return people, _report(scene, people, fit, nis)
 
 
-@jax.jit
+@compiled_fully
 def outlines(scene: PeopleScene, people: People) -> tuple[Outline, ...]:
     """The outlines of everybody in each camera, one row a slot."""
     bodies = jax.vmap(body_of)(_observed_places(scene, people))

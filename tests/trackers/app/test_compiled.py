@@ -8,7 +8,12 @@ import pytest
 from jaxfilters.trackers.app import cli, compiled, devices
 
 RUN = """
+from pathlib import Path
+
 import jax
+from jaxfilters._xla.compiled_quickly import compiled_quickly
+from jaxfilters._xla.kept_traces import traces_are_kept
+from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.trackers.app import compiled
 
 found = []
@@ -16,6 +21,9 @@ jax.monitoring.register_event_listener(lambda event, **_: found.append(event))
 compiled.SECONDS_TO_COMPILE = 0
 compiled.keep_compiled_programs()
 jax.jit(lambda x: x + 1)(1.0)
+compiled_quickly(quaternion_to_matrix)(jax.numpy.ones(4))
+folder = Path(str(jax.config.jax_compilation_cache_dir)) / "traced"
+assert len(list(folder.glob("quaternion_to_matrix-*"))) == traces_are_kept(), folder
 print("/jax/compilation_cache/cache_hits" in found, jax.config.jax_compilation_cache_dir)
 """
 
