@@ -45,9 +45,13 @@ def compiled_lightly(function: Callable[..., R], **settings: Any) -> Callable[..
 
 
 def compiled_fully(function: Callable[..., R], **settings: Any) -> Callable[..., R]:
-    """`jax.jit`, for a large program: its traced form is kept where the command keeps compiled programs.
+    """`jax.jit` for a large program, whose traced form is kept where `keep_traces` has named a folder.
 
-    So are those of `compiled_quickly` and `compiled_lightly` (see `kept_traces`).
+    The traced forms of `compiled_quickly` and `compiled_lightly` are kept there as well.
+
+    Args:
+        function: Called with arrays, of which one at least is an argument.
+        settings: Of `jax.jit`, such as `static_argnames`.
     """
     return _compiled(function, {}, settings)
 
@@ -58,10 +62,12 @@ def _compiled(function: Callable[..., R], options: dict[str, bool | int], settin
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> R:
+        if not options and not traces_are_kept():
+            return usual(*args, **kwargs)
         is_traced = any(_is_tracer(leaf) for leaf in jax.tree.leaves((args, kwargs)))
         if is_traced or jax.default_backend() != "cpu" or _within_program():
             return usual(*args, **kwargs)
-        known = kept.find(args, kwargs) if traces_are_kept() and not jax.config.jax_disable_jit else None
+        known = kept.find(args, kwargs) if traces_are_kept() and not jax.config.values["jax_disable_jit"] else None
         return known() if known else quick(*args, **kwargs)
 
     return call

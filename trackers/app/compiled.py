@@ -42,7 +42,9 @@ def keep_compiled_programs() -> str:
     # Above JAX's own border of a second half of a tracker's programs are compiled in every run.
     if _LEAST_SECONDS not in os.environ:
         jax.config.update(_LEAST_SECONDS.lower(), SECONDS_TO_COMPILE)
-    keep_traces(Path(jax.config.jax_compilation_cache_dir) / "traced")
+    place = jax.config.values["jax_compilation_cache_dir"]
+    if "://" not in place:  # the address of a bucket is no folder, though JAX can write there
+        keep_traces(Path(place) / "traced")
     return ""
 
 

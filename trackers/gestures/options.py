@@ -49,7 +49,7 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         "--ways",
         type=positive_integer,
         metavar="N",
-        help="to draw each symbol (default: one for 40 examples, at most 20)",
+        help="to draw each symbol (default: one for 40 examples, at most 20, or 8 if trained by gradient)",
     )
     gestures.add_argument(
         "--seed", type=seed, default=0, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"

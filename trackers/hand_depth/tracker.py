@@ -140,7 +140,7 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
             pieces.append(_nothing_found())
             first += 1
             continue
-        state, (track, done) = _scan(setup.compiled(), state, frames, times, first)
+        state, (track, done) = _scan(setup.compiled(), _through_the_host(state), frames, times, first)
         state = _through_the_host(state)
         if int(state.misses) >= PATIENCE:
             state = state._replace(race_time=jnp.asarray(times[first], dtype=float))
@@ -151,7 +151,10 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
 
 
 def _through_the_host(state: TrackState) -> TrackState:
-    """The state as `_start` leaves it: what has been on several devices would have `_scan` compile a second time."""
+    """The state on no device in particular.
+
+    What has been on several devices would have `_scan` compile a second time, and what is on one cannot be divided.
+    """
     data = state._replace(key=jax.random.key_data(state.key))
     data = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), data)
     return data._replace(key=jax.random.wrap_key_data(data.key, impl=jax.random.key_impl(state.key)))

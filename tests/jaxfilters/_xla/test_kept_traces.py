@@ -3,22 +3,25 @@
 import os
 import subprocess
 import sys
+import time
 from functools import partial
 from types import ModuleType
 from typing import NamedTuple
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters._xla import kept_traces
+from jaxfilters._xla import kept_traces, trace_key
 from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters._xla.kept_traces import KeptPrograms, keep_traces
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.lie import quaternion_to_matrix
 from jaxfilters.trackers.people.state import PeopleConfig, nobody
 
+SOURCES = trace_key._sources
 Q = np.array([0.5, 0.1, -0.3, 0.8], np.float32)
 
 
@@ -46,8 +49,33 @@ def weak(q):
     return jnp.where(q[0] > 0, 1.0, 2.0)
 
 
-for function in (repeated, drawn, weak):
-    function.__module__ = "jaxfilters.imagined"
+def printed(q):
+    jax.debug.callback(lambda q: None, q)
+    return 2 * q
+
+
+def precise(q):
+    return jnp.float32(1e-9) + (q.astype(float) + 1e-9 - q.astype(float)).astype(jnp.float32)
+
+
+def local_structure(q):
+    class Local(NamedTuple):
+        q: jax.Array
+
+    return Local(2 * q)
+
+
+IMAGINED = ModuleType("jaxfilters.imagined")
+for function in (repeated, drawn, weak, printed, precise, local_structure):
+    function.__module__ = IMAGINED.__name__
+    setattr(IMAGINED, function.__name__, function)
+
+
+@pytest.fixture(autouse=True)
+def imagined(monkeypatch):
+    """A module of the package, whose sources were there before it was imported."""
+    monkeypatch.setitem(sys.modules, IMAGINED.__name__, IMAGINED)
+    monkeypatch.setattr(trace_key, "_sources", lambda: b"of today")
 
 
 @pytest.fixture
@@ -101,9 +129,9 @@ def test_all_that_tracing_depends_on_tells_programs_apart(folder, traced, change
     changed = {"shape": Q[None], "dtype": Q.astype(np.float16), "weak": jnp.broadcast_to(jnp.asarray(0.5), 4)}
     found(repeated, Q, 1, static_argnames="times")()
     if change == "version":
-        monkeypatch.setattr(kept_traces, "version", lambda package: "0")
+        monkeypatch.setattr(trace_key, "_versions", lambda: ["0"])
     if change == "sources":
-        monkeypatch.setattr(kept_traces, "_sources", lambda: b"of another day")
+        monkeypatch.setattr(trace_key, "_sources", lambda: b"of another day")
     with jax.enable_x64(change == "x64"):
         times = 2 if change == "static" else 1
         result = found(repeated, changed.get(change, Q), times, static_argnames="times")()
@@ -112,15 +140,38 @@ def test_all_that_tracing_depends_on_tells_programs_apart(folder, traced, change
     assert len(traced) == (1 if change == "nothing" else 2)
 
 
-def test_a_changed_file_changes_the_sources(tmp_path, monkeypatch):
-    package = ModuleType("jaxfilters.imagined")
-    package.__path__ = [str(tmp_path)]
-    monkeypatch.setitem(sys.modules, "jaxfilters.imagined", package)
-    digests = []
+@pytest.mark.parametrize("settings", [{}, {"jax_enable_x64": True}])
+def test_one_object_tells_settings_and_types_of_static_arguments_apart(folder, traced, settings):
+    kept, plain = KeptPrograms(repeated, {}, {"static_argnames": "times"}), jax.jit(repeated, static_argnames="times")
+    for times in (1, True):
+        assert kept.find((Q, times), {})().shape == plain(Q, times).shape
+    assert len(traced) == 2
+    kept = KeptPrograms(precise, {}, {})
+    for is_wide in (False, True):
+        with jax.enable_x64(is_wide):
+            np.testing.assert_array_equal(kept.find((Q,), {})(), jax.jit(precise)(Q))
+    assert len(traced) == 4
+
+
+def test_a_changed_file_changes_the_digest(tmp_path):
+    digests, file = [], tmp_path / "module.py"
     for text in ("A = 1", "A = 2", "A = 1"):
-        (tmp_path / "module.py").write_text(text)
-        digests.append(kept_traces._sources.__wrapped__())
+        file.write_text(text)
+        digests.append(trace_key.digest_of([tmp_path], time.time() + 60))
     assert digests[0] == digests[2] != digests[1]
+    file.rename(tmp_path / "other.py")
+    assert trace_key.digest_of([tmp_path], time.time() + 60) not in digests
+    # Written after the import: not what runs.
+    assert trace_key.digest_of([tmp_path], time.time() - 60) is None
+    assert trace_key.digest_of([tmp_path / "missing"], time.time() + 60) is None
+
+
+def test_the_sources_are_those_of_this_package(monkeypatch):
+    folders = []
+    monkeypatch.setattr(trace_key, "digest_of", lambda found, before_s: folders.extend(found))
+    SOURCES.__wrapped__()
+    assert [folder.name for folder in folders] == ["jaxfilters", "models", "trackers", "benchmarks"]
+    assert all((folder / "__init__.py").exists() for folder in folders)
 
 
 @pytest.mark.parametrize("function", [double, lambda q: q, partial(quaternion_to_matrix)])
@@ -128,6 +179,29 @@ def test_functions_that_the_sources_do_not_describe_are_not_kept(folder, functio
     assert found(function, Q) is None
     np.testing.assert_array_equal(compiled_fully(double)(Q), 2 * Q)
     assert not folder.exists()
+
+
+def test_two_functions_of_one_name_are_not_taken_for_each_other(folder):
+    def repeated(q):
+        return 3 * q
+
+    repeated.__module__, repeated.__qualname__ = IMAGINED.__name__, "repeated"
+    assert found(repeated, Q) is None
+
+
+@pytest.mark.parametrize("function", [printed, local_structure])
+def test_what_cannot_be_exported_runs_without(folder, function):
+    assert found(function, Q) is None
+    np.testing.assert_array_equal(jax.tree.leaves(compiled_fully(function)(Q))[0], 2 * Q)
+
+
+@pytest.mark.parametrize(("args", "error"), [(([1, 2],), "repeated"), ((Q, [1]), "hashable"), ((Q, 1, 2), "argument")])
+def test_wrong_arguments_get_the_errors_of_jax(folder, args, error):
+    with pytest.raises((TypeError, ValueError, AttributeError)) as expected:
+        jax.jit(repeated, static_argnames="times")(*args)
+    with pytest.raises(expected.type) as got:
+        compiled_fully(repeated, static_argnames="times")(*args)
+    assert str(got.value) == str(expected.value)
 
 
 def test_structures_of_other_packages_are_not_kept(folder):
@@ -154,14 +228,22 @@ def test_a_damaged_file_is_traced_anew(folder, traced, damage):
     assert len(file.read_bytes()) == len(whole)
 
 
-def test_a_folder_without_room_is_said_and_the_run_goes_on(tmp_path):
+def test_where_nothing_can_be_written_one_warning_says_so_and_the_run_goes_on(tmp_path):
     (tmp_path / "file").write_text("")
     keep_traces(tmp_path / "file" / "traced")
     try:
-        with pytest.warns(UserWarning, match="will be traced again in the next run"):
+        with pytest.warns(UserWarning, match="traced programs are not kept from here on"):
             assert found(quaternion_to_matrix, Q)().shape == (3, 3)
+        assert found(repeated, Q, 1, static_argnames="times") is None
     finally:
         keep_traces(None)
+
+
+def test_what_may_be_read_but_not_touched_is_used(folder, traced, monkeypatch):
+    found(quaternion_to_matrix, Q)()
+    monkeypatch.setattr(kept_traces.os, "utime", Mock(side_effect=PermissionError))
+    found(quaternion_to_matrix, Q)()
+    assert len(traced) == 1
 
 
 def test_what_was_not_read_for_longest_makes_room(folder, monkeypatch):
@@ -185,6 +267,7 @@ def test_the_empty_state_of_people_has_definite_types():
 TWO_DEVICES = """
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import numpy as np
@@ -197,7 +280,8 @@ from jaxfilters.models.rendering.placement import share_poses
 def squared(poses, factor):
     return share_poses(lambda poses, factor: factor * poses**2, poses, factor)
 
-squared.__module__ = "jaxfilters.imagined"
+imagined = sys.modules["jaxfilters.imagined"] = ModuleType("jaxfilters.imagined")
+squared.__module__, imagined.squared = imagined.__name__, squared
 poses = np.arange(5, dtype=np.float32)
 expected = jax.jit(squared)(poses, np.float32(3.0))
 keep_traces(Path(sys.argv[1]))
