@@ -4,8 +4,9 @@ from collections.abc import Callable
 from dataclasses import field, replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
@@ -13,7 +14,7 @@ from jaxfilters.math.lie import quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import count_observed, rendered_cost, union_cost
 from jaxfilters.models.hand.limits import limit_log_likelihood
-from jaxfilters.models.hand.skeleton import HandGeometry, hand_center
+from jaxfilters.models.hand.skeleton import DIGITS, HandGeometry, hand_center
 from jaxfilters.models.hand.surface import HandSurface
 from jaxfilters.models.rendering.comparison import DepthTerms
 
@@ -25,6 +26,10 @@ the model itself ends: readings beyond it would draw the palm down the arm, fram
 
 FINEST_STRIDE, COARSEST_STRIDE = 0.5, 16.0
 """Pixels of the frame for one of a window: below the first, readings are only repeated."""
+HOLE = 5
+"""Pixels of a window, rows and columns: what has a reading among so many about it is not hidden."""
+FEWEST_READ = 2
+"""Of the three outer joints of a digit that is not hidden."""
 
 
 class HandImage(NamedTuple):
@@ -88,6 +93,26 @@ def isolate(
 def hand_image(camera: Pinhole, observed: Float[Array, "rows cols"]) -> HandImage:
     """An isolated window with its hand pixels counted."""
     return HandImage(camera, observed, count_observed(observed))
+
+
+def has_reading_near(observed: Float[Array, "rows cols"]) -> Bool[Array, "rows cols"]:
+    """Whether a pixel of a window, or a neighbour up to half of `HOLE` away, has a reading or is background."""
+    return jax.lax.reduce_window(~jnp.isnan(observed), False, jax.lax.bitwise_or, (HOLE, HOLE), (1, 1), "SAME")
+
+
+def hidden_digits(image: HandImage, joints: Float[Array, "21 3"]) -> Bool[Array, " 5"]:
+    """Whether a window says nothing about a digit: most of its outer joints have no reading near them.
+
+    Args:
+        image: Of a hand.
+        joints: Estimated, metres, in the order of `JOINT_NAMES`.
+    """
+    rows, cols = image.observed.shape
+    outer = joints[1:].reshape(len(DIGITS), 4, 3)[:, 1:]
+    u, v = jnp.moveaxis(jnp.round(image.camera.project(outer)).astype(int), -1, 0)
+    is_inside = (u >= 0) & (u < cols) & (v >= 0) & (v < rows)
+    is_read = has_reading_near(image.observed)[jnp.clip(v, 0, rows - 1), jnp.clip(u, 0, cols - 1)]
+    return jnp.sum(is_inside & is_read, axis=-1) < FEWEST_READ
 
 
 def union(terms: DepthTerms, image: HandImage, max_error: float) -> Float[Array, ""]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.models.hand.observation import crop
+from jaxfilters.models.hand.observation import crop, has_reading_near
 from jaxfilters.models.hand.skeleton import HandGeometry, forward_kinematics, hand_center
 from jaxfilters.models.hand.start import BATCH, SCALES, SEARCH_RADIUS, Start, costs_of, find_starts, registered
 from jaxfilters.models.rendering.depth import capsule_depth
@@ -48,8 +48,6 @@ WORST_START = 0.032
 LEAST_READ = 0.75
 """Share of what the tracked hand shows that needs readings for a race. Where fingers are hidden, many other poses
 explain the rest as well, which says nothing against the track."""
-HOLE = 5
-"""Pixels of the window, rows and columns: what has a reading among so many about it is not hidden."""
 
 
 def search(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
@@ -163,10 +161,9 @@ def _share_read(
     setup: Setup, camera: Pinhole, observed: Array, pose: Array, scale: Array, side: Array
 ) -> Float[Array, ""]:
     """Of the pixels of an image in which a hand would show, those that have a reading close by."""
-    read = jax.lax.reduce_window(~jnp.isnan(observed), False, jax.lax.bitwise_or, (HOLE, HOLE), (1, 1), "SAME")
     hand = forward_kinematics(pose, setup.sized(scale, side).geometry)
     shown = jnp.isfinite(capsule_depth(camera, hand.capsules))
-    return jnp.sum(shown & read) / jnp.maximum(jnp.sum(shown), 1)
+    return jnp.sum(shown & has_reading_near(observed)) / jnp.maximum(jnp.sum(shown), 1)
 
 
 def _distance(average: HandGeometry, one: Start, other: Start) -> float:

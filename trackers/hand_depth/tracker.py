@@ -19,8 +19,8 @@ from jaxtyping import Array
 from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
-from jaxfilters.models.hand.observation import HandLikelihood, union
-from jaxfilters.models.hand.skeleton import HandGeometry, anatomical_hand, forward_kinematics, open_palm
+from jaxfilters.models.hand.observation import HandLikelihood, hidden_digits, union
+from jaxfilters.models.hand.skeleton import DIGITS, HandGeometry, anatomical_hand, forward_kinematics, open_palm
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.particle.weighting import ParticleInfo
@@ -113,6 +113,7 @@ def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
         least_cost=jnp.asarray(math.inf, dtype=float),
         missing_is_background=jnp.asarray(background),
         time=jnp.asarray(-FRAME_INTERVAL, dtype=float),
+        hidden=jnp.zeros(len(DIGITS), bool),
         misses=jnp.asarray(PATIENCE, jnp.int32),
         key=key,
     )
@@ -184,7 +185,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     """One frame: predict, cut the window about the prediction, update, and judge whether the hand was there."""
     key, predict_key, update_key = jax.random.split(state.key, 3)
     likelihood = setup.hand(state)
-    filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood, state.doubt)
+    filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood, state.doubt, state.hidden)
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
     expected, _ = pose_moments(*particles_of(predicted))
@@ -206,16 +207,23 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     race_time = jnp.where(observed & (cost > SUDDEN * state.least_cost), time, state.race_time)
     least_cost = jnp.where(observed, jnp.minimum(cost, state.least_cost), state.least_cost)
     misses = jnp.where(observed, 0, state.misses + 1)
+    joints = forward_kinematics(pose, likelihood.geometry).joints
     track = HandTrack(
         pose=pose,
         pose_std=standard_deviations(pose, covariance),
-        joints=forward_kinematics(pose, likelihood.geometry).joints,
+        joints=joints,
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
         status=jnp.where(observed, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
     following = state._replace(
-        ensemble=ensemble, time=time, misses=misses, key=key, race_time=race_time, least_cost=least_cost
+        ensemble=ensemble,
+        time=time,
+        hidden=hidden_digits(image, joints),
+        misses=misses,
+        key=key,
+        race_time=race_time,
+        least_cost=least_cost,
     )
     return following, track
 

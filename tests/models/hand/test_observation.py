@@ -7,7 +7,16 @@ import pytest
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs, gibbs_sq
-from jaxfilters.models.hand.observation import HandLikelihood, crop, hand_image, isolate, rendered, union
+from jaxfilters.models.hand.observation import (
+    HOLE,
+    HandLikelihood,
+    crop,
+    hand_image,
+    hidden_digits,
+    isolate,
+    rendered,
+    union,
+)
 from jaxfilters.models.hand.skeleton import TANGENT_SIZE, forward_kinematics, hand_geometry, open_palm, retract
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.rendering.depth import render_capsules
@@ -90,3 +99,24 @@ def test_a_triangle_hand_is_likeliest_where_the_capsules_are_and_grows_with_its_
     # Scaled by hand: the mesh of a scaled geometry.
     larger = HandLikelihood(triangle_hand(GEOMETRY.scaled(1.1)), jnp.asarray(1.0), 0.1, union, gibbs_abs)
     np.testing.assert_allclose(jax.jit(larger.cost)(POSE, image), costs[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("digit", range(5))
+def test_a_digit_whose_outer_joints_have_no_reading_is_hidden_and_no_other(digit):
+    joints = forward_kinematics(POSE, GEOMETRY).joints
+    camera = Pinhole.from_intrinsics((270.0, 285.0), (192.0, 156.0), (318, 384))  # fingers are more than a hole apart
+    depth = np.array(render(camera, POSE))
+    u, v = np.moveaxis(np.asarray(camera.project(joints[2 + 4 * digit : 5 + 4 * digit])), -1, 0)
+    rows, cols = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    for at in zip(u, v, strict=True):
+        depth[np.hypot(cols - at[0], rows - at[1]) < HOLE] = np.nan
+    hidden = np.asarray(hidden_digits(hand_image(camera, jnp.asarray(depth)), joints))
+    np.testing.assert_array_equal(hidden, np.arange(5) == digit)
+
+
+@pytest.mark.parametrize(("move", "expected"), [((0.0, 0.0, 0.0), False), ((1.0, 0.0, 0.0), True)])
+def test_a_hand_that_is_read_is_not_hidden_and_one_beyond_the_window_is(move, expected):
+    joints = forward_kinematics(POSE, GEOMETRY).joints + jnp.asarray(move)
+    depth = np.array(render(CAMERA, POSE))
+    depth[::2] = np.nan  # rows that a sensor has left out
+    assert np.all(hidden_digits(hand_image(CAMERA, jnp.asarray(depth)), joints) == expected)

@@ -1,11 +1,13 @@
 """The hand tracker, whole: on rendered sequences with known truth, through loss and silence, and on real depth."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfilters.models.hand.skeleton import anatomical_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
+from jaxfilters.trackers.hand_depth import filtering
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 from jaxfilters.trackers.hand_depth.tracker import DOUBTFUL, LOST, SEARCHING, TRACKING
@@ -150,3 +152,12 @@ def test_a_real_hand_is_followed(data_dir):
     assert np.isin(track.status, (TRACKING, DOUBTFUL)).all()  # a fist is explained as well by the other hand
     # Of two seeds 13.8 and 13.8 mm; 15.2 and 16.1 where the best finalists are registered with every size only once.
     assert joint_errors_mm(track, recording.joints).mean() < 14.5
+
+
+def test_the_velocity_of_a_hidden_digit_decays_sooner_and_that_of_others_as_before():
+    dt, hidden = 1 / 30, np.arange(5) == 2
+    decay = np.diagonal(filtering._slowed(filtering.MOTION, jnp.asarray(hidden)).dynamics(jnp.zeros(22), dt).A_l)
+    usual = np.diagonal(filtering.MOTION.dynamics(jnp.zeros(22), dt).A_l)
+    middle = slice(6 + 3 * 2, 6 + 3 * 3)
+    np.testing.assert_allclose(decay[middle], np.exp(-dt / filtering.HIDDEN_DIGIT_S), rtol=1e-5)
+    np.testing.assert_array_equal(np.delete(decay, middle), np.delete(usual, middle))
