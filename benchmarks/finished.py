@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable
 from importlib.metadata import distributions
@@ -10,16 +11,13 @@ from typing import cast
 
 import numpy as np
 
-import jaxfilters
-from jaxfilters import benchmarks, models, trackers
+from jaxfilters._sources import digest_of, package_folders
 from jaxfilters.benchmarks.environment import environment
 from jaxfilters.benchmarks.metrics import Direction, Metric
 from jaxfilters.benchmarks.recordings import VARIABLE
 from jaxfilters.trackers.io.checkpoint import write_npz
 from jaxfilters.trackers.io.npz import read_npz
 
-_PACKAGES = (jaxfilters, models, trackers, benchmarks)
-"""In a checkout they lie side by side."""
 _WANTED = "without it, it is measured anew"
 
 
@@ -74,9 +72,6 @@ def _digest(settings: dict[str, object]) -> str:
     machine = {name: value for name, value in environment().items() if name != "load"}
     # Any package may matter: a part leaves out what needs one that is missing.
     installed = sorted(f"{one.name} {one.version}" for one in distributions())
-    message = json.dumps([settings, machine, installed, os.environ.get(VARIABLE)], sort_keys=True)
-    digest = hashlib.sha256(message.encode())
-    for folder in (path for package in _PACKAGES for path in package.__path__):
-        for source in sorted(Path(folder).rglob("*.py")):
-            digest.update(source.read_bytes())
-    return digest.hexdigest()[:12]
+    code = repr(digest_of(package_folders(), before_s=math.inf))
+    message = json.dumps([settings, machine, installed, os.environ.get(VARIABLE), code], sort_keys=True)
+    return hashlib.sha256(message.encode()).hexdigest()[:12]

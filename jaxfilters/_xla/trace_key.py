@@ -6,7 +6,6 @@ versions alone: where a package is edited in place, its version stays and so doe
 """
 
 import hashlib
-import importlib.util
 import inspect
 import pickle
 import platform
@@ -16,21 +15,18 @@ from collections.abc import Callable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
-from pathlib import Path
 from types import BuiltinFunctionType, FunctionType
 from typing import Any
 
 import jax
 
-PACKAGE = "jaxfilters"
-SUBPACKAGES = ("models", "trackers", "benchmarks")
-"""Which need not lie in the folder of the package, as in an editable installation."""
+from jaxfilters._sources import PACKAGE, digest_of, package_folders
+
 TRACED_PACKAGES = (
     *("jax", "jaxlib", "numpy", "scipy", "ml_dtypes", "opt_einsum"),
     *("optimistix", "equinox", "lineax", "jaxopt", "optax"),
 )
 """Packages whose code may be part of a traced program, or whose classes may be part of its arguments."""
-CODE_AND_DATA = {".py", ".npz"}
 SCOPED = ("jax_enable_x64", "jax_default_matmul_precision", "jax_default_device", "jax_numpy_dtype_promotion")
 """Settings that a program may change for a part of its run."""
 _IMPORTED_S = time.time()
@@ -98,29 +94,7 @@ def _described(value: Any) -> bytes:
 
 @cache
 def _sources() -> bytes | None:
-    specs = [importlib.util.find_spec(name) for name in (PACKAGE, *(f"{PACKAGE}.{name}" for name in SUBPACKAGES))]
-    places = [spec.submodule_search_locations for spec in specs if spec and spec.submodule_search_locations]
-    # The first place of the package itself: an editable installation adds the folder of the whole repository.
-    return digest_of([Path(next(iter(place))) for place in places], _IMPORTED_S - _MARGIN_S)
-
-
-def digest_of(folders: list[Path], before_s: float) -> bytes | None:
-    """Digest of the code and the data in folders; None where there is none, or a file is as new as `before_s`.
-
-    A file that was written after the import is not what runs.
-    """
-    digest, is_empty = hashlib.sha256(), True
-    try:
-        for i, folder in enumerate(folders):
-            for file in sorted(path for path in folder.rglob("*") if path.suffix in CODE_AND_DATA):
-                if max(file.stat().st_mtime, file.stat().st_ctime) >= before_s:
-                    return None
-                digest.update(f"{i} {file.relative_to(folder)}".encode())
-                digest.update(hashlib.sha256(file.read_bytes()).digest())
-                is_empty = False
-    except OSError:
-        return None
-    return None if is_empty else digest.digest()
+    return digest_of(package_folders(), _IMPORTED_S - _MARGIN_S)
 
 
 @cache

@@ -48,7 +48,7 @@ def test_other_code_measures_anew(tmp_path, monkeypatch):
     measure, package = Measuring(), tmp_path / "package"
     package.mkdir()
     (package / "tracker.py").write_text("STEPS = 1")
-    monkeypatch.setattr(finished, "_PACKAGES", (type("Package", (), {"__path__": [str(package)]}),))
+    monkeypatch.setattr(finished, "package_folders", lambda: [package])
     Finished(tmp_path).metrics("speed", measure)
     (package / "tracker.py").write_text("STEPS = 2")
     Finished(tmp_path).metrics("speed", measure)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters import _sources
 from jaxfilters._xla import kept_traces, trace_key
 from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters._xla.kept_traces import KeptPrograms, keep_traces
@@ -157,19 +158,20 @@ def test_a_changed_file_changes_the_digest(tmp_path):
     digests, file = [], tmp_path / "module.py"
     for text in ("A = 1", "A = 2", "A = 1"):
         file.write_text(text)
-        digests.append(trace_key.digest_of([tmp_path], time.time() + 60))
+        digests.append(_sources.digest_of([tmp_path], time.time() + 60))
     assert digests[0] == digests[2] != digests[1]
     file.rename(tmp_path / "other.py")
-    assert trace_key.digest_of([tmp_path], time.time() + 60) not in digests
+    assert _sources.digest_of([tmp_path], time.time() + 60) not in digests
     # Written after the import: not what runs.
-    assert trace_key.digest_of([tmp_path], time.time() - 60) is None
-    assert trace_key.digest_of([tmp_path / "missing"], time.time() + 60) is None
+    assert _sources.digest_of([tmp_path], time.time() - 60) is None
+    assert _sources.digest_of([tmp_path / "missing"], time.time() + 60) is None
 
 
 def test_the_sources_are_those_of_this_package(monkeypatch):
     folders = []
     monkeypatch.setattr(trace_key, "digest_of", lambda found, before_s: folders.extend(found))
     SOURCES.__wrapped__()
+    assert folders == _sources.package_folders()
     assert [folder.name for folder in folders] == ["jaxfilters", "models", "trackers", "benchmarks"]
     assert all((folder / "__init__.py").exists() for folder in folders)
 

@@ -106,3 +106,19 @@ def test_the_command_keeps_programs_but_where_speed_is_measured(arguments, kept,
     monkeypatch.setattr(sys, "argv", ["jaxfilters", *arguments])
     assert cli.command() == 7
     assert capsys.readouterr().err == "jaxfilters: no room.\n" * kept
+
+
+@pytest.mark.system
+def test_the_large_program_of_a_tracker_is_kept_and_found(tmp_path):
+    """Programs that cannot be kept run as well: without this nobody would notice."""
+    run = [sys.executable, "-c", "from jaxfilters.trackers.app.cli import command; command()", "track", "articulated"]
+    environment = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    environment |= {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_ENABLE_COMPILATION_CACHE": "1"}
+    kept = []
+    for i in range(2):
+        command = [*run, "--no-video", "--out", str(tmp_path / str(i))]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        kept.append({file.name: file.stat().st_size for file in (tmp_path / "cache" / "traced").iterdir()})
+    assert kept[0] == kept[1]
+    assert [size > 10_000 for name, size in kept[0].items() if name.startswith("_scan-")] == [True]

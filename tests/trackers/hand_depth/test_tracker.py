@@ -161,3 +161,19 @@ def test_the_velocity_of_a_hidden_digit_decays_sooner_and_that_of_others_as_befo
     middle = slice(6 + 3 * 2, 6 + 3 * 3)
     np.testing.assert_allclose(decay[middle], np.exp(-dt / filtering.HIDDEN_DIGIT_S), rtol=1e-5)
     np.testing.assert_array_equal(np.delete(decay, middle), np.delete(usual, middle))
+
+
+@pytest.mark.system
+def test_a_frame_without_readings_of_the_fingers_slows_them(tracker, sequence):
+    depth, joints = sequence[0].copy(), sequence[1]
+    times = np.arange(2 * CHUNK, dtype=np.float32) / 30
+    state, _ = tracker.step(tracker.init(jax.random.key(0), depth[0]), depth[:CHUNK], times[:CHUNK])
+    assert not np.any(state.hidden)
+    pixels = np.asarray(kinect_v2().project(jnp.asarray(joints[CHUNK:, 6:].reshape(-1, 3))))
+    low, high = np.floor(pixels.min(0)).astype(int) - 5, np.ceil(pixels.max(0)).astype(int) + 5
+    depth[CHUNK:, low[1] : high[1], low[0] : high[0]] = np.nan
+    after, track = tracker.step(state, depth[CHUNK:], times[CHUNK:])
+    assert np.all(np.asarray(after.hidden)[1:])
+    # The first frame alone is predicted with what the state says of the last one.
+    other = state._replace(hidden=jnp.ones(5, bool))
+    assert not np.array_equal(tracker.step(other, depth[CHUNK:], times[CHUNK:])[1].pose[0], track.pose[0])
