@@ -17,7 +17,7 @@ _INTRODUCTION = """# Results
 
 Every number below comes from a run of `jaxfilters bench`, which anybody can repeat; `jaxfilters bench --report` wrote
 this page from the files of these runs, which are in `docs/results/`, with the day, the machine and the versions that
-they hold for. Recordings that may not be redistributed are described on the pages of the trackers.
+they hold for. Recordings that may not be redistributed are described on the pages about the trackers' accuracy.
 
 Ratios to other libraries are medians over rounds in which both take turns, so that they hold on a busy machine as well.
 Times in seconds hold for the machine and the load of the run: these machines were not idle.
@@ -190,7 +190,7 @@ _OF_RECORDINGS = """## The six systems on recordings
 
 Each tracker on data that are not its own, beside the simplest thing that follows the same without a filter: mean
 errors, of heads root mean squares, of the distance before one camera the mean over people of how far each is off on
-average. What the recordings are, and on which of them constants were chosen, is on the pages of the trackers. The
+average. What the recordings are, and on which of them constants were chosen, is on the pages about accuracy. The
 numbers are those of the runs below.
 
 | system | recording | quantity | jaxfilters | simplest | which is |
