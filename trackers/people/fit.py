@@ -10,6 +10,7 @@ from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
+from jaxfilters.trackers.people.detectability import evidence_of, most_probable
 from jaxfilters.trackers.people.image_shift import best_shift, has_shifts, shifted, weighted
 from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
@@ -19,12 +20,22 @@ from jaxfilters.trackers.people.silhouettes import (
     log_likelihood,
     log_likelihoods,
     observed_place,
+    shape_of,
     shares_seen,
     unexplained_of,
     views_of,
 )
-from jaxfilters.trackers.people.state import BIAS, PLACE, STATE, STRIDE, CameraFrame, PeopleScene
-from jaxfilters.trackers.people.stride import longest_stride, with_best_stride, with_stride
+from jaxfilters.trackers.people.state import (
+    BIAS,
+    DETECTABILITIES,
+    DETECTABILITY,
+    PLACE,
+    STATE,
+    STRIDE,
+    CameraFrame,
+    PeopleScene,
+)
+from jaxfilters.trackers.people.stride import longest_stride, with_best_stride
 
 ALONE = 0.5
 """Probability that nobody else makes a pixel foreground, for every pixel of a window, above which strides are found."""
@@ -85,6 +96,10 @@ class Fit(NamedTuple):
     """Of the silhouette, how much lies in each image and before furniture, whoever else may be there."""
     crowding: Float[Array, "slots cameras"]
     """Share of the surroundings of the silhouette in each image that is foreground which no other person explains."""
+    detectability: Float[Array, " slots"]
+    """Probability that a pixel of the silhouette is detected."""
+    detection_evidence: Float[Array, "slots values"]
+    """Log likelihood of the images under each of `DETECTABILITIES`; 0 where others may explain the same pixels."""
 
     @property
     def share_seen(self) -> Float[Array, " slots"]:
@@ -101,6 +116,7 @@ def fit_people(
     scene: PeopleScene,
     predicted: Gaussian,
     shifts: Float[Array, "slots cameras 2"],
+    detectability: Float[Array, "slots values"],
     active: Bool[Array, " slots"],
     seniority: Float[Array, " slots"],
     frames: tuple[CameraFrame, ...],
@@ -111,6 +127,7 @@ def fit_people(
         scene: Cameras, furniture, floor.
         predicted: Beliefs of all slots.
         shifts: Of their silhouettes after the frame before.
+        detectability: Log weights of how much of each silhouette is detected, before these images.
         active: Which of them hold a person.
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
@@ -134,14 +151,16 @@ def fit_people(
         mine = shifted(unshifted, shifts[k]) if has_shifts(scene) else unshifted
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        alone = jnp.min(unexplained) > ALONE
+        alone = _is_alone(unexplained)
         if has_shifts(scene):
             shifts = shifts.at[k].set(best_shift(scene, places[k], unshifted, contrasts, shifts[k]))
             mine = shifted(unshifted, shifts[k])
+        detected = most_probable(detectability[k] + alone * evidence_of(scene, places[k], mine, contrasts))
+        places = places.at[k, DETECTABILITY].set(detected)
 
         def best(place, offsets):
             place = with_best_stride(scene, place, longest[k], mine, contrasts, alone)
-            candidates = place + with_stride(dot(offsets, axes[k]))
+            candidates = place + _displaced(dot(offsets, axes[k]))
             scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
             away = candidates[:, : STRIDE.start] - start[k]
             total = scores - einsum("ci,ij,cj->c", away, prior[k], away) / 2
@@ -155,10 +174,20 @@ def fit_people(
         return places.at[k].set(place), shifts
 
     lattices, num_active = _lattices(), jnp.sum(active)
-    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, (with_stride(start), shifts))
+    begin = shape_of(start, most_probable(detectability)), shifts
+    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, begin)
     if has_shifts(scene):
         views = jax.vmap(shifted)(views, shifts)
     return _curvature(scene, places, shifts, active, seniority, views, axes, _steps(scene, start))
+
+
+def _is_alone(unexplained):
+    return jnp.min(unexplained) > ALONE
+
+
+def _displaced(offsets):
+    """Displacements of silhouettes by X, Y, height and width."""
+    return shape_of(offsets, 0.0)
 
 
 def _lattices():
@@ -186,7 +215,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        candidates = places[k] + with_stride(dot(jnp.concatenate([around * steps[k], -away, away]), axes[k]))
+        candidates = places[k] + _displaced(dot(jnp.concatenate([around * steps[k], -away, away]), axes[k]))
         values = by_reading(scene, candidates, mine, contrasts)
         scores = jnp.sum(values, axis=0) / scene.config.independent_patches
         fit = Fit(
@@ -204,6 +233,8 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
             _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
             shares_seen(scene, places[k], mine, jnp.ones_like(unexplained)),
             crowding(scene, places[k], mine, unexplained),
+            places[k, DETECTABILITY],
+            _is_alone(unexplained) * evidence_of(scene, places[k], mine, contrasts),
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
@@ -221,6 +252,8 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         jnp.full(n, jnp.inf),
         jnp.zeros((n, cameras)),
         jnp.zeros((n, cameras)),
+        jnp.ones(n),
+        jnp.zeros((n, len(DETECTABILITIES))),
     )
     order = jnp.argsort(~active)
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
@@ -238,7 +271,7 @@ def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])[: STRIDE.start]
         offsets = dot(dot(foreground.lattice(2), jnp.eye(2, 4)) * steps[senior], axes[senior])
-        candidates = places[senior] + with_stride((between[:, None] + offsets).reshape(-1, 4))
+        candidates = places[senior] + _displaced((between[:, None] + offsets).reshape(-1, 4))
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
         return score - (jnp.max(values) - with_k) / scene.config.independent_patches

@@ -21,6 +21,7 @@ from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import nearest_on_border, walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity, is_meeting
+from jaxfilters.trackers.people.detectability import prior_log_weights
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.silhouette_bias import edge_covariance
 from jaxfilters.trackers.people.silhouettes import OVERLAP, area_of, body_of, presence_of
@@ -326,6 +327,7 @@ def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
         unseen_s=jnp.where(slot, 0.0, people.unseen_s),
         appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
         shift=jnp.where(slot[:, None, None], 0.0, people.shift),
+        detectability=jnp.where(slot[:, None], prior_log_weights(), people.detectability),
     )
 
 

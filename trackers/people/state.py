@@ -28,6 +28,10 @@ PLACE = (0, 1, HEIGHT, WIDTH)
 """X, Y, height and width in a state: what one image shows."""
 STRIDE = slice(4, 6)
 """After X, Y, height and width of a silhouette: from the middle to the front foot along X and Y, metres."""
+DETECTABILITY = 6
+"""After the stride: the probability that a pixel of the silhouette is detected as foreground (`detectability`)."""
+DETECTABILITIES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+"""Possible values of the detectability, the most probable one without an image first."""
 
 
 @pytree_dataclass
@@ -115,6 +119,8 @@ class People(NamedTuple):
     next_identity: Int32[Array, ""]
     shift: Float[Array, "slots cameras 2"]
     """Of their silhouettes in the image of each camera, pixels (`image_shift`)."""
+    detectability: Float[Array, "slots values"]
+    """Log weights of how much of each silhouette is detected (`detectability`)."""
 
 
 class Report(NamedTuple):
@@ -160,6 +166,7 @@ def _empty(n: int, cameras: int) -> People:
         no_meetings(n),
         jnp.zeros((), jnp.int32),
         jnp.zeros((n, cameras, 2)),
+        jnp.zeros((n, len(DETECTABILITIES))),
     )
 
 

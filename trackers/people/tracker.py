@@ -21,7 +21,7 @@ from jaxfilters.gaussian.consider import consider
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.motion.models import constant_velocity
-from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people import detectability, lifecycle
 from jaxfilters.trackers.people.appearance import appearances, identity_switch_correction
 from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
 from jaxfilters.trackers.people.image_shift import displacement_by_shift, shift_sd
@@ -124,12 +124,17 @@ def step(
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     F, Q = motion(scene.config, dt)
     predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
-    fit = fit_people(scene, predicted, people.shift, active, lifecycle.seniority(people), frames)
+    log_weights = detectability.predicted(people.detectability, dt)
+    fit = fit_people(scene, predicted, people.shift, log_weights, active, lifecycle.seniority(people), frames)
     belief, nis = updated(scene, predicted, fit, dt)
-    people = people._replace(belief=chosen(active, belief, people.belief), shift=fit.shift)
+    people = people._replace(
+        belief=chosen(active, belief, people.belief),
+        shift=fit.shift,
+        detectability=detectability.updated(log_weights, fit.detection_evidence),
+    )
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.existence(scene, people, fit, dt, looked)
-    places = jnp.concatenate([_observed_places(scene, people), fit.stride], axis=1)
+    places = jnp.concatenate([_observed_places(scene, people), fit.stride, fit.detectability[:, None]], axis=1)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR

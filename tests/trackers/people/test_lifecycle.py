@@ -10,7 +10,16 @@ from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.lifecycle import Birth, stride
-from jaxfilters.trackers.people.state import DORMANT, FREE, TENTATIVE, TRACKED, CameraFrame, PeopleConfig, nobody
+from jaxfilters.trackers.people.state import (
+    DETECTABILITIES,
+    DORMANT,
+    FREE,
+    TENTATIVE,
+    TRACKED,
+    CameraFrame,
+    PeopleConfig,
+    nobody,
+)
 from jaxfilters.trackers.people.tracker import people_scene, step
 
 SLOTS = 4
@@ -50,6 +59,8 @@ def fit_of(score=1.0, share_seen=1.0, surplus=np.inf, share_in_view=1.0):
         full(surplus),
         full(share_in_view)[:, None],
         full(0)[:, None],
+        full(1),
+        jnp.zeros((SLOTS, len(DETECTABILITIES))),
     )
 
 
