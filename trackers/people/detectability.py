@@ -1,68 +1,84 @@
-"""How much of each person differs from the background: the probability that a pixel of a silhouette is detected.
+"""How much of each person differs from the background: a factor on the probability that a pixel is foreground.
 
 Clothes in the colour of the background, bad light and compression leave holes in a silhouette. A search that expects
-all of a body takes holes for places where nobody is, and moves the person to where fewer of them are. The probability
-is one number a person for all cameras, with a few possible values. Its filter is that of a discrete state (the forward
-recursion of a hidden Markov model) that forgets in time (a power of the posterior; A. Raftery, M. Karny, P. Ettler,
-"Online prediction under model uncertainty via dynamic model averaging", Technometrics 52, 2010). Images in which other
-people may explain the same pixels do not count: a second track on one person would otherwise pass for a person of whom
-little is detected.
+all of a body takes holes for places where nobody is, and moves the person to where fewer of them are. The factor has a
+few possible values. It is one number a person for all cameras, though the background behind a person differs between
+them. Each image multiplies the weights of the values by its likelihoods, and older images count less (stabilised
+forgetting: R. Kulhavy, M. Zarrop, "On a general concept of forgetting", International Journal of Control 58, 1993: the
+weights are raised to a power, and the prior to the rest of it).
+
+The factor belongs to a person's own likelihood alone. A body hides what is behind it whether or not it is detected. An
+image in which other people may explain the pixels of a person does not count: a second track on one person would
+otherwise pass for a person of whom little is detected.
 """
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfilters.trackers.people.silhouettes import View, log_likelihood
-from jaxfilters.trackers.people.state import DETECTABILITIES, DETECTABILITY, PeopleScene
+from jaxfilters.trackers.people.state import DETECTABILITIES, DETECTABILITY_PRIOR, PeopleScene
 
 MEMORY_S = 3.0
-"""Time after which an image counts 1 / e as much. A person who leaves is a silhouette of which nothing is detected, and
-must be given up before little of it is expected: at 7 frames a second, 2 seconds are too short for that."""
-PRIOR_NATS = 2.0
-"""By how much the first of the values is more probable than each of the others without an image."""
-
-
-def prior_log_weights() -> Float[Array, " values"]:
-    """Of a person of whom no image has been compared yet, up to a constant."""
-    return -PRIOR_NATS * (jnp.arange(len(DETECTABILITIES)) > 0)
+"""Time after which the weight of an image is 1 / e. A person who leaves is a silhouette of which nothing is detected.
+After ten seconds of whole silhouettes at 7 frames a second, such a person is given up one frame later than without this
+factor; with 2 seconds it takes four frames longer."""
+LEAST_FOR_EXISTENCE = 0.55
+"""Least value under which the score decides whether a person exists: under 0.25, foreground in a sixth of a silhouette
+(a shadow, a chair that was moved) would keep the track of a person who left."""
+ALONE = 0.5
+"""Least probability that nobody else makes a pixel foreground, over all pixels of a window, for an image to count."""
 
 
 def most_probable(log_weights: Float[Array, "*slots values"]) -> Float[Array, "*slots"]:
-    """The most probable value of each person."""
+    """The value with the largest weight of each person."""
     return jnp.array(DETECTABILITIES)[jnp.argmax(log_weights, axis=-1)]
 
 
-def predicted(log_weights: Float[Array, "slots values"], dt: Float[Array, ""]) -> Float[Array, "slots values"]:
-    """Log weights `dt` seconds later."""
+def predicted(
+    log_weights: Float[Array, "slots values"], dt: Float[Array, ""], tracked: Bool[Array, " slots"]
+) -> Float[Array, "slots values"]:
+    """Log weights of the values `dt` seconds later, up to a constant; only the first value for who is not tracked yet.
+
+    Whoever is not tracked may be clutter, which explains itself as a person of whom little is detected.
+    """
     kept = jnp.exp(-dt / MEMORY_S)
-    return kept * log_weights + (1 - kept) * prior_log_weights()
+    prior = jnp.array(DETECTABILITY_PRIOR)
+    whole = jnp.where(jnp.arange(len(DETECTABILITIES)) == 0, 0.0, -jnp.inf)
+    return jnp.where(tracked[:, None], kept * log_weights + (1 - kept) * prior, whole)
 
 
 def updated(
-    log_weights: Float[Array, "slots values"], evidence: Float[Array, "slots values"]
+    log_weights: Float[Array, "slots values"], evidence: Float[Array, "slots values"], tracked: Bool[Array, " slots"]
 ) -> Float[Array, "slots values"]:
-    """Log weights after an image.
+    """Log weights of the values after an image, with the maximum 0; the prior for who is not tracked yet.
 
     Args:
-        log_weights: Before it.
-        evidence: Log likelihood of the image under each value (`evidence_of`).
+        log_weights: Before the image.
+        evidence: Log likelihood ratios of the image (`evidence_of`).
+        tracked: Who is a person and no longer a candidate.
     """
     after = log_weights + evidence
-    return after - jnp.max(after, axis=-1, keepdims=True)
+    after -= jnp.max(after, axis=-1, keepdims=True)
+    return jnp.where(tracked[:, None], after, jnp.array(DETECTABILITY_PRIOR))
 
 
 def evidence_of(
-    scene: PeopleScene, shape: Float[Array, " shape"], views: View, contrasts: Float[Array, "cameras samples"]
+    scene: PeopleScene,
+    shape: Float[Array, " 6"],
+    views: View,
+    unexplained: Float[Array, "cameras samples"],
+    contrasts: Float[Array, "cameras samples"],
 ) -> Float[Array, " values"]:
-    """Log likelihood of the images of a person under each value.
+    """Log likelihood ratio of a person against nobody under each value, in the cameras where no other person may be.
 
     Args:
         scene: Cameras and constants.
-        shape: Of the silhouette.
+        shape: X, Y, height, width and stride of the silhouette, metres.
         views: The windows of the person.
+        unexplained: Probability that nobody else makes each sample foreground.
         contrasts: What silhouettes are compared with.
     """
-    values = jnp.array(DETECTABILITIES, shape.dtype)
-    candidates = jnp.broadcast_to(shape, (len(values), len(shape))).at[:, DETECTABILITY].set(values)
-    return jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, views, contrasts)
+    alone = jnp.min(unexplained, axis=-1, keepdims=True) > ALONE
+    under = lambda value: log_likelihood(scene, shape, views, value * alone * contrasts)
+    return jax.vmap(under)(jnp.array(DETECTABILITIES, contrasts.dtype))

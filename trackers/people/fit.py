@@ -10,7 +10,7 @@ from jaxfilters._full_precision import dot, einsum
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.foreground import Quadratic
-from jaxfilters.trackers.people.detectability import evidence_of, most_probable
+from jaxfilters.trackers.people.detectability import ALONE, LEAST_FOR_EXISTENCE, evidence_of, most_probable
 from jaxfilters.trackers.people.image_shift import best_shift, has_shifts, shifted, weighted
 from jaxfilters.trackers.people.silhouette_bias import bias_factor, pixel_m
 from jaxfilters.trackers.people.silhouettes import (
@@ -20,25 +20,13 @@ from jaxfilters.trackers.people.silhouettes import (
     log_likelihood,
     log_likelihoods,
     observed_place,
-    shape_of,
     shares_seen,
     unexplained_of,
     views_of,
 )
-from jaxfilters.trackers.people.state import (
-    BIAS,
-    DETECTABILITIES,
-    DETECTABILITY,
-    PLACE,
-    STATE,
-    STRIDE,
-    CameraFrame,
-    PeopleScene,
-)
-from jaxfilters.trackers.people.stride import longest_stride, with_best_stride
+from jaxfilters.trackers.people.state import BIAS, DETECTABILITIES, PLACE, STATE, STRIDE, CameraFrame, PeopleScene
+from jaxfilters.trackers.people.stride import longest_stride, with_best_stride, with_stride
 
-ALONE = 0.5
-"""Probability that nobody else makes a pixel foreground, for every pixel of a window, above which strides are found."""
 LEAST_REACH_M, MOST_REACH_M = 0.16, 0.5
 """How far from the prediction a person is searched for, along each axis."""
 HEIGHT_STEP_M = 0.03
@@ -83,7 +71,7 @@ class Fit(NamedTuple):
     """The log likelihood around `place`, along `axes`, of all cameras, or of each where they may be wrong; leaves
     (slots, readings, ...)."""
     score: Float[Array, " slots"]
-    """Mean log likelihood ratio a pixel."""
+    """Mean log likelihood ratio a pixel, under a detectability of `LEAST_FOR_EXISTENCE` at least."""
     shift: Float[Array, "slots cameras 2"]
     """Of their silhouettes in each image, pixels."""
     shares_seen: Float[Array, "slots cameras"]
@@ -97,9 +85,9 @@ class Fit(NamedTuple):
     crowding: Float[Array, "slots cameras"]
     """Share of the surroundings of the silhouette in each image that is foreground which no other person explains."""
     detectability: Float[Array, " slots"]
-    """Probability that a pixel of the silhouette is detected."""
+    """The most probable value after these images."""
     detection_evidence: Float[Array, "slots values"]
-    """Log likelihood of the images under each of `DETECTABILITIES`; 0 where others may explain the same pixels."""
+    """Log likelihood ratios of the images under `DETECTABILITIES`; 0 where others may explain the same pixels."""
 
     @property
     def share_seen(self) -> Float[Array, " slots"]:
@@ -127,7 +115,7 @@ def fit_people(
         scene: Cameras, furniture, floor.
         predicted: Beliefs of all slots.
         shifts: Of their silhouettes after the frame before.
-        detectability: Log weights of how much of each silhouette is detected, before these images.
+        detectability: Log weights of `DETECTABILITIES` before these images.
         active: Which of them hold a person.
         seniority: Whose presence is the less in doubt, of two of whom one may be a mistake.
         frames: One a camera.
@@ -151,16 +139,16 @@ def fit_people(
         mine = shifted(unshifted, shifts[k]) if has_shifts(scene) else unshifted
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        alone = _is_alone(unexplained)
+        alone = jnp.min(unexplained) > ALONE
         if has_shifts(scene):
             shifts = shifts.at[k].set(best_shift(scene, places[k], unshifted, contrasts, shifts[k]))
             mine = shifted(unshifted, shifts[k])
-        detected = most_probable(detectability[k] + alone * evidence_of(scene, places[k], mine, contrasts))
-        places = places.at[k, DETECTABILITY].set(detected)
+        evidence = evidence_of(scene, places[k], mine, unexplained, contrasts)
+        contrasts = most_probable(detectability[k] + evidence) * contrasts
 
         def best(place, offsets):
             place = with_best_stride(scene, place, longest[k], mine, contrasts, alone)
-            candidates = place + _displaced(dot(offsets, axes[k]))
+            candidates = place + with_stride(dot(offsets, axes[k]))
             scores = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, mine, contrasts)
             away = candidates[:, : STRIDE.start] - start[k]
             total = scores - einsum("ci,ij,cj->c", away, prior[k], away) / 2
@@ -174,20 +162,10 @@ def fit_people(
         return places.at[k].set(place), shifts
 
     lattices, num_active = _lattices(), jnp.sum(active)
-    begin = shape_of(start, most_probable(detectability)), shifts
-    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, begin)
+    places, shifts = jax.lax.fori_loop(0, PASSES * num_active, one_person, (with_stride(start), shifts))
     if has_shifts(scene):
         views = jax.vmap(shifted)(views, shifts)
-    return _curvature(scene, places, shifts, active, seniority, views, axes, _steps(scene, start))
-
-
-def _is_alone(unexplained):
-    return jnp.min(unexplained) > ALONE
-
-
-def _displaced(offsets):
-    """Displacements of silhouettes by X, Y, height and width."""
-    return shape_of(offsets, 0.0)
+    return _curvature(scene, places, shifts, detectability, active, seniority, views, axes, _steps(scene, start))
 
 
 def _lattices():
@@ -200,10 +178,10 @@ def _lattices():
     return jnp.stack([jnp.concatenate([wide, middle]), narrow / 2, narrow / 4])
 
 
-def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> Fit:
+def _curvature(scene, places, shifts, detectability, active, seniority, views, axes, steps) -> Fit:
     around = foreground.lattice(4)
     away = PROFILE_M * jnp.eye(1, 4)
-    middle = len(around) // 2
+    middle, known = len(around) // 2, most_probable(detectability)
     readings = len(scene.cameras) if has_shifts(scene) else 1
 
     def by_reading(scene, candidates, mine, contrasts):
@@ -215,8 +193,11 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
         mine = jax.tree.map(lambda leaf: leaf[k], views)
         unexplained = unexplained_of(scene, places, active.at[k].set(False), mine)
         contrasts = contrasts_of(mine, unexplained)
-        candidates = places[k] + _displaced(dot(jnp.concatenate([around * steps[k], -away, away]), axes[k]))
-        values = by_reading(scene, candidates, mine, contrasts)
+        evidence = evidence_of(scene, places[k], mine, unexplained, contrasts)
+        detected = known.at[k].set(most_probable(detectability[k] + evidence))
+        exists = jnp.maximum(detected[k], LEAST_FOR_EXISTENCE) * contrasts
+        candidates = places[k] + with_stride(dot(jnp.concatenate([around * steps[k], -away, away]), axes[k]))
+        values = by_reading(scene, candidates, mine, detected[k] * contrasts)
         scores = jnp.sum(values, axis=0) / scene.config.independent_patches
         fit = Fit(
             places[k, : STRIDE.start],
@@ -226,15 +207,15 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
             jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(foreground.quadratic_fit(v[:-2], steps[k]) for v in values)
             ),
-            scores[middle],
+            log_likelihood(scene, places[k], mine, exists) / scene.config.independent_patches,
             shifts[k],
             shares_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
-            _surplus(scene, places, active, seniority, views, axes, steps, k, scores[middle]),
+            _surplus(scene, places, detected, active, seniority, views, axes, steps, k, scores[middle]),
             shares_seen(scene, places[k], mine, jnp.ones_like(unexplained)),
             crowding(scene, places[k], mine, unexplained),
-            places[k, DETECTABILITY],
-            _is_alone(unexplained) * evidence_of(scene, places[k], mine, contrasts),
+            detected[k],
+            evidence,
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
@@ -259,7 +240,7 @@ def _curvature(scene, places, shifts, active, seniority, views, axes, steps) -> 
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
 
 
-def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
+def _surplus(scene, places, detectability, active, seniority, views, axes, steps, k, score):
     """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best."""
     apart = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
     apart = jnp.where(active & (seniority > seniority[k]), apart, jnp.inf)
@@ -269,9 +250,10 @@ def _surplus(scene, places, active, seniority, views, axes, steps, k, score):
         theirs = jax.tree.map(lambda leaf: leaf[senior], views)
         others = active.at[k].set(False).at[senior].set(False)
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
+        contrasts = jnp.maximum(detectability[senior], detectability[k]) * contrasts
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])[: STRIDE.start]
         offsets = dot(dot(foreground.lattice(2), jnp.eye(2, 4)) * steps[senior], axes[senior])
-        candidates = places[senior] + _displaced((between[:, None] + offsets).reshape(-1, 4))
+        candidates = places[senior] + with_stride((between[:, None] + offsets).reshape(-1, 4))
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
         return score - (jnp.max(values) - with_k) / scene.config.independent_patches

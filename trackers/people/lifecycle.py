@@ -21,11 +21,11 @@ from jaxfilters.models.person.ellipsoid import VISIBLE, outline, standing
 from jaxfilters.models.person.foreground import contrast, log_likelihood_ratio, presence
 from jaxfilters.models.person.scene import nearest_on_border, walkable
 from jaxfilters.trackers.people.appearance import BINS, dissimilarity, is_meeting
-from jaxfilters.trackers.people.detectability import prior_log_weights
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.silhouette_bias import edge_covariance
 from jaxfilters.trackers.people.silhouettes import OVERLAP, area_of, body_of, presence_of
 from jaxfilters.trackers.people.state import (
+    DETECTABILITY_PRIOR,
     DORMANT,
     FREE,
     HEIGHT,
@@ -235,9 +235,9 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
     # A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
-    # not speak for nobody: of a person who is tracked, less is expected, and less follows.
+    # not speak for nobody: of a person who is tracked, less is expected, and less follows. Nor do holes.
     tracked, in_view = people.mode == TRACKED, fit.share_in_view
-    superfluous = fit.surplus < LEAST_SURPLUS * jnp.where(tracked, in_view, 1.0)
+    superfluous = fit.surplus < LEAST_SURPLUS * jnp.where(tracked, in_view * fit.detectability, 1.0)
     a_second = HIDDEN_COST + (SUPERFLUOUS_COST - HIDDEN_COST) * in_view
     cost = jnp.where(tracked, a_second * dt, LEAST_SURPLUS - fit.surplus)
     change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
@@ -327,7 +327,7 @@ def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
         unseen_s=jnp.where(slot, 0.0, people.unseen_s),
         appearance=jnp.where(slot[:, None], 1 / BINS, people.appearance),
         shift=jnp.where(slot[:, None, None], 0.0, people.shift),
-        detectability=jnp.where(slot[:, None], prior_log_weights(), people.detectability),
+        detectability=jnp.where(slot[:, None], jnp.array(DETECTABILITY_PRIOR), people.detectability),
     )
 
 

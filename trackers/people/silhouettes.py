@@ -22,7 +22,7 @@ from jaxfilters.models.person.ellipsoid import (
 )
 from jaxfilters.models.person.foreground import Window, contrast, log_likelihood_ratio, presence
 from jaxfilters.trackers.people.silhouette_bias import displacement
-from jaxfilters.trackers.people.state import DETECTABILITY, PLACE, STRIDE, CameraFrame, PeopleConfig, PeopleScene
+from jaxfilters.trackers.people.state import PLACE, STRIDE, CameraFrame, PeopleConfig, PeopleScene
 
 MARGIN = 0.3
 """Of the window beyond the farthest candidates, in its size: what is cut off would seem to speak for nobody."""
@@ -57,12 +57,6 @@ def observed_place(scene: PeopleScene, mean: Float[Array, " 9"]) -> Float[Array,
     return place_of(mean) + displacement(scene, mean)
 
 
-def shape_of(place: Float[Array, "*slots 4"], detectability: Float[ArrayLike, "*slots"]) -> Float[Array, "*slots 7"]:
-    """The silhouette of X, Y, height, width and detectability, with the legs together."""
-    detected = jnp.broadcast_to(jnp.asarray(detectability), place.shape[:-1])[..., None]
-    return jnp.concatenate([place, jnp.zeros((*place.shape[:-1], 2)), detected], axis=-1)
-
-
 def body_of(place: Float[Array, "*batch shape"]) -> Ellipsoid:
     """The ellipsoid of X, Y, height and width, whatever follows; of a size that an outline can be had of."""
     return standing(place[..., :2], *(jnp.maximum(place[..., i], LEAST_SIZE_M) for i in (2, 3)))
@@ -75,7 +69,7 @@ def presence_of(
     uv: Float[Array, "*pixels 2"],
     margin_px: Float[ArrayLike, ""] = 0.0,
 ) -> Float[Array, "*pixels"]:
-    """`presence` of X, Y, height, width and, where given, stride and detectability, in the camera of a matrix.
+    """`presence` of X, Y, height, width and, if it is known, the stride, in the camera of a projection matrix.
 
     Args:
         config: Constants.
@@ -86,8 +80,7 @@ def presence_of(
     """
     height, width = (jnp.maximum(place[i], LEAST_SIZE_M) for i in (2, 3))
     stride = place[STRIDE] if len(place) > STRIDE.start else None
-    detectability = place[DETECTABILITY] if len(place) > DETECTABILITY else 1.0
-    return detectability * presence(P, place[:2], height, width, uv, config.spread_px + margin_px, stride)
+    return presence(P, place[:2], height, width, uv, config.spread_px + margin_px, stride)
 
 
 def line_of_sight(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -224,12 +217,11 @@ def crowding(
 
     Such foreground is of a person who is not tracked yet, of a shadow or of a reflection.
     """
-    whole = place[:DETECTABILITY]
 
     def in_camera(P, view, free):
-        margin_px = AROUND * jnp.sqrt(outline(P, body_of(whole)).shape[1, 1])
-        mine = presence_of(scene.config, P, whole, view.window.uv)
-        around = presence_of(scene.config, P, whole, view.window.uv, margin_px) * (1 - mine) * view.visible
+        margin_px = AROUND * jnp.sqrt(outline(P, body_of(place)).shape[1, 1])
+        mine = presence_of(scene.config, P, place, view.window.uv)
+        around = presence_of(scene.config, P, place, view.window.uv, margin_px) * (1 - mine) * view.visible
         return jnp.sum(around * view.foreground * free) / jnp.maximum(jnp.sum(around), 1.0)
 
     return jax.vmap(in_camera)(scene.projections(), views, unexplained)

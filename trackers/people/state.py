@@ -28,10 +28,10 @@ PLACE = (0, 1, HEIGHT, WIDTH)
 """X, Y, height and width in a state: what one image shows."""
 STRIDE = slice(4, 6)
 """After X, Y, height and width of a silhouette: from the middle to the front foot along X and Y, metres."""
-DETECTABILITY = 6
-"""After the stride: the probability that a pixel of the silhouette is detected as foreground (`detectability`)."""
 DETECTABILITIES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
-"""Possible values of the detectability, the most probable one without an image first."""
+"""Possible factors on the probability that a person makes a pixel foreground (`detectability`)."""
+DETECTABILITY_PRIOR = (0.0, -2.0, -2.0, -2.0, -2.0, -2.0)
+"""Log weights of these without an image, up to a constant."""
 
 
 @pytree_dataclass
@@ -120,7 +120,7 @@ class People(NamedTuple):
     shift: Float[Array, "slots cameras 2"]
     """Of their silhouettes in the image of each camera, pixels (`image_shift`)."""
     detectability: Float[Array, "slots values"]
-    """Log weights of how much of each silhouette is detected (`detectability`)."""
+    """Log weights of `DETECTABILITIES`, up to a constant."""
 
 
 class Report(NamedTuple):
@@ -166,7 +166,7 @@ def _empty(n: int, cameras: int) -> People:
         no_meetings(n),
         jnp.zeros((), jnp.int32),
         jnp.zeros((n, cameras, 2)),
-        jnp.zeros((n, len(DETECTABILITIES))),
+        jnp.tile(jnp.array(DETECTABILITY_PRIOR), (n, 1)),
     )
 
 

@@ -31,19 +31,24 @@ def longest_stride(mean: Float[Array, "*slots 9"]) -> Float[Array, "*slots 2"]:
     return (length / jnp.maximum(speed, _LEAST_M_PER_S))[..., None] * mean[..., 2:4]
 
 
+def with_stride(place: Float[Array, "*slots 4"]) -> Float[Array, "*slots 6"]:
+    """X, Y, height and width, followed by the stride of a person whose legs are together."""
+    return jnp.pad(place, [(0, 0)] * (place.ndim - 1) + [(0, 2)])
+
+
 def with_best_stride(
     scene: PeopleScene,
-    shape: Float[Array, " 7"],
+    shape: Float[Array, " 6"],
     longest: Float[Array, " 2"],
     views: View,
     contrasts: Float[Array, "cameras samples"],
     alone: Bool[Array, ""],
-) -> Float[Array, " 7"]:
+) -> Float[Array, " 6"]:
     """A silhouette with the stride under which the images are most likely, or half the largest beside others.
 
     Args:
         scene: Cameras and constants.
-        shape: The silhouette with the stride so far.
+        shape: X, Y, height, width and stride so far, metres.
         longest: The largest stride, metres.
         views: The windows of the person.
         contrasts: What candidates are compared with.

@@ -124,17 +124,18 @@ def step(
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     F, Q = motion(scene.config, dt)
     predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
-    log_weights = detectability.predicted(people.detectability, dt)
+    tracked = people.mode == TRACKED
+    log_weights = detectability.predicted(people.detectability, dt, tracked)
     fit = fit_people(scene, predicted, people.shift, log_weights, active, lifecycle.seniority(people), frames)
     belief, nis = updated(scene, predicted, fit, dt)
     people = people._replace(
         belief=chosen(active, belief, people.belief),
         shift=fit.shift,
-        detectability=detectability.updated(log_weights, fit.detection_evidence),
+        detectability=detectability.updated(log_weights, fit.detection_evidence, tracked),
     )
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.existence(scene, people, fit, dt, looked)
-    places = jnp.concatenate([_observed_places(scene, people), fit.stride, fit.detectability[:, None]], axis=1)
+    places = jnp.concatenate([_observed_places(scene, people), fit.stride], axis=1)
     active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR

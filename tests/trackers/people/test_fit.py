@@ -9,9 +9,8 @@ import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
-from jaxfilters.trackers.people.detectability import prior_log_weights
 from jaxfilters.trackers.people.fit import MOST_SHIFT_M, Fit, _nearest_first, as_measurement, fit_people
-from jaxfilters.trackers.people.state import HEIGHT, STATE, CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.state import DETECTABILITY_PRIOR, HEIGHT, STATE, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import MOST_CROWDING, people_scene, updated
 
 pytestmark = pytest.mark.system
@@ -105,7 +104,7 @@ def found(camera, draw, floor):
         belief = Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), (SLOTS, STATE, STATE)))
         active = jnp.array([slot in order for slot in range(SLOTS)])
         no_shift, seniority = jnp.zeros((SLOTS, 1, 2)), -jnp.arange(SLOTS, dtype=float)
-        prior = jnp.tile(prior_log_weights(), (SLOTS, 1))
+        prior = jnp.tile(jnp.array(DETECTABILITY_PRIOR), (SLOTS, 1))
         fit = search(scene, belief, no_shift, prior, active, seniority, (shown,))
         return jax.tree.map(np.asarray, fit)
 
@@ -206,7 +205,7 @@ def test_the_score_is_compared_over_pixels_of_the_feet(low_camera, draw):
     sd = jnp.array([1.0, 1.0, 0.5, 0.5, 0.08, 0.06, 0.1, 0.1, 0.1])
     frame = CameraFrame(mask, np.zeros((*mask.shape, 3), np.uint8), np.bool_(True))
     belief = Gaussian(mean, jnp.diag(sd**2)[None])
-    nothing = jnp.zeros((1, 1, 2)), prior_log_weights()[None], jnp.ones(1, bool), jnp.zeros(1)
+    nothing = jnp.zeros((1, 1, 2)), jnp.array([DETECTABILITY_PRIOR]), jnp.ones(1, bool), jnp.zeros(1)
     fit = jax.jit(fit_people)(scene, belief, *nothing, (frame,))
     x, y = fit.place[0, :2]
     feet, beyond = (low_camera.project(jnp.array([x, y + d, 0.0]))[0] for d in (0.0, fit.steps[0, 0]))

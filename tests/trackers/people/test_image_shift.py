@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.detectability import prior_log_weights
 from jaxfilters.trackers.people.fit import fit_people
 from jaxfilters.trackers.people.image_shift import displacement_by_shift, shift_sd, weighted
 from jaxfilters.trackers.people.silhouettes import views_of
-from jaxfilters.trackers.people.state import STATE, CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.state import DETECTABILITY_PRIOR, STATE, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
 PLACE = (0.2, 1.0, 1.70, 0.45)
@@ -39,7 +38,7 @@ def test_the_place_is_that_of_the_first_camera_and_the_second_is_shifted(camera,
     mean = jnp.zeros((1, STATE)).at[0, :6].set(jnp.array([*PLACE[:2], 0, 0, *PLACE[2:]]))
     sd = jnp.array([0.3, 0.3, 0.5, 0.5, 0.08, 0.05, 0.1, 0.1, 0.1])
     belief = Gaussian(mean, jnp.diag(sd**2)[None])
-    unchanged = prior_log_weights()[None], jnp.ones(1, bool), jnp.zeros(1)
+    unchanged = jnp.array([DETECTABILITY_PRIOR]), jnp.ones(1, bool), jnp.zeros(1)
     search = jax.jit(fit_people)
     found = []
     for scene in scenes:

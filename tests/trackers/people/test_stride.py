@@ -11,11 +11,10 @@ from jaxfilters.models.rendering.depth import render_ellipsoids
 from jaxfilters.models.synthetic.room import floor_camera, looking
 from jaxfilters.models.synthetic.walkers import HIP, LEG_SWING, Walker, body
 from jaxfilters.trackers.people import stride
-from jaxfilters.trackers.people.detectability import prior_log_weights
 from jaxfilters.trackers.people.fit import fit_people
-from jaxfilters.trackers.people.silhouettes import View, shape_of
-from jaxfilters.trackers.people.state import CameraFrame, PeopleConfig
-from jaxfilters.trackers.people.stride import FULL_STRIDE, longest_stride
+from jaxfilters.trackers.people.silhouettes import View
+from jaxfilters.trackers.people.state import DETECTABILITY_PRIOR, CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.stride import FULL_STRIDE, longest_stride, with_stride
 from jaxfilters.trackers.people.tracker import people_scene
 
 AT, HEIGHT_M = (0.3, 4.0), 1.8
@@ -43,18 +42,17 @@ def test_a_full_stride_is_that_of_the_walkers():
 
 
 def test_legs_are_together_by_default():
-    found = shape_of(jnp.arange(8.0).reshape(2, 4), 0.5)
-    np.testing.assert_array_equal(found, [[0, 1, 2, 3, 0, 0, 0.5], [4, 5, 6, 7, 0, 0, 0.5]])
+    np.testing.assert_array_equal(with_stride(jnp.arange(8.0).reshape(2, 4)), [[0, 1, 2, 3, 0, 0], [4, 5, 6, 7, 0, 0]])
 
 
 @pytest.mark.parametrize(("alone", "share"), [(True, 1.0), (False, 0.5)])
 def test_beside_others_legs_are_half_a_stride_apart_whatever_the_image_shows(alone, share, monkeypatch):
     monkeypatch.setattr(stride, "log_likelihood", lambda scene, shape, views, contrasts: shape[4])
-    shape, longest = jnp.array([1.0, 2.0, 1.7, 0.45, 0.1, 0.0, 1.0]), jnp.array([0.4, 0.0])
+    shape, longest = jnp.array([1.0, 2.0, 1.7, 0.45, 0.1, 0.0]), jnp.array([0.4, 0.0])
     scene = people_scene([floor_camera(PINHOLE, T_CAMERA_WORLD)], FLOOR)
     views = View(*[jnp.zeros((1, 1))] * len(View._fields))
     chosen = stride.with_best_stride(scene, shape, longest, views, jnp.zeros((1, 1)), jnp.array(alone))
-    np.testing.assert_allclose(chosen, [1.0, 2.0, 1.7, 0.45, share * 0.4, 0.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(chosen, [1.0, 2.0, 1.7, 0.45, share * 0.4, 0.0], rtol=1e-6)
 
 
 def search_of(num_cameras, **config):
@@ -66,7 +64,7 @@ def search_of(num_cameras, **config):
     scene = people_scene(cameras, FLOOR, config=PeopleConfig(capacity=1, spread_px=0.0, **config))
     mean = jnp.array([[*AT, 1.2, 0.0, HEIGHT_M, 0.47, 0.0, 0.0, 0.0]])
     sd = jnp.array([0.3, 0.3, 0.3, 0.3, 0.02, 0.05, 0.1, 0.1, 0.1])
-    nothing = jnp.zeros((1, num_cameras, 2)), prior_log_weights()[None], jnp.ones(1, bool), jnp.zeros(1)
+    nothing = jnp.zeros((1, num_cameras, 2)), jnp.array([DETECTABILITY_PRIOR]), jnp.ones(1, bool), jnp.zeros(1)
     search = jax.jit(lambda frames: fit_people(scene, Gaussian(mean, jnp.diag(sd**2)[None]), *nothing, frames))
     render = jax.jit(lambda walker: render_ellipsoids(PINHOLE, body(walker), T_CAMERA_WORLD))
 

@@ -6,8 +6,8 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, UInt8
-from scipy.optimize import least_squares
 
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face import pose as head
@@ -234,6 +234,7 @@ def _posed(shape: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
     size = np.linalg.norm(rays[:, :2] - rays[:, :2].mean(axis=0)) / np.linalg.norm(shape[:, :2])
     start = np.concatenate([rays.mean(axis=0) / size, np.zeros(3)])
-    fit = least_squares(lambda x: np.concatenate([placed(x)[1].ravel() / _LANDMARK_STD, x[3:] / _ANGLE_STD]), start)
+    residuals = lambda x: np.concatenate([placed(x)[1].ravel() / _LANDMARK_STD, x[3:] / _ANGLE_STD])
+    fit = scipy.optimize.least_squares(residuals, start)  # imported here, by SciPy: it takes as long as JAX
     R, misplaced = placed(fit.x)
     return R, fit.x[:3], float(np.linalg.norm(misplaced, axis=1).max())
