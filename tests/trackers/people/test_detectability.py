@@ -189,3 +189,12 @@ def test_a_step_keeps_what_is_known_of_the_tracked_and_starts_anew_with_others(s
         np.testing.assert_allclose(now.detectability[1], DETECTABILITY_PRIOR, atol=1e-6)
     born = lifecycle.confirm(scene, now._replace(mode=now.mode.at[0].set(0)), lifecycle.Birth(jnp.array(AT), True))
     np.testing.assert_allclose(born.detectability[0], DETECTABILITY_PRIOR)
+
+
+@pytest.mark.system
+def test_where_nobody_is_the_score_says_so_of_whom_little_was_detected_as_well(search, whole):
+    """Under .25 a pixel of an empty silhouette loses some .2 nats on average, under .55 half a nat."""
+    little = tuple(0.0 if value == 0.25 else -1e6 for value in DETECTABILITIES)
+    fit = search(np.zeros_like(whole), [AT], little)
+    assert float(fit.detectability[0]) == 0.25
+    assert float(fit.score[0]) < -0.35
