@@ -22,12 +22,13 @@ from jaxfilters.trackers.people.state import DETECTABILITIES, DETECTABILITY_PRIO
 MEMORY_S = 3.0
 """Time after which the weight of an image is 1 / e. A person who leaves is a silhouette of which nothing is detected.
 After ten seconds of whole silhouettes at 7 frames a second, such a person is given up one frame later than without this
-factor; with 2 seconds it takes four frames longer."""
+factor; with 2 seconds three frames later."""
 LEAST_FOR_EXISTENCE = 0.55
-"""Least value under which the score decides whether a person exists: under 0.25, foreground in a sixth of a silhouette
-(a shadow, a chair that was moved) would keep the track of a person who left."""
+"""Least value under which the score decides whether a person exists: an empty silhouette loses 0.5 nats a pixel under
+it, and 0.2 under 0.25, with which the track of a person who left would be kept more than twice as long."""
 ALONE = 0.5
-"""Least probability that nobody else makes a pixel foreground, over all pixels of a window, for an image to count."""
+"""Least probability that nobody else makes a pixel foreground, over all pixels of a window, for an image to count and
+for a stride to be searched for."""
 
 
 def most_probable(log_weights: Float[Array, "*slots values"]) -> Float[Array, "*slots"]:

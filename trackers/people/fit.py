@@ -240,7 +240,7 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
     return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
 
 
-def _surplus(scene, places, detectability, active, seniority, views, axes, steps, k, score):
+def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, score):
     """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best."""
     apart = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
     apart = jnp.where(active & (seniority > seniority[k]), apart, jnp.inf)
@@ -250,7 +250,7 @@ def _surplus(scene, places, detectability, active, seniority, views, axes, steps
         theirs = jax.tree.map(lambda leaf: leaf[senior], views)
         others = active.at[k].set(False).at[senior].set(False)
         contrasts = contrasts_of(theirs, unexplained_of(scene, places, others, theirs))
-        contrasts = jnp.maximum(detectability[senior], detectability[k]) * contrasts
+        contrasts = jnp.maximum(detected[senior], detected[k]) * contrasts
         between = jnp.linspace(0.0, 1.0, BETWEEN)[:, None] * (places[k] - places[senior])[: STRIDE.start]
         offsets = dot(dot(foreground.lattice(2), jnp.eye(2, 4)) * steps[senior], axes[senior])
         candidates = places[senior] + with_stride((between[:, None] + offsets).reshape(-1, 4))

@@ -235,7 +235,7 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
     # A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
-    # not speak for nobody: of a person who is tracked, less is expected, and less follows. Nor do holes.
+    # not speak for nobody: of a person who is tracked, less is expected, and less follows. Holes do not either.
     tracked, in_view = people.mode == TRACKED, fit.share_in_view
     superfluous = fit.surplus < LEAST_SURPLUS * jnp.where(tracked, in_view * fit.detectability, 1.0)
     a_second = HIDDEN_COST + (SUPERFLUOUS_COST - HIDDEN_COST) * in_view
