@@ -98,7 +98,7 @@ class TrackState(NamedTuple):
     time: Float[Array, ""]
     """Of the last frame, seconds."""
     misses: Array
-    """Frames in a row in which the hand was not visible; starts above `PATIENCE`."""
+    """Frames in a row in which the hand was not visible; above `PATIENCE` until keypoints of a hand are found."""
     length_observed: Bool[Array, " lengths"]
     """As in the track."""
     key: Array
@@ -339,7 +339,8 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     rows = jnp.sum(frame.mask)
     observed = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
     bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
-    searching = state.misses > PATIENCE
+    # Only keypoints are searched for. With a given start the hypotheses go on, and fit again when the hand is back.
+    searching = (state.misses > PATIENCE) if setup.start is None else jnp.zeros((), bool)
     misses = jnp.where(observed, 0, state.misses + 1).astype(jnp.int32)
     status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
     misses = jnp.where(searching, state.misses, misses)

@@ -1,5 +1,7 @@
 """The articulated tracker: on the paper's sequence, from keypoints alone, through gaps."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +110,20 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
     assert np.all(track.status[25:35] == LOST)
     assert np.all(track.status[38:] == TRACKING)
     assert all(np.all(np.isfinite(leaf)) for leaf in (track.mean, track.std, track.points))
+
+
+@pytest.mark.system
+def test_a_hand_with_a_given_start_is_lost_while_it_is_gone_and_tracked_when_it_is_back():
+    """It cannot be searched for. Without the gap the mean error of an angle at the end is 1.2 degrees."""
+    sequence = tracker.synthetic_sequence(1)
+    y, gone = sequence.y.copy(), slice(20, 34)
+    y[gone] = np.nan
+    found = tracker.track_sequence(replace(sequence, y=y))
+    assert (found.status[gone] == LOST).all()
+    assert (found.status[40:] == TRACKING).all()
+    angles = LAYOUT.angles
+    error = np.abs(found.mean[-1, angles] - sequence.truth[-1, angles])
+    assert np.rad2deg(error.mean()) < 5
 
 
 @pytest.mark.system
