@@ -67,7 +67,8 @@ from .particle.auxiliary import guided as guided
 from .particle.bootstrap import ParticleState as ParticleState
 from .particle.bootstrap import bootstrap as bootstrap
 from .particle.correlated_bootstrap import correlated_bootstrap as correlated_bootstrap
-from .particle.guided_rao_blackwell import Guidance as Guidance
+from .particle.guidance import Guidance as Guidance
+from .particle.guidance import GuidanceMixture as GuidanceMixture
 from .particle.guided_rao_blackwell import Jump as Jump
 from .particle.guided_rao_blackwell import guided_rao_blackwell as guided_rao_blackwell
 from .particle.locally_optimal import locally_optimal as locally_optimal

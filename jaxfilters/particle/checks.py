@@ -304,11 +304,26 @@ def check_partitions(partitions: Any, num_coordinates: int) -> None:
 
 
 def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
-    """Require a point like the state of one particle, and an information matrix of its tangent space."""
+    """Require points like the state of one particle, each with an information matrix of its tangent space."""
+    if all(hasattr(guidance, name) for name in ("points", "information", "log_likelihoods")):
+        _check_guidance_mixture(guidance, x, size)
+        return
     if not (hasattr(guidance, "point") and hasattr(guidance, "information")):
-        raise TypeError(f"guide must return a Guidance; got {_kind(guidance)}.")
+        raise TypeError(f"guide must return a Guidance or a GuidanceMixture; got {_kind(guidance)}.")
     like("point of guide", guidance.point, x, "the nonlinear state of a particle")
     check_covariance("information of guide", guidance.information, size, "an information matrix")
+
+
+def _check_guidance_mixture(mixture: Any, x: PyTree, size: int) -> None:
+    count = jnp.size(mixture.log_likelihoods)
+    check_shape("log_likelihoods of guide", mixture.log_likelihoods, (count,), "one for each of the points")
+    if count == 0:
+        raise ValueError("guide must return at least one point; got none.")
+    several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), x)
+    like("points of guide", mixture.points, several, "nonlinear states of particles, the axis of the points first")
+    check_shape(
+        "information of guide", mixture.information, (count, size, size), "an information matrix for each point"
+    )
 
 
 def check_jump(jump: Any, size: int) -> None:

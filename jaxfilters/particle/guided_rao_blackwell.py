@@ -1,22 +1,18 @@
 r"""Rao-Blackwellized particle filter with a proposal that depends on the current observation.
 
 With many dimensions and few particles, hardly any sample of the transition falls where the likelihood is high. Here a
-`guide` computes from the observation a point and an information matrix: a Gaussian approximation of the likelihood.
-Each particle draws from the product of that Gaussian and its own transition, mixed with a fraction of the plain
-transition that bounds the weights (defensive mixture: T. Hesterberg, "Weighted average importance sampling and
-defensive mixture distributions", Technometrics 37, 1995), and its weight is multiplied by the ratio of transition and
-proposal density (A. Doucet, S. Godsill and C. Andrieu, "On sequential Monte Carlo sampling methods for Bayesian
-filtering", Statistics and Computing 10, 2000, section II-D). A rough guide costs efficiency, not correctness.
+`guide` computes from the observation a Gaussian approximation of the likelihood, or several about its maxima, and the
+particles are drawn from its product with their own transitions: see `jaxfilters.particle.guidance`. A rough guide costs
+efficiency, not correctness.
 
 The increments may be heavy-tailed: with a small probability a particle jumps, which adds a wide normal number to its
 increment (a scale mixture; D. F. Andrews and C. L. Mallows, "Scale mixtures of normal distributions", Journal of the
 Royal Statistical Society B 36, 1974). What is not observed then stays where it is, while a sudden movement is followed.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import field
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,28 +24,11 @@ from jaxfilters._xla.noise import standard_normal
 from jaxfilters.filter import Filter
 from jaxfilters.math.linalg import cholesky, matmul, solve_triangular
 from jaxfilters.particle import checks, rao_blackwell
+from jaxfilters.particle.guidance import Guide, as_mixture, draw
 from jaxfilters.particle.proposals import exact
 from jaxfilters.particle.rao_blackwell import Increments, RaoBlackwell, RaoBlackwellState
 from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.typing import AnyKey, as_pytree, only_inputs, taking_inputs
-
-
-class Guidance(NamedTuple):
-    """A Gaussian approximation of the likelihood of one observation, as a function of the nonlinear state."""
-
-    point: PyTree
-    """Its maximum: a nonlinear state x."""
-    information: Float[Array, "n n"]
-    """Inverse of its covariance in the tangent space at that point; zero where it says nothing."""
-
-
-@runtime_checkable
-class Guide(Protocol):
-    """Compute a `Guidance` from the observation and the predicted ensemble, whose axis is the last one."""
-
-    def __call__(
-        self, particles: PyTree, log_weights: Float[Array, " n"], y: PyTree, inputs: PyTree, /
-    ) -> Guidance: ...
 
 
 class Jump(NamedTuple):
@@ -116,8 +95,9 @@ def guided_rao_blackwell(
 
     Args:
         inner: A filter made by `rao_blackwell_shared` with the proposal `exact`.
-        guide: `(particles, log_weights, y) -> Guidance`; leaves of `particles` have the ensemble axis last.
-            It may take the inputs of the step as one more argument, see `jf.typing`.
+        guide: `(particles, log_weights, y) -> Guidance`, or a `GuidanceMixture` where the likelihood has several
+            maxima; leaves of `particles` have the ensemble axis last. It may take the inputs of the step as one more
+            argument, see `jf.typing`.
         local: `(x, other) -> delta`, the inverse of the filter's `retract`; subtraction by default.
         jump: `inputs -> Jump`, the jumps of a step; none by default.
         prior_share: Fraction of the particles that are drawn from the transition alone, in (0, 1). No importance
@@ -233,60 +213,20 @@ def _update(
     guidance = model.guide(ensemble.particles, ensemble.log_weights, observation, inputs)
     size = predicted.delta.shape[0]
     checks.check_guidance(guidance, jax.tree.map(lambda leaf: leaf[..., 0], ensemble.particles), size)
+    mixture = as_mixture(guidance)
 
     def to_point(origin: PyTree, point: PyTree) -> Array:
         delta = model.local(origin, point)
         checks.check_shape("the result of local", delta, (size,), "noise_dim of inner")
         return delta
 
-    towards = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)(predicted.origin, guidance.point) - predicted.drift
-    delta, log_ratio = draw(key, predicted.spread, guidance.information, towards, model.prior_share)
+    of_each_particle = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)
+    towards = jax.vmap(of_each_particle, in_axes=(None, 0))(predicted.origin, mixture.points) - predicted.drift
+    delta, log_ratio = draw(key, predicted.spread, mixture, towards, model.prior_share)
     if jumps is not None:
-        wide, log_ratio_wide = draw(key, jumps.spread, guidance.information, towards, model.prior_share)
+        wide, log_ratio_wide = draw(key, jumps.spread, mixture, towards, model.prior_share)
         delta = jnp.where(jumps.jumped, wide, delta)
         log_ratio = jnp.where(jumps.jumped, log_ratio_wide, log_ratio)
     state = _moved(model, state, delta, _shift(predicted, jumps, delta - predicted.delta))
     ensemble, info = rao_blackwell.update_ensemble(model.inner, state.ensemble, observation, inputs, log_ratio)
     return state._replace(ensemble=ensemble), info
-
-
-def draw(
-    key: AnyKey,
-    spread: Float[Array, "n n"],
-    information: Float[Array, "n n"],
-    towards: Float[Array, "n k"],
-    prior_share: float,
-) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
-    r"""Draw increments from the mixture of transition and guide.
-
-    The mixture is $\alpha N(0, N) + (1 - \alpha) N(\mu_i, C)$ with $C = (N^{-1} + \Lambda)^{-1}$ and
-    $\mu_i = C \Lambda t_i$. It is computed in coordinates whitened by $N = L L^T$, where $C$ is
-    $(I + L^T \Lambda L)^{-1}$, so that float32 suffices however different the units of the components are.
-
-    Args:
-        key: Random key.
-        spread: Covariance N of the increments given the past.
-        information: Information matrix Lambda of the guide.
-        towards: Increments t_i that would move each of the k particles to the point of the guide.
-        prior_share: Fraction alpha of draws from the transition alone.
-
-    Returns:
-        Increments `(n, k)`, and the logarithms `(k,)` of the ratio of N(0, N) to the mixture there.
-    """
-    choice_key, noise_key = jax.random.split(key)
-    noise = standard_normal(noise_key, towards.shape)
-    root = cholesky(spread)
-    precision_root = cholesky(jnp.eye(root.shape[0], dtype=root.dtype) + dot(dot(root.T, information), root))
-
-    # LAPACK solves for many right-hand sides with threads of its own, which compete with a likelihood that keeps all
-    # cores busy: 30 ms for 512 particles, against 0.1 ms for a product with the inverse. The diagonal of the root is at
-    # least one, so that its inverse is well conditioned.
-    inverse_root = solve_triangular(precision_root, jnp.eye(root.shape[0], dtype=root.dtype))
-    center = matmul(inverse_root.T, matmul(inverse_root, dot(root.T, dot(information, towards))))
-    plain = jax.random.uniform(choice_key, noise.shape[-1:]) < prior_share
-    whitened = jnp.where(plain, noise, center + matmul(inverse_root.T, noise))
-    log_prior = -0.5 * jnp.sum(whitened**2, axis=0)
-    log_guided = -0.5 * jnp.sum(dot(precision_root.T, whitened - center) ** 2, axis=0)
-    log_guided = log_guided + jnp.log(jnp.diagonal(precision_root)).sum()
-    log_mixture = jnp.logaddexp(math.log(prior_share) + log_prior, math.log1p(-prior_share) + log_guided)
-    return dot(root, whitened), log_prior - log_mixture

@@ -177,6 +177,12 @@ def not_shared():
     return jf.rao_blackwell_shared(prior, VELOCITY, depends_on_x, log_likelihood, num_particles=8, noise_dim=1)
 
 
+def run_guided_by_mixture(**fields):
+    several = jf.GuidanceMixture(jnp.zeros((2, 1)), jnp.ones((2, 1, 1)), jnp.zeros(2))._replace(**fields)
+    inner = marginal(jf.rao_blackwell_shared)
+    return jf.run(jf.guided_rao_blackwell(inner, lambda particles, log_weights, y: several), KEY, YS)
+
+
 def unguided():
     return jf.guided_rao_blackwell(marginal(jf.rao_blackwell_shared), lambda particles, log_weights, y: y)
 
@@ -332,6 +338,18 @@ PARTICLE = [
     Case("shared A_n of x", lambda: jf.run(not_shared(), KEY, YS), ("A_n", "dynamics")),
     # Guided filters.
     Case("guide point", lambda: run_guided(lambda y: y[0]), ("guide", "point", "()", "(1,)")),
+    Case(
+        "guide points", lambda: run_guided_by_mixture(points=jnp.zeros((3, 1))), ("points of guide", "(3, 1)", "(2, 1)")
+    ),
+    Case(
+        "guide informations",
+        lambda: run_guided_by_mixture(information=ONE),
+        ("information of guide", "(2, 1, 1)", "(1, 1)"),
+    ),
+    Case(
+        "guide heights", lambda: run_guided_by_mixture(log_likelihoods=jnp.zeros((2, 1))), ("log_likelihoods", "(2, 1)")
+    ),
+    Case("guide no point", lambda: run_guided_by_mixture(log_likelihoods=jnp.zeros(0)), ("guide", "none")),
     Case("guide information", lambda: run_guided(information=jnp.eye(2)), ("information", "(2, 2)", "(1, 1)")),
     Case("guide sign", lambda: run_guided(information=-jnp.eye(1)), ("information", "-1")),
     Case("guide local", lambda: run_guided(local=lambda x, other: 0.0), ("local", "()", "(1,)")),

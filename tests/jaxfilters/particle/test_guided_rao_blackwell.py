@@ -5,13 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.scipy.stats import norm
+from scipy.integrate import quad
 
 from jaxfilters import weights
 from jaxfilters.filter import keep_info, log_evidence, run
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.extended import extended_kalman
 from jaxfilters.particle.differentiable_resampling import soft
-from jaxfilters.particle.guided_rao_blackwell import Guidance, Jump, draw, guided_rao_blackwell
+from jaxfilters.particle.guidance import Guidance, GuidanceMixture, as_mixture, draw
+from jaxfilters.particle.guided_rao_blackwell import Jump, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell, rao_blackwell_shared
 from jaxfilters.particle.resampling import systematic
 from jaxfilters.particle.tempering import AdaptiveTempering
@@ -46,6 +48,13 @@ def look_nowhere(particles, log_weights, y):
     return look(particles, log_weights, y)._replace(information=jnp.zeros((1, 1)))
 
 
+def look_twice(particles, log_weights, y):
+    """The true maximum, and one that is not there."""
+    del particles, log_weights
+    information = jnp.array([[[1 / R]], [[0.3 / R]]])
+    return GuidanceMixture(jnp.stack([y + 0.1, y - 0.3])[:, None], information, jnp.array([0.0, 1.0]))
+
+
 def make_inner(builder=rao_blackwell_shared, num_particles=200, **options):
     prior = Gaussian(jnp.zeros(1), 4.0 * jnp.eye(1))
     return builder(sample_prior, prior, dynamics, log_likelihood, num_particles=num_particles, noise_dim=1, **options)
@@ -74,7 +83,10 @@ def exact_log_evidence(ys):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("guide", "scheme"), [(look_past, systematic), (look_nowhere, systematic), (look, soft(0.6))])
+@pytest.mark.parametrize(
+    ("guide", "scheme"),
+    [(look_past, systematic), (look_nowhere, systematic), (look_twice, systematic), (look, soft(0.6))],
+)
 def test_evidence_is_unbiased_whatever_the_guide_says(guide, scheme):
     # z-test at 4 sigma over 600 runs of the unbiased evidence: fails by chance once in 16000.
     ys = simulate()
@@ -107,15 +119,25 @@ def test_an_unseen_frame_is_a_plain_prediction():
     assert np.all(np.isfinite(state.ensemble.particles))
 
 
-@pytest.mark.system
-def test_importance_weights_restore_the_prior():
-    # 4e5 draws; each moment within 4 standard errors of the truth.
+def mixture_of(points):
+    """Guidance in three dimensions of very different units, with the first of two points or with both."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(3, 3)) * [1.0, 0.01, 3.0]
-    spread, information = root @ root.T, np.linalg.inv(root @ root.T) * 5
-    towards = np.tile((root @ [1.0, -0.5, 0.7])[:, None], 400_000)
+    inverse = np.linalg.inv(root @ root.T)
+    towards = root @ np.array([[1.0, -0.5, 0.7], [-0.8, 0.9, 0.2]]).T
+    information = np.stack([5 * inverse, 2 * inverse])[:points]
+    mixture = GuidanceMixture(jnp.zeros((points, 0)), jnp.asarray(information), jnp.asarray([0.0, 0.4])[:points])
+    return root @ root.T, mixture, towards.T[:points]
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("points", [1, 2])
+def test_importance_weights_restore_the_prior(points):
+    # 4e5 draws; each moment within 4 standard errors of the truth.
     with jax.enable_x64(True):
-        delta, log_ratio = draw(jax.random.key(0), *map(jnp.asarray, (spread, information, towards)), 0.2)
+        spread, mixture, towards = mixture_of(points)
+        towards = jnp.repeat(jnp.asarray(towards)[..., None], 400_000, axis=-1)
+        delta, log_ratio = draw(jax.random.key(0), jnp.asarray(spread), mixture, towards, 0.2)
     weight = np.exp(np.asarray(log_ratio))
     delta = np.asarray(delta)
     assert weight.max() <= 1 / 0.2 + 1e-9
@@ -127,6 +149,44 @@ def test_importance_weights_restore_the_prior():
     ]:
         product = weight * value
         assert abs(product.mean() - truth) < 4 * product.std() / np.sqrt(product.size)
+
+
+def test_shares_of_points_are_the_integrals_of_their_products(x64):
+    """Where the likelihood is the sum of both functions, q is p L / Z; Z by quadrature, for particles at two places."""
+    variance, information, heights, share = 0.5, np.array([3.0, 0.2]), np.array([0.7, -0.4]), 0.3
+    towards = np.array([[1.0, -2.0], [-1.5, 0.8]])  # of two points from two particles
+    mixture = GuidanceMixture(jnp.zeros((2, 0)), jnp.asarray(information)[:, None, None], jnp.asarray(heights))
+    delta, log_ratio = draw(
+        jax.random.key(1), variance * jnp.eye(1), mixture, jnp.repeat(jnp.asarray(towards)[:, None], 50, axis=-1), share
+    )
+
+    def likelihood(d, particle):
+        return np.exp(heights - 0.5 * information * (d - towards[:, particle]) ** 2).sum()
+
+    for k, (d, found) in enumerate(zip(np.asarray(delta)[0], np.asarray(log_ratio), strict=True)):
+        particle = k // 50
+        product = lambda d: norm_pdf(d, variance) * likelihood(d, particle)  # noqa: B023
+        ratio = share + (1 - share) * likelihood(d, particle) / quad(product, -20, 20, epsabs=1e-12)[0]
+        np.testing.assert_allclose(-found, np.log(ratio), atol=1e-9)
+
+
+def norm_pdf(x, variance):
+    return np.exp(-0.5 * x**2 / variance) / np.sqrt(2 * np.pi * variance)
+
+
+def test_a_point_without_likelihood_is_left_out_and_one_point_is_a_mixture_of_one():
+    one = Guidance(jnp.ones(2), 3.0 * jnp.eye(2))
+    alone = as_mixture(one)
+    both = GuidanceMixture(
+        jnp.stack([one.point, jnp.full(2, 9.0)]), jnp.stack([one.information, jnp.eye(2)]), jnp.array([0.0, -jnp.inf])
+    )
+    origins = jnp.linspace(-1, 1, 14).reshape(2, 7)
+    draws = [
+        draw(jax.random.key(2), jnp.eye(2), mixture, mixture.points[..., None] - origins, 0.2)
+        for mixture in (alone, both)
+    ]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), *draws)
+    assert as_mixture(both) is both
 
 
 SHARP = 1e-4
@@ -241,7 +301,7 @@ def walking(num_particles, **options):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("guide", [look, look_past])
+@pytest.mark.parametrize("guide", [look, look_past, look_twice])
 def test_evidence_is_unbiased_with_jumps(guide):
     # Without a linear state nothing is approximated. z-test at 4 sigma over 600 runs: fails by chance once in 16000.
     ys = jumping_walk(8, 0.0)
