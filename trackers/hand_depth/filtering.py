@@ -23,18 +23,32 @@ from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.math.lie import quaternion_mean, quaternion_normalize, quaternion_to_matrix
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.motion import PER_COORDINATE, HandMotion, per_coordinate
-from jaxfilters.models.hand.observation import HandImage, HandLikelihood, crop, hand_image, isolate, window_stride
-from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
+from jaxfilters.models.hand.observation import (
+    HandImage,
+    HandLikelihood,
+    crop,
+    hand_image,
+    hidden_digits,
+    isolate,
+    window_stride,
+)
+from jaxfilters.models.hand.registration import (
+    PosePrior,
+    Registration,
+    RegistrationConfig,
+    register,
+    target_from_image,
+)
 from jaxfilters.models.hand.skeleton import (
     DIGITS,
     TANGENT_SIZE,
-    HandGeometry,
     forward_kinematics,
     hand_center,
     local,
     retract,
 )
-from jaxfilters.particle.guided_rao_blackwell import Guidance, GuidedState, Jump, guided_rao_blackwell
+from jaxfilters.particle.guidance import GuidanceMixture
+from jaxfilters.particle.guided_rao_blackwell import GuidedState, Jump, guided_rao_blackwell
 from jaxfilters.particle.rao_blackwell import RaoBlackwellState, rao_blackwell_shared
 from jaxfilters.particle.tempering import AdaptiveTempering
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
@@ -42,6 +56,8 @@ from jaxfilters.trackers.hand_depth.config import HandDepthConfig
 WINDOW = (128, 128)
 REGISTRATION_STRIDE = 4
 """Of the pixels of the window: a thousand residuals fix 21 numbers."""
+OTHER_STARTS = 3
+"""Particles from which the registration begins besides the mean pose."""
 MAX_ERROR = 0.1
 """c_max of the paper, metres."""
 SIGMA = 3e-4
@@ -198,7 +214,7 @@ def build_filter(setup: Setup, pose: Array, likelihood: HandLikelihood, doubt: A
     )
     if not guide:
         return inner
-    registered, jump = jax.tree_util.Partial(_look, likelihood.geometry), jax.tree_util.Partial(_jump, doubt)
+    registered, jump = jax.tree_util.Partial(_look, likelihood), jax.tree_util.Partial(_jump, doubt)
     return guided_rao_blackwell(inner, registered, local=local, jump=jump, prior_share=0.1)
 
 
@@ -217,16 +233,31 @@ def _sample_about(pose: Array, std: Array, key: Array) -> Array:
     return retract(pose, std * jax.random.normal(key, (TANGENT_SIZE,)))
 
 
-def _look(geometry: HandGeometry, particles: Array, log_weights: Array, image: HandImage) -> Guidance:
-    """Register the predicted hand onto the image."""
+def _look(likelihood: HandLikelihood, particles: Array, log_weights: Array, image: HandImage) -> GuidanceMixture:
+    """Register the predicted hand onto the image, beginning with its mean pose and with some of the particles.
+
+    A hand that moved far may be found from a particle where the mean pose leads to another maximum. The likelihood says
+    which maximum counts. While a digit is hidden, many other poses explain the rest as well, so that only the maximum
+    that the mean pose leads to counts.
+    """
     mean, covariance = pose_moments(particles, log_weights)
     # A thousandth more on the diagonal: few effective particles leave the covariance without full rank.
     root = jnp.linalg.cholesky(covariance + jnp.diag(1e-3 * jnp.diagonal(covariance) + 1e-10))
     shape = tuple(size // REGISTRATION_STRIDE for size in WINDOW)
     camera = image.camera.crop(jnp.zeros(2), shape, REGISTRATION_STRIDE)
     target = target_from_image(camera, image.observed[::REGISTRATION_STRIDE, ::REGISTRATION_STRIDE])
-    found = register(camera, target, geometry, mean, PosePrior(mean, root), RegistrationConfig())
-    return Guidance(found.pose, found.information)
+
+    def registered(start: Array) -> Registration:
+        return register(camera, target, likelihood.geometry, start, PosePrior(mean, root), RegistrationConfig())
+
+    count = particles.shape[1]
+    chosen = [(2 * i + 1) * count // (2 * OTHER_STARTS) for i in range(OTHER_STARTS)]
+    found = jax.vmap(registered)(jnp.stack([mean, *(particles[:, i] for i in chosen)]))
+    log_likelihoods = jax.vmap(likelihood.log_likelihood, in_axes=(0, None))(found.pose, image)
+    is_hidden = hidden_digits(image, forward_kinematics(mean, likelihood.geometry).joints)
+    is_other = jnp.arange(1 + OTHER_STARTS) > 0
+    log_likelihoods = jnp.where(is_other & jnp.any(is_hidden), -jnp.inf, log_likelihoods)
+    return GuidanceMixture(found.pose, found.information, log_likelihoods)
 
 
 @compiled_quickly

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.models.hand.skeleton import anatomical_hand
+from jaxfilters.models.hand.observation import crop, hand_image
+from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics, hand_center, open_palm, retract
+from jaxfilters.models.rendering.depth import capsule_depth
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.trackers.hand_depth import filtering
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
@@ -177,3 +179,31 @@ def test_a_frame_without_readings_of_the_fingers_slows_them(tracker, sequence):
     # The first frame alone is predicted with what the state says of the last one.
     other = state._replace(hidden=jnp.ones(5, bool))
     assert not np.array_equal(tracker.step(other, depth[CHUNK:], times[CHUNK:])[1].pose[0], track.pose[0])
+
+
+@pytest.mark.system
+def test_a_hand_that_moved_far_is_found_from_a_particle_but_not_while_a_digit_is_hidden():
+    """The mean pose shows the other side of the hand: from there, registration alone ends 60 mm away."""
+    setup = hand_depth.set_up(kinect_v2(), HandDepthConfig(hand="right", scale=1.0))
+    true = open_palm(jnp.array([0.0, 0.09, 0.7]))
+    turned = retract(true, jnp.zeros(21).at[4].set(2.5))
+    window, empty = crop(setup.camera, jnp.full(setup.camera.shape, jnp.inf), hand_center(true), filtering.WINDOW, 1)
+    depth = capsule_depth(window, forward_kinematics(true, setup.likelihood.geometry).capsules)
+    image = hand_image(window, jnp.minimum(depth, empty))
+    noise = 0.01 * jax.random.normal(jax.random.key(0), (21, 60))
+    particles = jax.vmap(retract, in_axes=(None, 1), out_axes=1)(turned, noise).at[:, 30].set(true)
+
+    found = filtering._look(setup.likelihood, particles, jnp.full(60, -jnp.log(60)), image)
+
+    def error_mm(pose):
+        joints = [forward_kinematics(each, setup.likelihood.geometry).joints for each in (pose, true)]
+        return 1000 * float(jnp.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+
+    best = int(jnp.argmax(found.log_likelihoods))
+    assert best != 0
+    assert error_mm(found.points[best]) < 5
+    assert error_mm(found.points[0]) > 30
+    hidden = image._replace(observed=image.observed.at[:60].set(jnp.nan))
+    assert not np.isfinite(
+        filtering._look(setup.likelihood, particles, jnp.full(60, -jnp.log(60)), hidden).log_likelihoods[1:]
+    ).any()
