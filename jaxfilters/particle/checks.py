@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from jaxfilters.particle.guidance import Guidance, GuidanceMixture
+
 _SYMMETRY_TOLERANCE = 1e-4
 _EIGENVALUE_TOLERANCE = 1e-5
 """As shares of the largest element; float32 rounding of products of a few hundred terms stays below both."""
@@ -305,25 +307,30 @@ def check_partitions(partitions: Any, num_coordinates: int) -> None:
 
 def check_guidance(guidance: Any, x: PyTree, size: int) -> None:
     """Require points like the state of one particle, each with an information matrix of its tangent space."""
-    if all(hasattr(guidance, name) for name in ("points", "information", "log_likelihoods")):
-        _check_guidance_mixture(guidance, x, size)
+    if isinstance(guidance, GuidanceMixture):
+        _check_mixture(guidance, x, size)
         return
-    if not (hasattr(guidance, "point") and hasattr(guidance, "information")):
+    if not isinstance(guidance, Guidance):
         raise TypeError(f"guide must return a Guidance or a GuidanceMixture; got {_kind(guidance)}.")
     like("point of guide", guidance.point, x, "the nonlinear state of a particle")
     check_covariance("information of guide", guidance.information, size, "an information matrix")
 
 
-def _check_guidance_mixture(mixture: Any, x: PyTree, size: int) -> None:
-    count = jnp.size(mixture.log_likelihoods)
-    check_shape("log_likelihoods of guide", mixture.log_likelihoods, (count,), "one for each of the points")
-    if count == 0:
+def _check_mixture(mixture: GuidanceMixture, x: PyTree, size: int) -> None:
+    heights = jnp.asarray(mixture.log_likelihoods)
+    check_shape("log_likelihoods of guide", heights, (heights.size,), "one for each point")
+    if heights.size == 0:
         raise ValueError("guide must return at least one point; got none.")
-    several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), x)
-    like("points of guide", mixture.points, several, "nonlinear states of particles, the axis of the points first")
-    check_shape(
-        "information of guide", mixture.information, (count, size, size), "an information matrix for each point"
-    )
+    check_values("log_likelihoods of guide", heights, "below infinity", lambda values: values < np.inf)
+    several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (heights.size, *jnp.shape(leaf))), x)
+    expected = f"nonlinear states of {heights.size} particles, as many as there are log_likelihoods"
+    like("points of guide", mixture.points, several, expected)
+    matrices = (heights.size, size, size)
+    check_shape("information of guide", mixture.information, matrices, "an information matrix for each point")
+    information, values = concrete(mixture.information), concrete(heights)
+    if information is not None and values is not None:
+        for matrix in information[values > -np.inf]:
+            check_covariance("information of guide", matrix, size, "an information matrix")
 
 
 def check_jump(jump: Any, size: int) -> None:

@@ -34,7 +34,7 @@ class Guidance(NamedTuple):
 class GuidanceMixture(NamedTuple):
     """Gaussian approximations of the likelihood of one observation about several of its maxima.
 
-    Two of them may lie at the same place.
+    Their sum stands for the likelihood, so that a maximum which is given twice counts twice.
     """
 
     points: PyTree
@@ -42,8 +42,9 @@ class GuidanceMixture(NamedTuple):
     information: Float[Array, "m n n"]
     """Inverse of each one's covariance in the tangent space at its point; zero where it says nothing."""
     log_likelihoods: Float[Array, " m"]
-    """Logarithms of the likelihood at the points, up to a constant that all have in common; any other weights of the
-    maxima cost efficiency, not correctness. `-inf` leaves a maximum out; at least one must be finite."""
+    """Logarithms of the likelihood at the points, up to a constant that all have in common. Other weights of the maxima
+    cost efficiency, not correctness, unless the filter is tempered. `-inf` leaves a maximum out, whose point and
+    information may then hold anything; if all are left out, particles are drawn from the transition."""
 
 
 @runtime_checkable
@@ -58,7 +59,7 @@ class Guide(Protocol):
 def as_mixture(guidance: Guidance | GuidanceMixture) -> GuidanceMixture:
     """A mixture as it is; the approximation about one maximum as a mixture of one."""
     if isinstance(guidance, GuidanceMixture):
-        return guidance
+        return jax.tree.map(jnp.asarray, guidance)
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], guidance)
     return GuidanceMixture(one.point, one.information, jnp.zeros(1, one.information.dtype))
 
@@ -95,7 +96,7 @@ def draw(
         key: Random key.
         spread: Covariance N of the increments given the past.
         mixture: Its information matrices Lambda_j, and the logarithms of the likelihood at its m points.
-        towards: Increments t_ij that would move each of the k particles to each of the points.
+        towards: Increments t_ij that would move each of the k particles to each of the m points.
         prior_share: Fraction alpha of draws from the transition alone.
 
     Returns:
@@ -104,8 +105,11 @@ def draw(
     choice_key, noise_key, point_key = jax.random.split(key, 3)
     noise = standard_normal(noise_key, towards.shape[1:])
     root = cholesky(spread)
-    products = jax.vmap(_product, in_axes=(None, 0, 0))(root, mixture.information, towards)
-    log_shares = jax.nn.log_softmax(products.log_integral + mixture.log_likelihoods[:, None], axis=0)
+    information, heights, towards = _without_what_is_left_out(mixture, towards)
+    products = jax.vmap(_product, in_axes=(None, 0, 0))(root, information, towards)
+    # Which point a particle is drawn towards has no derivative. The weights are right with any shares, so that those
+    # that do not depend on the parameters leave the derivative of the evidence right, too.
+    log_shares = jax.lax.stop_gradient(jax.nn.log_softmax(products.log_integral + heights[:, None], axis=0))
     point = jax.random.categorical(point_key, log_shares, axis=0)
     guided = jax.vmap(lambda product: product.center + matmul(product.inverse_root.T, noise))(products)
     guided = jnp.take_along_axis(guided, point[None, None], axis=0)[0]
@@ -116,6 +120,16 @@ def draw(
     log_guided = jax.scipy.special.logsumexp(log_shares + log_densities, axis=0)
     log_mixture = jnp.logaddexp(math.log(prior_share) + log_prior, math.log1p(-prior_share) + log_guided)
     return dot(root, whitened), log_prior - log_mixture
+
+
+def _without_what_is_left_out(
+    mixture: GuidanceMixture, towards: Float[Array, "m n k"]
+) -> tuple[Float[Array, "m n n"], Float[Array, " m"], Float[Array, "m n k"]]:
+    """Information, heights and increments; those left out say nothing, and count only where all are left out."""
+    counts = mixture.log_likelihoods > -jnp.inf
+    heights = jnp.where(counts | ~jnp.any(counts), jnp.where(counts, mixture.log_likelihoods, 0.0), -jnp.inf)
+    counts = counts[:, None, None]
+    return jnp.where(counts, mixture.information, 0.0), heights, jnp.where(counts, towards, 0.0)
 
 
 def _product(root: Float[Array, "n n"], information: Float[Array, "n n"], towards: Float[Array, "n k"]) -> _Product:

@@ -1,9 +1,9 @@
 r"""Rao-Blackwellized particle filter with a proposal that depends on the current observation.
 
 With many dimensions and few particles, hardly any sample of the transition falls where the likelihood is high. Here a
-`guide` computes from the observation a Gaussian approximation of the likelihood, or several about its maxima, and the
-particles are drawn from its product with their own transitions: see `jaxfilters.particle.guidance`. A rough guide costs
-efficiency, not correctness.
+`guide` computes from the observation a Gaussian approximation of the likelihood, or several about its maxima. Every
+particle is drawn from the product of this approximation and its own transition: see `jaxfilters.particle.guidance`. A
+rough guide costs efficiency, not correctness.
 
 The increments may be heavy-tailed: with a small probability a particle jumps, which adds a wide normal number to its
 increment (a scale mixture; D. F. Andrews and C. L. Mallows, "Scale mixtures of normal distributions", Journal of the

@@ -237,8 +237,8 @@ def _look(likelihood: HandLikelihood, particles: Array, log_weights: Array, imag
     """Register the predicted hand onto the image, beginning with its mean pose and with some of the particles.
 
     A hand that moved far may be found from a particle where the mean pose leads to another maximum. The likelihood says
-    which maximum counts. While a digit is hidden, many other poses explain the rest as well, so that only the maximum
-    that the mean pose leads to counts.
+    how much each maximum counts. While a digit is hidden, many other poses explain the rest as well, so that only the
+    maximum that the mean pose leads to counts.
     """
     mean, covariance = pose_moments(particles, log_weights)
     # A thousandth more on the diagonal: few effective particles leave the covariance without full rank.
@@ -254,10 +254,11 @@ def _look(likelihood: HandLikelihood, particles: Array, log_weights: Array, imag
     chosen = [(2 * i + 1) * count // (2 * OTHER_STARTS) for i in range(OTHER_STARTS)]
     found = jax.vmap(registered)(jnp.stack([mean, *(particles[:, i] for i in chosen)]))
     log_likelihoods = jax.vmap(likelihood.log_likelihood, in_axes=(0, None))(found.pose, image)
-    is_hidden = hidden_digits(image, forward_kinematics(mean, likelihood.geometry).joints)
+    is_hidden = hidden_digits(image, forward_kinematics(found.pose[0], likelihood.geometry).joints)
     is_other = jnp.arange(1 + OTHER_STARTS) > 0
-    log_likelihoods = jnp.where(is_other & jnp.any(is_hidden), -jnp.inf, log_likelihoods)
-    return GuidanceMixture(found.pose, found.information, log_likelihoods)
+    is_finite = jnp.all(jnp.isfinite(found.pose), axis=1) & jnp.all(jnp.isfinite(found.information), axis=(1, 2))
+    counts = is_finite & ~(is_other & jnp.any(is_hidden))
+    return GuidanceMixture(found.pose, found.information, jnp.where(counts, log_likelihoods, -jnp.inf))
 
 
 @compiled_quickly

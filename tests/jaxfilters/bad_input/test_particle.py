@@ -349,6 +349,12 @@ PARTICLE = [
     Case(
         "guide heights", lambda: run_guided_by_mixture(log_likelihoods=jnp.zeros((2, 1))), ("log_likelihoods", "(2, 1)")
     ),
+    Case("guide mixture sign", lambda: run_guided_by_mixture(information=-jnp.ones((2, 1, 1))), ("information", "-1")),
+    Case(
+        "guide mixture infinite",
+        lambda: run_guided_by_mixture(log_likelihoods=jnp.array([0.0, jnp.inf])),
+        ("log_likelihoods of guide", "inf"),
+    ),
     Case("guide no point", lambda: run_guided_by_mixture(log_likelihoods=jnp.zeros(0)), ("guide", "none")),
     Case("guide information", lambda: run_guided(information=jnp.eye(2)), ("information", "(2, 2)", "(1, 1)")),
     Case("guide sign", lambda: run_guided(information=-jnp.eye(1)), ("information", "-1")),

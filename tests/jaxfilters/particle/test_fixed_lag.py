@@ -16,7 +16,8 @@ from jaxfilters.particle.adaptive import adaptive_diffusion
 from jaxfilters.particle.bootstrap import bootstrap
 from jaxfilters.particle.differentiable_resampling import transport
 from jaxfilters.particle.fixed_lag import fixed_lag, fixed_lag_rts
-from jaxfilters.particle.guided_rao_blackwell import Guidance, guided_rao_blackwell
+from jaxfilters.particle.guidance import Guidance
+from jaxfilters.particle.guided_rao_blackwell import guided_rao_blackwell
 from jaxfilters.particle.partitioned import Partitions, batch_log_likelihood, consecutive
 from jaxfilters.particle.rao_blackwell import MixedDynamics, rao_blackwell_shared
 from jaxfilters.particle.smoothing import keep_history, trajectories
