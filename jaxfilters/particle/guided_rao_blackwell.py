@@ -222,11 +222,12 @@ def _update(
 
     of_each_particle = jax.vmap(to_point, in_axes=(-1, None), out_axes=-1)
     towards = jax.vmap(of_each_particle, in_axes=(None, 0))(predicted.origin, mixture.points) - predicted.drift
-    delta, log_ratio = draw(key, predicted.spread, mixture, towards, model.prior_share)
-    if jumps is not None:
-        wide, log_ratio_wide = draw(key, jumps.spread, mixture, towards, model.prior_share)
-        delta = jnp.where(jumps.jumped, wide, delta)
-        log_ratio = jnp.where(jumps.jumped, log_ratio_wide, log_ratio)
+    if jumps is None:
+        delta, log_ratio = draw(key, predicted.spread, mixture, towards, model.prior_share)
+    else:
+        both = jnp.stack([predicted.spread, jumps.spread])  # one program for both: it takes half as long to compile
+        drawn = jax.vmap(lambda spread: draw(key, spread, mixture, towards, model.prior_share))(both)
+        delta, log_ratio = (jnp.where(jumps.jumped, wide, usual) for usual, wide in drawn)
     state = _moved(model, state, delta, _shift(predicted, jumps, delta - predicted.delta))
     ensemble, info = rao_blackwell.update_ensemble(model.inner, state.ensemble, observation, inputs, log_ratio)
     return state._replace(ensemble=ensemble), info
