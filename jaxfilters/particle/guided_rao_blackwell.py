@@ -225,7 +225,7 @@ def _update(
     if jumps is None:
         delta, log_ratio = draw(key, predicted.spread, mixture, towards, model.prior_share)
     else:
-        both = jnp.stack([predicted.spread, jumps.spread])  # one program for both: it takes half as long to compile
+        both = jnp.stack([predicted.spread, jumps.spread])  # traced once for both
         drawn = jax.vmap(lambda spread: draw(key, spread, mixture, towards, model.prior_share))(both)
         delta, log_ratio = (jnp.where(jumps.jumped, wide, usual) for usual, wide in drawn)
     state = _moved(model, state, delta, _shift(predicted, jumps, delta - predicted.delta))
