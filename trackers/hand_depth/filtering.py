@@ -254,7 +254,7 @@ def _look(likelihood: HandLikelihood, particles: Array, log_weights: Array, imag
     chosen = [(2 * i + 1) * count // (2 * OTHER_STARTS) for i in range(OTHER_STARTS)]
     found = jax.vmap(registered)(jnp.stack([mean, *(particles[:, i] for i in chosen)]))
     log_likelihoods = jax.vmap(likelihood.log_likelihood, in_axes=(0, None))(found.pose, image)
-    # At the predicted pose: judged where the registration ends, fingers that are hidden are 10.4 mm off in place of 10.0.
+    # In the predicted pose: judged in the one that is registered, hidden fingers are 10.4 mm off in place of 10.0.
     is_hidden = hidden_digits(image, forward_kinematics(mean, likelihood.geometry).joints)
     is_other = jnp.arange(1 + OTHER_STARTS) > 0
     is_finite = jnp.all(jnp.isfinite(found.pose), axis=1) & jnp.all(jnp.isfinite(found.information), axis=(1, 2))
