@@ -104,6 +104,23 @@ def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return materialized(jnp.stack([jnp.stack(row) for row in L]))
 
 
+def log_det_triangular(L: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Logarithm of the determinant of a triangular matrix with a positive diagonal: half of that of `L L^T`.
+
+    Raises:
+        ValueError: If L is not square.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> from jaxfilters.math import linalg
+        >>> print(linalg.log_det_triangular(jnp.array([[2.0, 0.0], [5.0, 0.5]])))
+        0.0
+    """
+    if L.shape != L.shape[:1] * 2:
+        raise ValueError(f"L must be square; got {L.shape}.")
+    return jnp.log(jnp.diagonal(L)).sum()
+
+
 def solve_triangular(
     L: Float[Array, "n n"], b: Float[Array, " n"] | Float[Array, "n m"], *, transpose: bool = False
 ) -> Float[Array, " n"] | Float[Array, "n m"]:

@@ -23,7 +23,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.linearize import Linearize, taylor
-from jaxfilters.math.linalg import cholesky, matmul, safe_norm, solve_triangular
+from jaxfilters.math.linalg import cholesky, log_det_triangular, matmul, safe_norm, solve_triangular
 from jaxfilters.particle import checks
 from jaxfilters.typing import AnyKey, LogLikelihood, only_inputs, taking_inputs
 
@@ -299,7 +299,7 @@ def draw_whitened(
     ahead, root, center, precision_root = posterior
     noise = randomness[: center.size]
     z = center + solve_triangular(precision_root, noise, transpose=True)
-    log_determinant = jnp.sum(jnp.log(jnp.diagonal(precision_root)))
+    log_determinant = log_det_triangular(precision_root)
     log_density = log_determinant - 0.5 * jnp.sum(noise**2)
     if randomness.size > center.size:
         plain = jax.scipy.stats.norm.cdf(randomness[-1]) < prior_share

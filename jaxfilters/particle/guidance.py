@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxfilters._full_precision import dot
 from jaxfilters._xla.noise import standard_normal
-from jaxfilters.math.linalg import cholesky, matmul, solve_triangular
+from jaxfilters.math.linalg import cholesky, log_det_triangular, matmul, solve_triangular
 from jaxfilters.typing import AnyKey
 
 
@@ -144,14 +144,10 @@ def _product(root: Float[Array, "n n"], information: Float[Array, "n n"], toward
     # The exponent at the mean of the product: a sum of squares, where differences of large ones would cancel.
     missed = dot(root, center) - towards
     exponent = jnp.sum(center**2, axis=0) + jnp.sum(missed * dot(information, missed), axis=0)
-    return _Product(precision_root, inverse_root, center, -0.5 * exponent - _log_determinant(precision_root))
+    return _Product(precision_root, inverse_root, center, -0.5 * exponent - log_det_triangular(precision_root))
 
 
 def _log_density(product: _Product, whitened: Float[Array, "n k"]) -> Float[Array, " k"]:
     """Of whitened increments, without the constant that it shares with the transition."""
     deviation = dot(product.precision_root.T, whitened - product.center)
-    return -0.5 * jnp.sum(deviation**2, axis=0) + _log_determinant(product.precision_root)
-
-
-def _log_determinant(root: Float[Array, "n n"]) -> Float[Array, ""]:
-    return jnp.log(jnp.diagonal(root)).sum()
+    return -0.5 * jnp.sum(deviation**2, axis=0) + log_det_triangular(product.precision_root)

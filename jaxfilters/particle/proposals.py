@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot
-from jaxfilters.math.linalg import cholesky, solve_triangular
+from jaxfilters.math.linalg import cholesky, log_det_triangular, solve_triangular
 from jaxfilters.particle.gaussian_proposals import laplace as laplace
 from jaxfilters.particle.gaussian_proposals import linearized as linearized
 
@@ -81,9 +81,5 @@ def plug_in_corrected(
     root_Q, root_N = cholesky(Q_n), cholesky(N)
     delta = dot(root_Q, noise)
     whitened = solve_triangular(root_N, delta)
-    log_ratio = 0.5 * (dot(noise, noise) - dot(whitened, whitened)) + _half_log_det(root_Q) - _half_log_det(root_N)
-    return delta, log_ratio
-
-
-def _half_log_det(root: Float[Array, "n n"]) -> Float[Array, ""]:
-    return jnp.log(jnp.diagonal(root)).sum()
+    narrower = log_det_triangular(root_Q) - log_det_triangular(root_N)
+    return delta, 0.5 * (dot(noise, noise) - dot(whitened, whitened)) + narrower

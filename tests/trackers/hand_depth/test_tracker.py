@@ -183,7 +183,7 @@ def test_a_frame_without_readings_of_the_fingers_slows_them(tracker, sequence):
 
 @pytest.mark.system
 def test_a_hand_that_moved_far_is_found_from_a_particle_but_not_while_a_digit_is_hidden():
-    """The mean pose shows the other side of the hand: from there, registration alone ends 60 mm away."""
+    """The mean pose shows the other side of the hand; from there, registration ends 55 mm away, from a particle 13."""
     setup = hand_depth.set_up(kinect_v2(), HandDepthConfig(hand="right", scale=1.0))
     true = open_palm(jnp.array([0.0, 0.09, 0.7]))
     turned = retract(true, jnp.zeros(21).at[4].set(2.5))
@@ -191,7 +191,8 @@ def test_a_hand_that_moved_far_is_found_from_a_particle_but_not_while_a_digit_is
     depth = capsule_depth(window, forward_kinematics(true, setup.likelihood.geometry).capsules)
     image = hand_image(window, jnp.minimum(depth, empty))
     noise = 0.01 * jax.random.normal(jax.random.key(0), (21, 60))
-    particles = jax.vmap(retract, in_axes=(None, 1), out_axes=1)(turned, noise).at[:, 30].set(true)
+    near = retract(true, jnp.zeros(21).at[:3].set(0.012).at[5].set(0.15))
+    particles = jax.vmap(retract, in_axes=(None, 1), out_axes=1)(turned, noise).at[:, 30].set(near)
 
     found = filtering._look(setup.likelihood, particles, jnp.full(60, -jnp.log(60)), image)
 
@@ -201,8 +202,8 @@ def test_a_hand_that_moved_far_is_found_from_a_particle_but_not_while_a_digit_is
 
     best = int(jnp.argmax(found.log_likelihoods))
     assert best != 0
-    assert error_mm(found.points[best]) < 5
-    assert error_mm(found.points[0]) > 30
+    assert error_mm(found.points[best]) < 20 < 30 < error_mm(near)
+    assert error_mm(found.points[0]) > 40
     hidden = image._replace(observed=image.observed.at[:60].set(jnp.nan))
     assert not np.isfinite(
         filtering._look(setup.likelihood, particles, jnp.full(60, -jnp.log(60)), hidden).log_likelihoods[1:]
