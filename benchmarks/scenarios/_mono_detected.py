@@ -1,9 +1,10 @@
 """Modelled people from their images alone, beside `solvePnP`.
 
 Nothing is known of a person or of where the landmarks are: the detectors find them, as for a user. The same detections
-go to OpenCV's `solvePnP` with the mean face of the same model, which is the simplest thing that could work. Both are
-judged on the same frames: those in which the detector sees a face and the tracker follows it. The people are none of
-those whom the detectors' errors were measured on (`jaxfilters fit face-detector`).
+go to the simplest things that could work: the landmarks to OpenCV's `solvePnP` with the mean face of the same model,
+and meshes, where the detector gives them, to the rotation that takes the mean mesh nearest to them. All are judged on
+the same frames: those in which the detector sees a face and the tracker follows it. The people are none of those whom
+the detectors' errors were measured on (`jaxfilters fit face-detector`).
 """
 
 import sys
@@ -28,6 +29,7 @@ from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.table import TRACKED
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
+from jaxfilters.trackers.head.mono.mesh_rotation import measured, on_axes_of
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.io.face_models import people_face_model
@@ -57,6 +59,8 @@ class DetectedRun(NamedTuple):
     """True depth."""
     lost_share: float
     """Of the frames after the start in which the face is not followed."""
+    mesh_errors: Float[np.ndarray, "n 3"] | None = None
+    """Of roll, yaw and pitch of the mesh alone, if the detector gives one."""
 
 
 def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
@@ -134,11 +138,17 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
     """
     images = made.frames(0, len(made))
     track = followed(made, images, face, detector, seed)
-    located = [
-        pnp(face, made.rig, detector, image) if i % EVERY == 0 else np.full(6, np.nan)
-        for i, image in enumerate(images[:, 0])
-    ]
-    return _evaluated(made, track, np.stack(located))
+    located, by_mesh = np.full((2, len(images), 6), np.nan)
+    known = None if detector.errors is None else detector.errors.vertices
+    vertices = None if known is None else on_axes_of(face, known)
+    for i in range(0, len(images), EVERY):
+        found = detector.detect(images[i, 0], None)
+        if isinstance(found, str):
+            continue
+        located[i] = pnp(face, made.rig, found.points)
+        if vertices is not None and found.solid is not None:
+            by_mesh[i, 3:] = measured(vertices, found.solid, made.rig)[0]
+    return _evaluated(made, track, located, by_mesh)
 
 
 def followed(
@@ -151,23 +161,18 @@ def followed(
     return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
 
 
-def pnp(
-    face: MultilinearFace, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
-) -> Float[np.ndarray, " 6"]:
-    """Pose of the mean face by `solvePnP` from one image, millimetres and radians; NaN without a detection."""
-    found = detector.detect(image, None)
-    if isinstance(found, str):
-        return np.full(6, np.nan)
+def pnp(face: MultilinearFace, rig: CameraRig, points: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, " 6"]:
+    """Pose of the mean face by `solvePnP` from detected landmarks, millimetres and radians."""
     mean = np.asarray(shape(face, face.identity_mean, face.expression_mean), float)
     start = np.zeros((3, 1)), FACING[:, None].copy()
     (fx, fy), (cx, cy) = np.asarray(rig.focal[0], float), np.asarray(rig.center[0], float)
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    _, turn, place = cv2.solvePnP(mean, found.points, K, np.zeros(5), *start, useExtrinsicGuess=True)
+    _, turn, place = cv2.solvePnP(mean, points, K, np.zeros(5), *start, useExtrinsicGuess=True)
     return np.concatenate([place.ravel(), Rotation.from_rotvec(turn.ravel()).as_euler("ZYX")])
 
 
 def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
-    """Errors, coverage of two standard deviations, and those of `solvePnP`, over all people.
+    """Errors, coverage of two standard deviations, and those of the simplest methods, over all people.
 
     Errors of depth are sizes of each person's mean error: how large a face is stays unknown, whatever is averaged.
 
@@ -189,6 +194,14 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
             f"{prefix}z_error_mm_{name}": Metric(float(np.mean(np.abs(depth))), "mm", "lower"),
             f"{prefix}z_bias_share_{name}": Metric(100 * abs(float(np.mean(share))), "%", "lower"),
         }
+    meshes = [run.mesh_errors for run in runs if run.mesh_errors is not None]
+    if meshes:
+        rms = np.sqrt(np.mean(np.square(np.concatenate(meshes)), axis=0))
+        metrics |= {
+            f"mesh_{axis}_rms_deg_{name}": Metric(float(rms[i - 3]), "deg", "lower")
+            for axis, i in AXES.items()
+            if i > 2
+        }
     within = np.concatenate([np.abs(run.errors) <= 2 * run.std for run in runs])
     metrics |= {
         f"coverage2_{axis}_{name}": Metric(100 * float(np.mean(within[:, i])), "%", "higher")
@@ -198,10 +211,14 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
     return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
 
 
-def _evaluated(made: IctSequence, track: MonoTrack, located: Float[np.ndarray, "t 6"]) -> DetectedRun:
+def _evaluated(
+    made: IctSequence, track: MonoTrack, located: Float[np.ndarray, "t 6"], by_mesh: Float[np.ndarray, "t 6"]
+) -> DetectedRun:
     is_tracked = np.isin(track.status, TRACKED)
     rows = np.flatnonzero(is_tracked & np.isfinite(located[:, 0]))
     begun = int(np.argmax(is_tracked)) if is_tracked.any() else 0
-    errors, beside = (pose_errors(one, made.poses)[rows] for one in (track.pose, located))
+    errors, beside, of_mesh = (pose_errors(one, made.poses)[rows] for one in (track.pose, located, by_mesh))
     lost = float(np.mean(~is_tracked[begun:]))
-    return DetectedRun(errors, np.asarray(track.pose_std)[rows] * DISPLAY, beside, made.poses[rows, 2], lost)
+    has_meshes = bool(len(rows)) and bool(np.all(np.isfinite(of_mesh[:, 3:])))
+    std, distance = np.asarray(track.pose_std)[rows] * DISPLAY, made.poses[rows, 2]
+    return DetectedRun(errors, std, beside, distance, lost, of_mesh[:, 3:] if has_meshes else None)

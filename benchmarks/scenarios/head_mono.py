@@ -32,7 +32,7 @@ from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._mono_detected import people_metrics
-from jaxfilters.benchmarks.scenarios._mono_floor import modelled_size_metrics, size_errors
+from jaxfilters.benchmarks.scenarios._mono_floor import modelled_rotation_metrics, modelled_size_metrics, size_errors
 from jaxfilters.benchmarks.scenarios._mono_real import cross_model, modelled_metrics, video_metrics
 from jaxfilters.benchmarks.scenarios._mono_runs import (
     Contender,
@@ -81,7 +81,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     metrics = experiment_metrics(users, QUICK_NUM_FRAMES if quick else NUM_FRAMES, seed, quick, kept)
     parts = {
         "floor": lambda: _floor(users),
-        "modelled_floor": lambda: modelled_size_metrics(seed, DISTANCE_MM),
+        "modelled_floor": lambda: modelled_size_metrics(seed, DISTANCE_MM) | modelled_rotation_metrics(seed),
         "starts": lambda: start_metrics(learnt_from(people_but(None), 10, seed).face, seed, 2 if quick else 40),
         "speed": lambda: speed_metrics(seed, 3 if quick else 25),
         "modelled": lambda: modelled_metrics(quick, seed),

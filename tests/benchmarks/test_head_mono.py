@@ -13,7 +13,6 @@ from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
 from jaxfilters.trackers.head.mono.config import MonoConfig
-from jaxfilters.trackers.head.mono.detectors import Seen
 from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.io.face_models import default_face_model
 
@@ -118,7 +117,8 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
 
 def detected(errors, pnp, std, distance=600.0):
     rows = lambda value: np.broadcast_to(np.asarray(value, float), (4, 6))
-    return _mono_detected.DetectedRun(rows(errors), rows(std), rows(pnp), np.full(4, distance), 0.25)
+    mesh = np.broadcast_to([3.0, 4.0, 5.0], (4, 3)) if std == 7.0 else None
+    return _mono_detected.DetectedRun(rows(errors), rows(std), rows(pnp), np.full(4, distance), 0.25, mesh)
 
 
 def test_detected_people_stand_beside_solve_pnp():
@@ -130,6 +130,7 @@ def test_detected_people_stand_beside_solve_pnp():
     assert metrics["yaw_rms_deg_modelled"].value == pytest.approx(np.sqrt(12.5))
     assert metrics["pnp_yaw_rms_deg_modelled"].value == pytest.approx(1.0)
     assert metrics["pnp_z_error_mm_modelled"].value == pytest.approx(1.0)
+    assert metrics["mesh_pitch_rms_deg_modelled"].value == pytest.approx(5.0)  # of whom there are meshes
     assert metrics["coverage2_z_modelled"].value == pytest.approx(50.0)
     assert metrics["lost_share_modelled"].value == pytest.approx(25.0)
 
@@ -139,14 +140,4 @@ def test_solve_pnp_finds_the_mean_face_where_it_is():
     pose = np.array([20.0, -10.0, 620.0, 0.1, 0.3, -0.2])
     mean = shape(face, face.identity_mean, face.expression_mean)
     points = np.asarray(project_shape(_mono_runs.camera(), mean, jnp.asarray(pose))[0][0], float)
-
-    class Detector:
-        errors = None
-        is_averaged = False
-
-        def detect(self, image, near):
-            return Seen(points) if image.any() else "no face"
-
-    found = _mono_detected.pnp(face, _mono_runs.camera(), Detector(), np.ones((480, 640), np.uint8))
-    np.testing.assert_allclose(found, pose, atol=0.02)
-    assert np.isnan(_mono_detected.pnp(face, _mono_runs.camera(), Detector(), np.zeros((480, 640), np.uint8))).all()
+    np.testing.assert_allclose(_mono_detected.pnp(face, _mono_runs.camera(), points), pose, atol=0.02)

@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import MIRROR, NUM_LANDMARKS
+from jaxfilters.models.face.pose import rotation
 from jaxfilters.models.face.rig import CameraRig, jacobian, monocular, project_shape
 from jaxfilters.models.synthetic.face_texture import make_background
 from jaxfilters.models.synthetic.ict_face import IctModel, deformed, make_ict_person, ten_landmarks
@@ -26,6 +27,7 @@ from jaxfilters.models.synthetic.ict_render import make_ict_head, render_ict
 from jaxfilters.models.synthetic.ict_skin import paint_skin
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector
+from jaxfilters.trackers.head.mono.mesh_rotation import line_of_sight
 from jaxfilters.trackers.head.mono.start import is_symmetric
 from jaxfilters.trackers.io.detector_errors import DetectorErrors, save_detector_errors
 from jaxfilters.trackers.io.errors import InputError
@@ -58,6 +60,8 @@ class Picture(NamedTuple):
     """Detected minus true."""
     J: Float[np.ndarray, "10 2 3"]
     """Of the pixels by the places of the landmarks."""
+    solid: Float[np.ndarray, "V 3"] | None = None
+    """The mesh on the axes of the face about its mean vertex, millimetres, if the detector gives one."""
 
 
 def fit_detector(options: argparse.Namespace) -> str:
@@ -98,7 +102,8 @@ def of_person(key: AnyKey, model: IctModel, detectors: dict[str, Detector], imag
             if isinstance(observed, str) or not is_symmetric(observed.points):
                 continue
             if np.linalg.norm(observed.points.mean(axis=0) - uv.mean(axis=0)) < ELSEWHERE * eyes:
-                found[name].append(Picture((observed.points - uv) / scale, J / scale))
+                solid = None if observed.solid is None else _on_face(observed.solid, pose, rig) / scale
+                found[name].append(Picture((observed.points - uv) / scale, J / scale, solid))
     return found
 
 
@@ -123,7 +128,15 @@ def measured(people: list[list[Picture]], name: str) -> DetectorErrors:
     covariance = (both - mean).T @ (both - mean) / len(both)
     # Robust: what is far off is no noise but a mistake, which the tracker's losses are for.
     white = 1.4826 * np.median(np.abs(np.concatenate([rest, rest[:, list(MIRROR)]])), axis=0).max(axis=-1)
-    return DetectorErrors(mean.reshape(-1, 3), covariance, white)
+    solids = [one.solid for pictures in enough for one in pictures if one.solid is not None]
+    vertices = np.mean(solids, axis=0) if solids else None
+    return DetectorErrors(mean.reshape(-1, 3), covariance, white, vertices)
+
+
+def _on_face(solid: Float[np.ndarray, "V 3"], pose: jax.Array, rig: CameraRig) -> Float[np.ndarray, "V 3"]:
+    """A mesh in pixels about its mean vertex, on the axes of a face of that pose."""
+    sight = np.asarray(line_of_sight(rig, jnp.asarray(solid[:, :2].mean(axis=0))), float)
+    return (solid - solid.mean(axis=0)) @ sight.T @ np.asarray(rotation(pose[3:]), float)
 
 
 def _misplaced(pictures: list[Picture]) -> tuple[Float[np.ndarray, "10 3"], Float[np.ndarray, "n 10 2"]]:

@@ -13,7 +13,7 @@ from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.io.trees import put_together, taken_apart
 
 _WANTED = "expected a checkpoint"
-SCHEMA = 2
+SCHEMA = 3
 """Version of the layout below; a file of another version is refused."""
 
 

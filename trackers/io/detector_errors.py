@@ -2,7 +2,8 @@
 
 An `.npz` with, for each detector NAME, the arrays `NAME_mean` (K, 3) and `NAME_covariance` (3K, 3K), which describe the
 part that all images of one person share, in millimetres on the model's axes, and `NAME_white` (K,), the standard
-deviation of a coordinate from image to image in millimetres across the line of sight; and `header`, a text in JSON:
+deviation of a coordinate from image to image in millimetres across the line of sight; of a detector of meshes also
+`NAME_vertices` (V, 3), the mean mesh in millimetres on the model's axes; and `header`, a text in JSON:
 
     {"format": "jaxfilters detector errors", "version": 1, "units": "mm", "detectors": [names], "parameters": {...}}
 
@@ -24,6 +25,8 @@ from jaxfilters.trackers.io.input_files import LARGEST, are_finite
 from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters detector errors", 1
+FEWEST_VERTICES = 4
+"""Of a mesh, for a rotation."""
 DEFAULT_FILE = Path(__file__).with_name("detector_errors.npz")
 """What `jaxfilters fit face-detector` made of people of the ICT face model."""
 _WANTED = "expected an .npz of `jaxfilters fit face-detector`"
@@ -38,6 +41,8 @@ class DetectorErrors(NamedTuple):
     """Millimetres squared, among people: what all images of one person share."""
     white: Float[np.ndarray, " 10"]
     """Standard deviation of a coordinate from image to image, millimetres across the line of sight."""
+    vertices: Float[np.ndarray, "V 3"] | None = None
+    """Mean mesh of people, millimetres on the model's axes about the mean vertex; None for a detector without one."""
 
 
 def save_detector_errors(path: Path, errors: dict[str, DetectorErrors], parameters: dict[str, Any]) -> None:
@@ -47,7 +52,12 @@ def save_detector_errors(path: Path, errors: dict[str, DetectorErrors], paramete
         OutputError: the file cannot be written.
     """
     header = {"format": FORMAT, "version": VERSION, "units": "mm", "detectors": list(errors), "parameters": parameters}
-    arrays = {f"{name}_{part}": value for name, one in errors.items() for part, value in one._asdict().items()}
+    arrays = {
+        f"{name}_{part}": value
+        for name, one in errors.items()
+        for part, value in one._asdict().items()
+        if value is not None
+    }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_npz(path, {"header": np.asarray(json.dumps(header, allow_nan=False)), **arrays})
@@ -79,13 +89,20 @@ def default_detector_errors() -> dict[str, DetectorErrors]:
 
 def _errors(arrays: dict[str, np.ndarray], name: str, path: Path) -> DetectorErrors:
     size = 3 * NUM_LANDMARKS
-    shapes = dict(zip(DetectorErrors._fields, ((NUM_LANDMARKS, 3), (size, size), (NUM_LANDMARKS,)), strict=True))
+    shapes: dict[str, tuple[int, ...]] = {
+        "mean": (NUM_LANDMARKS, 3),
+        "covariance": (size, size),
+        "white": (NUM_LANDMARKS,),
+    }
+    mesh = arrays.get(f"{name}_vertices")
+    if mesh is not None:
+        shapes["vertices"] = (max(len(mesh) if mesh.ndim else 0, FEWEST_VERTICES), 3)
     for part, shape in shapes.items():
         array = arrays.get(f"{name}_{part}")
         if array is None or array.shape != shape or array.dtype.kind != "f" or not are_finite(array):
             got = "none" if array is None else f"{array.shape} {array.dtype}"
             raise InputError(f"{path}: {name}_{part} must be finite numbers {shape} below {LARGEST:g}; got {got}.")
-    one = DetectorErrors(*(arrays[f"{name}_{part}"].astype(float) for part in shapes))
+    one = DetectorErrors(**{part: arrays[f"{name}_{part}"].astype(float) for part in shapes})
     covariance = 0.5 * (one.covariance + one.covariance.T)
     scale = np.abs(covariance).max()
     if np.abs(covariance - one.covariance).max() > 1e-5 * scale or np.linalg.eigvalsh(covariance)[0] < -1e-5 * scale:

@@ -1,11 +1,14 @@
 """Misplacements of a detector from pictures: draws with known mean and covariance are found again."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import MIRROR
-from jaxfilters.trackers.fitting.face_detector import Picture, measured
+from jaxfilters.models.face.rig import monocular
+from jaxfilters.trackers.fitting.face_detector import Picture, _on_face, measured
 from jaxfilters.trackers.io.errors import InputError
 
 PEOPLE, PICTURES, NOISE_MM = 200, 16, 0.5
@@ -33,6 +36,24 @@ def test_mean_covariance_and_noise_are_found_again():
     std = np.sqrt(np.diagonal(errors.covariance)).reshape(10, 3)
     np.testing.assert_allclose(std[:, :2], np.tile((1.0, 1.5), (10, 1)), rtol=0.2)
     np.testing.assert_allclose(errors.white, NOISE_MM, rtol=0.2)
+
+
+def test_the_mean_mesh_is_that_of_faces_turned_back():
+    """Far from the axis of the camera, too: a mesh is as it looks along the line of sight."""
+    rng = np.random.default_rng(0)
+    rig = monocular(Pinhole.from_intrinsics(800.0, (319.5, 239.5), (480, 640)))
+    vertices = rng.normal(0, 40.0, (30, 3))
+    vertices -= vertices.mean(axis=0)
+    for angles in rng.uniform(-0.5, 0.5, (3, 3)):
+        uv = np.append(rng.uniform((0, 0), (640, 480)), 0.0)
+        ray = np.append((uv[:2] - (319.5, 239.5)) / 800.0, 1.0)
+        sight, _ = Rotation.align_vectors(ray[None], [[0.0, 0.0, 1.0]])
+        solid = (sight.inv() * Rotation.from_euler("ZYX", angles)).apply(vertices) + uv
+        pose = jnp.asarray([0.0, 0.0, 600.0, *angles])
+        np.testing.assert_allclose(_on_face(solid, pose, rig), vertices, atol=1e-3)
+    pictures = [[one._replace(solid=vertices + 1.0) for one in pictures_of(rng, np.zeros((10, 3)))] for _ in range(15)]
+    pictures[0] = [one._replace(solid=vertices - 14.0) for one in pictures[0]]
+    np.testing.assert_allclose(measured(pictures, "own").vertices, vertices, atol=1e-9)
 
 
 def test_too_few_people_are_refused():

@@ -18,7 +18,7 @@ from jaxfilters.trackers.io.errors import InputError, OutputError
 @pytest.fixture
 def saved(tmp_path):
     root = np.random.default_rng(0).normal(0, 1, (30, 30))
-    errors = DetectorErrors(np.ones((10, 3)), root @ root.T, np.full(10, 0.5))
+    errors = DetectorErrors(np.ones((10, 3)), root @ root.T, np.full(10, 0.5), np.eye(6)[:, :3])
     save_detector_errors(tmp_path / "new" / "errors.npz", {"own": errors}, {"people": 3})
     return tmp_path / "new" / "errors.npz", errors
 
@@ -49,6 +49,9 @@ WRONG = {
     "asymmetric": (changed(own_covariance=np.triu(np.ones((30, 30)))), "own_covariance must be symmetric"),
     "negative": (changed(own_covariance=-np.eye(30)), "own_covariance must be symmetric and positive"),
     "noiseless": (changed(own_white=np.zeros(10)), "own_white must be positive"),
+    "flat mesh": (changed(own_vertices=np.ones((6, 2))), r"own_vertices must be finite numbers \(6, 3\)"),
+    "small mesh": (changed(own_vertices=np.ones((3, 3))), r"own_vertices must be finite numbers \(4, 3\)"),
+    "no mesh": (changed(own_vertices=np.float64(1)), r"own_vertices must be finite numbers \(4, 3\)"),
     "nobody": (with_header(detectors=[]), "detectors must be one name or more"),
     "foreign": (with_header(format="a face"), 'header must say format "jaxfilters detector errors"'),
 }

@@ -85,8 +85,12 @@ class FaceTracker(Protocol):
         """State and track after a chunk of frames."""
         ...
 
-    def compared(self, state: Any, row: Any, images: np.ndarray) -> Compared:
+    def compared(self, state: Any, row: Any, images: np.ndarray, time: float) -> Compared:
         """State and row of the last frame, or better ones if a detector finds the face elsewhere in it."""
+        ...
+
+    def reported(self, track: Any, times: np.ndarray) -> Any:
+        """Rows as they are given out: with what detectors say that is not for the next frames."""
         ...
 
     def empty(self, count: int) -> Any:
@@ -205,13 +209,13 @@ class Following:
         if not self._is_lost and times[-1] - self._looked >= LOOK_EVERY_S:
             self._looked = float(times[-1])
             self._look_at(images[-1, 0], track.image_points[-1, 0])
-        return track
+        return self._tracker.reported(track, times)
 
     def _compare(self, images: np.ndarray, time: float, track: Any) -> Any:
         """The track of a chunk, with the last row from where the detector finds the face, if that is better."""
         self._compared = time
         row = jax.tree.map(lambda leaf: leaf[-1], track)
-        self.state, better, is_elsewhere = self._tracker.compared(self.state, row, images)
+        self.state, better, is_elsewhere = self._tracker.compared(self.state, row, images, time)
         if better is None:
             return track
         if is_elsewhere:

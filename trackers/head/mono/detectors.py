@@ -54,6 +54,8 @@ class Seen(NamedTuple):
     """In iBUG's order; NaN where there is none."""
     iris_px: Float[np.ndarray, " 2"] | None = None
     """Width of the right and the left iris."""
+    solid: Float[np.ndarray, "V 3"] | None = None
+    """All vertices of a mesh, and the distance away from the camera as large as pixels."""
 
 
 @runtime_checkable
@@ -72,6 +74,17 @@ class Detector(Protocol):
 
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+        ...
+
+
+@runtime_checkable
+class MeshGiver(Detector, Protocol):
+    """Finds a face in an image by a mesh, of which `errors.vertices` is the mean."""
+
+    def glance(
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "V 3"] | None:
+        """The mesh of the face nearest to a place, as fast as it can be found; None without a face."""
         ...
 
 
@@ -109,20 +122,36 @@ class MeshLandmarks:
             ImportError: without MediaPipe, or with one that has no face mesh of its own.
         """
         self._mesh = MeshDetector(refined=True, most_faces=MOST_FACES, looks=LOOKS)
+        self._glance = MeshDetector(refined=True, most_faces=MOST_FACES)
         self.errors = default_detector_errors()["mediapipe"]
 
     def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
-        meshes = [solid[:, :2] for solid in self._mesh.solids(image)]
-        if not meshes:
+        solids = self._mesh.solids(image)
+        if not solids:
             return "no face"
         if near is None:
-            mesh = max(meshes, key=lambda one: float(np.prod(np.ptp(one, axis=0))))
+            solid = max(solids, key=lambda one: float(np.prod(np.ptp(one[:, :2], axis=0))))
         else:
-            mesh = min(meshes, key=lambda one: float(np.linalg.norm(one.mean(axis=0) - near)))
+            solid = _nearest(solids, near)
+        mesh = solid[:, :2]
         dense = np.array([mesh[list(vertices)].mean(axis=0) if vertices else (np.nan, np.nan) for vertices in MESH_68])
         iris_px = np.array([np.linalg.norm(mesh[a] - mesh[b]) for a, b in IRISES])
-        return Seen(dense[list(FROM_68)], len(meshes), dense, iris_px)
+        return Seen(dense[list(FROM_68)], len(solids), dense, iris_px, solid)
+
+    def glance(
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "V 3"] | None:
+        """The mesh of the face nearest to a place after one look; None without a face.
+
+        In a quarter of the time of three looks, and the mean of a track and a mesh (`mesh_rotation`) is as good.
+        """
+        solids = self._glance.solids(image)
+        return _nearest(solids, near) if solids else None
+
+
+def _nearest(solids: list[Float[np.ndarray, "V 3"]], place: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "V 3"]:
+    return min(solids, key=lambda one: float(np.linalg.norm(one[:, :2].mean(axis=0) - place)))
 
 
 DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {

@@ -151,3 +151,20 @@ def _start(face: MultilinearFace, now: MultilinearFace, state: MonoState) -> Bun
 
 def _log_det(A: Array) -> Array:
     return 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(A))))
+
+
+def check_gallery(gallery: Gallery | None, face: MultilinearFace, options: MonoConfig) -> None:
+    """Whether people can be recognised with a model by a tracker.
+
+    Raises:
+        ValueError: if they are not of the model, or for the tracker of the thesis, which knows nobody.
+    """
+    if gallery is None:
+        return
+    if options.is_published:
+        raise ValueError('gallery must be None where options.landmarks is not "aligned": that tracker knows nobody.')
+    count, num_identities = len(gallery.identity), face.num_identities
+    expected = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
+    shapes = tuple(jnp.shape(leaf) for leaf in gallery)
+    if shapes != expected:
+        raise ValueError(f"gallery must be of the model, with shapes {expected}; got {shapes}.")

@@ -30,7 +30,7 @@ from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
 from jaxfilters.trackers.head.mono.claims import frame_covariance
 from jaxfilters.trackers.head.mono.detections import noise_px
-from jaxfilters.trackers.head.mono.detectors import Detector
+from jaxfilters.trackers.head.mono.detectors import Detector, Seen
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import LEAST_SCORE, REGAINED_SCORE
@@ -67,24 +67,29 @@ def seconds_between(detector: Detector) -> float:
     return EVERY_S_AVERAGED if detector.is_averaged else EVERY_S
 
 
+def place_of(state: MonoState, rig: CameraRig) -> Float[np.ndarray, " 2"]:
+    """Where the face of a track is in the image, pixels; not finite if the camera is within it."""
+    return np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
+
+
 def located(
-    state: MonoState, row: MonoTrack, rig: CameraRig, detector: Detector, image: UInt8[np.ndarray, "rows cols"]
+    state: MonoState,
+    row: MonoTrack,
+    rig: CameraRig,
+    detector: Detector,
+    detected: Seen,
+    image: UInt8[np.ndarray, "rows cols"],
 ) -> Located | None:
-    """The state with the face where a detector finds it in the last image; None if none, or the track is beyond doubt.
+    """The state with the face where a detector finds it in the last image; None if its landmarks have no pose.
 
     Args:
         state: Of the tracker after that image.
-        row: Of the track in that image.
+        row: Of the track in that image, which is in doubt or lost.
         rig: One camera.
         detector: Of the landmarks.
+        detected: What it found in the image.
         image: The last one.
     """
-    if row.status == DEFORMABLE:
-        return None
-    near = np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
-    detected = detector.detect(image, near if np.all(np.isfinite(near)) else None)
-    if isinstance(detected, str):
-        return None
     noise = np.full(len(detected.points), DETECTED_PX)
     beside = np.zeros(state.model.mean.shape)
     if detector.errors is not None:

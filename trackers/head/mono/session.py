@@ -14,23 +14,23 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.gallery import Gallery, joined
 from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
-from jaxfilters.models.face.misplacement import misplacement
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
-from jaxfilters.trackers.head.common.state import INITIALISING, POSE
+from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head.mono.detections import Collector, Detections
-from jaxfilters.trackers.head.mono.detectors import CascadeDetector, Detector
+from jaxfilters.trackers.head.mono.detectors import CascadeDetector, Detector, MeshGiver, Seen
 from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
-from jaxfilters.trackers.head.mono.recognition import People, as_gallery, one_of, people, recognised
-from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, search_of
-from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack, prior_of
+from jaxfilters.trackers.head.mono.mesh_rotation import MeshRotations
+from jaxfilters.trackers.head.mono.recognition import People, as_gallery, check_gallery, one_of, people, recognised
+from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, prior_beside, search_of
+from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_points
 from jaxfilters.trackers.io.face_models import people_face_model
@@ -40,12 +40,6 @@ MOST_REPROJECTION = 0.05
 """Distances between the eyes by which landmarks may be from where the face that fits them best has them."""
 DEPTH_MM = (100.0, 5000.0)
 """In which a face may be."""
-UNRENDERED_MM = 1.5
-"""Of each coordinate of what a detector misplaces, standard deviation of what rendered people do not show of others.
-
-On faces of a foreign model with photographs for skin the cascades' means differ by 1.0 to 4.1 mm from those of the
-people that they were measured on; the median is 1.2 mm.
-"""
 _STATIC = ("num_particles", "landmarks", "selection", "past", "adjust")
 """Options that a compiled program is for; the others reach it as numbers, or do not concern it."""
 
@@ -104,7 +98,7 @@ class MonoSession:
         else:
             check_points(np.asarray(points)[list(FROM_68)])
         options = options or MonoConfig()
-        _check_gallery(gallery, tracked(face), options)
+        check_gallery(gallery, tracked(face), options)
         if not (math.isfinite(focal_log_std) and focal_log_std >= 0):
             raise ValueError(f"focal_log_std must be finite and at least 0; got {focal_log_std}.")
         self._tracker = _MonoTracker(rig, face, options, points, detections, detector, gallery, focal_log_std)
@@ -218,6 +212,8 @@ class _MonoTracker:
         self._detector = detector or CascadeDetector()
         self._collector = Collector(self._detector)
         self.compare_every_s = math.inf if options.is_published else redetection.seconds_between(self._detector)
+        errors = None if options.is_published else self._detector.errors
+        self._meshes = MeshRotations(face, rig, None if errors is None else errors.vertices)
         self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
         self._ready: Future[MonoState] | None = None
         """What a face that comes back needs first, compiled beside the frames."""
@@ -254,6 +250,7 @@ class _MonoTracker:
         start, detections = found.start, found.detections
         if old is not None:
             self._remember(old)
+        self._meshes.restore([])
         zero = jnp.zeros((), start.uv.dtype)
         state = begin(
             key,
@@ -275,20 +272,42 @@ class _MonoTracker:
         return Beginning(state, detections.time, what)
 
     def saved(self) -> dict[str, Any]:
-        return {"people": self._people, "num_at_recognition": self._num_at_recognition}
+        return {
+            "people": self._people,
+            "num_at_recognition": self._num_at_recognition,
+            "meshes": self._meshes.saved(),
+        }
 
     def restore(self, saved: dict[str, Any], state: MonoState) -> None:
         # Landmarks which a person gave, or which were found otherwise, are of the first images.
         self._points = self._detections = None
         self._people, self._num_at_recognition = saved["people"], saved["num_at_recognition"]
+        self._meshes.restore(saved["meshes"])
         self._system = self._system._replace(face=self._followed(state))
 
     def advance(self, state: MonoState, images: np.ndarray, clock: np.ndarray, is_frame: np.ndarray):
         state, track = advance(self._system, state, images, clock, is_frame, self._compiled)
         return self._recognised(state), track
 
-    def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray) -> Compared:
-        found = redetection.located(state, row, self.rig, self._detector, images[0])
+    def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray, time: float) -> Compared:
+        place = redetection.place_of(state, self.rig)
+        if row.status == DEFORMABLE:
+            if isinstance(self._detector, MeshGiver) and np.all(np.isfinite(place)):
+                self._meshes.add(self._detector.glance(images[0], place), row, time)
+            return Compared(state, None)
+        observed = self._detector.detect(images[0], place if np.all(np.isfinite(place)) else None)
+        if isinstance(observed, str):
+            return Compared(state, None)
+        compared = self._beside(state, row, observed, images)
+        self._meshes.add(observed.solid, row if compared.row is None else compared.row, time)
+        return compared
+
+    def reported(self, track: MonoTrack, times: np.ndarray) -> MonoTrack:
+        return self._meshes.reported(track, times)
+
+    def _beside(self, state: MonoState, row: MonoTrack, observed: Seen, images: np.ndarray) -> Compared:
+        """A track in doubt, or lost, beside what was detected in the last images."""
+        found = redetection.located(state, row, self.rig, self._detector, observed, images[0])
         if found is None:
             return Compared(state, None)
         frames = np.repeat(images[None], self.chunk, axis=0)
@@ -349,7 +368,7 @@ class _MonoTracker:
 
     def _checked(self, detections: Detections) -> tuple[_Found | None, list[str]]:
         """A start, if the landmarks are those of a face before the camera."""
-        points, prior = jnp.asarray(detections.points, float), self._prior(detections)
+        points, prior = jnp.asarray(detections.points, float), prior_beside(detections.errors, self._options)
         start = initialise(self._face, self.rig, points, prior, detected_px=detections.std_px)
         eyes = detections.points[:, :4].reshape(-1, 2, 2, 2).mean(axis=2)
         apart = float(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=-1).mean())
@@ -361,14 +380,6 @@ class _MonoTracker:
         if depth.min() < DEPTH_MM[0] or depth.max() > DEPTH_MM[1]:
             return None, [f"the face would be {depth.mean():.0f} mm away"]
         return self._message(detections, start, prior), []
-
-    def _prior(self, detections: Detections) -> Prior:
-        """What holds the face, with what the detector misplaces."""
-        options, errors = self._options, detections.errors
-        if errors is None or options.is_published or not options.prior_weight:
-            return prior_of(options)
-        covariance = errors.covariance + UNRENDERED_MM**2 * np.eye(len(errors.covariance))
-        return prior_of(options)._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std))
 
     def _message(self, detections: Detections, start: Start, prior: Prior) -> _Found:
         """The start with all that the detections tell beside the ten landmarks."""
@@ -386,15 +397,3 @@ class _MonoTracker:
         if detections.iris_px is not None and options.eyes_apart_mm is None:
             start, past = with_irises(self._face, self.rig, start, views, past, detections.iris_px, prior)
         return _Found(detections, start, views, prior._replace(past=past))
-
-
-def _check_gallery(gallery: Gallery | None, face: MultilinearFace, options: MonoConfig) -> None:
-    if gallery is None:
-        return
-    if options.is_published:
-        raise ValueError('gallery must be None where options.landmarks is not "aligned": that tracker knows nobody.')
-    count, num_identities = len(gallery.identity), face.num_identities
-    expected = ((count, num_identities), (count, num_identities, num_identities), (count, *face.mean.shape))
-    shapes = tuple(jnp.shape(leaf) for leaf in gallery)
-    if shapes != expected:
-        raise ValueError(f"gallery must be of the model, with shapes {expected}; got {shapes}.")

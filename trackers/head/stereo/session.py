@@ -205,7 +205,12 @@ class _HeadTracker:
     ) -> tuple[HeadState, HeadTrack]:
         return advance(self.rig, self._searches, state, images, clock, is_frame, self._compiled)
 
-    def compared(self, state: HeadState, row: HeadTrack, images: np.ndarray) -> Compared:
+    def reported(self, track: HeadTrack, times: np.ndarray) -> HeadTrack:
+        del times
+        return track
+
+    def compared(self, state: HeadState, row: HeadTrack, images: np.ndarray, time: float) -> Compared:
+        del time
         if row.status not in (DOUBTFUL, LOST):
             return Compared(state, None)
         detected = self._at_detected(state, images)

@@ -49,6 +49,9 @@ def test_of_two_faces_the_nearest_or_largest_is_taken(monkeypatch):
     assert alone.num_faces == beside.num_faces == 2
     np.testing.assert_array_equal(alone.dense[30], large[4])
     np.testing.assert_array_equal(beside.dense[30], small[4])
+    np.testing.assert_array_equal(beside.solid, solid(small))
+    np.testing.assert_array_equal(detector.glance(IMAGE, np.array([60.0, 60.0])), solid(small))
+    assert detector_of(monkeypatch, lambda image: []).glance(IMAGE, np.zeros(2)) is None
 
 
 def test_the_mesh_is_the_default_where_it_can_be_loaded(monkeypatch):
@@ -65,19 +68,22 @@ def test_the_mesh_is_the_default_where_it_can_be_loaded(monkeypatch):
 
 
 def detector_of(monkeypatch, solids):
-    """The detector on a mesh whose faces in an image are those of a function."""
+    """The detector on a mesh whose faces in an image are those of a function; it glances once, and looks often."""
+    made = []
 
     class FakeMesh:
-        def __init__(self, *, refined, most_faces, looks):
+        def __init__(self, *, refined, most_faces, looks=1):
             assert refined
             assert most_faces > 1
-            assert looks > 1
+            made.append(looks)
 
         def solids(self, image):
             return solids(image)
 
     monkeypatch.setattr(module, "MeshDetector", FakeMesh)
-    return DETECTORS["mediapipe"]()
+    detector = DETECTORS["mediapipe"]()
+    assert made == [LOOKS, 1]
+    return detector
 
 
 def solid(mesh):
