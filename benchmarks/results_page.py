@@ -64,6 +64,7 @@ class Row(NamedTuple):
 
 
 _ICT = "rendered people of the ICT face model, heads and faces moving as recorded"
+_PNP, _MEAN_MESH = "`solvePnP` in each frame", "the mesh of a mean person, rotated onto the mesh"
 ON_RECORDINGS = (
     *(
         Row(
@@ -137,13 +138,19 @@ ON_RECORDINGS = (
             "face before one camera",
             _ICT,
             f"{quantity}, {detector}",
-            "`solvePnP` in each frame",
+            simplest,
             "head-mono",
             f"{metric}_modelled_rendered{suffix}",
-            f"pnp_{metric}_modelled_rendered{suffix}",
+            f"{prefix}_{metric}_modelled_rendered{suffix}",
         )
-        for detector, suffix in (("cascades", ""), ("MediaPipe's mesh", "_mediapipe"))
-        for quantity, metric in (("yaw", "yaw_rms_deg"), ("pitch", "pitch_rms_deg"), ("distance", "z_error_mm"))
+        for quantity, detector, metric, suffix, prefix, simplest in (
+            ("yaw", "cascades", "yaw_rms_deg", "", "pnp", _PNP),
+            ("pitch", "cascades", "pitch_rms_deg", "", "pnp", _PNP),
+            ("distance", "cascades", "z_error_mm", "", "pnp", _PNP),
+            ("yaw", "MediaPipe's mesh", "yaw_rms_deg", "_mediapipe", "mesh", _MEAN_MESH),
+            ("pitch", "MediaPipe's mesh", "pitch_rms_deg", "_mediapipe", "mesh", _MEAN_MESH),
+            ("distance", "MediaPipe's mesh", "z_error_mm", "_mediapipe", "pnp", _PNP),
+        )
     ),
     *(
         Row(
