@@ -3,7 +3,7 @@
 Nothing is known of a person or of where the landmarks are: the detectors find them, as for a user. The same detections
 go to the simplest things that could work: the landmarks to OpenCV's `solvePnP` with the mean face of the same model,
 and meshes, where the detector gives them, to the rotation that takes the mean mesh nearest to them. All are judged on
-the same frames: those in which the detector sees a face and the tracker follows it. The people are none of those whom
+the same frames: those in which the detector finds a face and the tracker follows it. The people are none of those whom
 the detectors' errors were measured on (`jaxfilters fit face-detector`).
 """
 

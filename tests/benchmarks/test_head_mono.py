@@ -115,15 +115,18 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
         np.testing.assert_allclose(run.yaw_deg, np.degrees(0.1))
 
 
-def detected(errors, pnp, std, distance=600.0):
+def detected(errors, pnp, std, distance=600.0, mesh=None):
     rows = lambda value: np.broadcast_to(np.asarray(value, float), (4, 6))
-    mesh = np.broadcast_to([3.0, 4.0, 5.0], (4, 3)) if std == 7.0 else None
+    mesh = None if mesh is None else np.broadcast_to(mesh, (4, 3))
     return _mono_detected.DetectedRun(rows(errors), rows(std), rows(pnp), np.full(4, distance), 0.25, mesh)
 
 
 def test_detected_people_stand_beside_solve_pnp():
     """Two people 6 mm too near and 12 too far: sizes are averaged, the bias is that of signed shares."""
-    runs = [detected([0, 0, -6, 0, 3, 0], np.ones(6), 2.0), detected([0, 0, 12, 0, 4, 0], np.ones(6), 7.0)]
+    runs = [
+        detected([0, 0, -6, 0, 3, 0], np.ones(6), 2.0),
+        detected([0, 0, 12, 0, 4, 0], np.ones(6), 7.0, mesh=[3.0, 4.0, 5.0]),
+    ]
     metrics = _mono_detected.detected_metrics("modelled", runs)
     assert metrics["z_error_mm_modelled"].value == pytest.approx(9.0)
     assert metrics["z_bias_share_modelled"].value == pytest.approx(0.5)

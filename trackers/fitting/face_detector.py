@@ -4,7 +4,8 @@ Every person of the ICT face model is rendered in several poses, lights and expr
 each picture. The misplacement of a landmark is a vector on the face that all pictures of the person share, and noise:
 `uv_found - uv = J b + noise`, with J the derivative of the pixels by the landmark's place. b is found by robust least
 squares (Cauchy weights) for each person and landmark; its mean and covariance are over people. The left and the right
-half of a face are one sample each, so that the mean is symmetric.
+half of a face are one sample each, so that the mean is symmetric. Of a detector that gives a mesh, the mean mesh is
+the mean over all pictures, turned back by the true rotations; its two halves are as measured.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfilters._full_precision import dot
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import MIRROR, NUM_LANDMARKS
 from jaxfilters.models.face.pose import rotation
@@ -135,8 +137,9 @@ def measured(people: list[list[Picture]], name: str) -> DetectorErrors:
 
 def _on_face(solid: Float[np.ndarray, "V 3"], pose: jax.Array, rig: CameraRig) -> Float[np.ndarray, "V 3"]:
     """A mesh in pixels about its mean vertex, on the axes of a face of that pose."""
-    sight = np.asarray(line_of_sight(rig, jnp.asarray(solid[:, :2].mean(axis=0))), float)
-    return (solid - solid.mean(axis=0)) @ sight.T @ np.asarray(rotation(pose[3:]), float)
+    sight = line_of_sight(rig, jnp.asarray(solid[:, :2].mean(axis=0)))
+    back = dot(sight.T, rotation(pose[3:]))
+    return np.asarray(dot(jnp.asarray(solid - solid.mean(axis=0)), back), float)
 
 
 def _misplaced(pictures: list[Picture]) -> tuple[Float[np.ndarray, "10 3"], Float[np.ndarray, "n 10 2"]]:

@@ -42,7 +42,8 @@ class DetectorErrors(NamedTuple):
     white: Float[np.ndarray, " 10"]
     """Standard deviation of a coordinate from image to image, millimetres across the line of sight."""
     vertices: Float[np.ndarray, "V 3"] | None = None
-    """Mean mesh of people, millimetres on the model's axes about the mean vertex; None for a detector without one."""
+    """Mean mesh of people, millimetres about the mean vertex, on the axes of the package's general model; None for a
+    detector without meshes."""
 
 
 def save_detector_errors(path: Path, errors: dict[str, DetectorErrors], parameters: dict[str, Any]) -> None:

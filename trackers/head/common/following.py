@@ -90,7 +90,7 @@ class FaceTracker(Protocol):
         ...
 
     def reported(self, track: Any, times: np.ndarray) -> Any:
-        """Rows as they are given out: with what detectors say that is not for the next frames."""
+        """Rows with corrections by a detector that do not enter the state; each row is passed once, in order."""
         ...
 
     def empty(self, count: int) -> Any:

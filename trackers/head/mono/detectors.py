@@ -55,7 +55,7 @@ class Seen(NamedTuple):
     iris_px: Float[np.ndarray, " 2"] | None = None
     """Width of the right and the left iris."""
     solid: Float[np.ndarray, "V 3"] | None = None
-    """All vertices of a mesh, and the distance away from the camera as large as pixels."""
+    """All vertices of a mesh: pixels, and the depth on the same scale."""
 
 
 @runtime_checkable

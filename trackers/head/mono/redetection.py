@@ -67,9 +67,10 @@ def seconds_between(detector: Detector) -> float:
     return EVERY_S_AVERAGED if detector.is_averaged else EVERY_S
 
 
-def place_of(state: MonoState, rig: CameraRig) -> Float[np.ndarray, " 2"]:
-    """Where the face of a track is in the image, pixels; not finite if the camera is within it."""
-    return np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
+def place_of(state: MonoState, rig: CameraRig) -> Float[np.ndarray, " 2"] | None:
+    """Where the face of a track is in the image, pixels; None where it has no finite place."""
+    place = np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
+    return place if np.all(np.isfinite(place)) else None
 
 
 def located(

@@ -213,7 +213,7 @@ class _MonoTracker:
         self._collector = Collector(self._detector)
         self.compare_every_s = math.inf if options.is_published else redetection.seconds_between(self._detector)
         errors = None if options.is_published else self._detector.errors
-        self._meshes = MeshRotations(face, rig, None if errors is None else errors.vertices)
+        self._meshes = MeshRotations(face, rig, None if errors is None else errors.vertices, focal_log_std)
         self._pool = ThreadPoolExecutor(1) if self.is_live and not options.is_published else None
         self._ready: Future[MonoState] | None = None
         """What a face that comes back needs first, compiled beside the frames."""
@@ -292,14 +292,14 @@ class _MonoTracker:
     def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray, time: float) -> Compared:
         place = redetection.place_of(state, self.rig)
         if row.status == DEFORMABLE:
-            if isinstance(self._detector, MeshGiver) and np.all(np.isfinite(place)):
+            if self._meshes.are_used and isinstance(self._detector, MeshGiver) and place is not None:
                 self._meshes.add(self._detector.glance(images[0], place), row, time)
             return Compared(state, None)
-        observed = self._detector.detect(images[0], place if np.all(np.isfinite(place)) else None)
+        observed = self._detector.detect(images[0], place)
         if isinstance(observed, str):
             return Compared(state, None)
         compared = self._beside(state, row, observed, images)
-        self._meshes.add(observed.solid, row if compared.row is None else compared.row, time)
+        self._meshes.add(observed.solid, row, time, compared.row)
         return compared
 
     def reported(self, track: MonoTrack, times: np.ndarray) -> MonoTrack:
@@ -347,6 +347,7 @@ class _MonoTracker:
     def _asked_who(self, system: System, state: MonoState) -> MonoState:
         """As when a face comes back. Frames of a camera must not wait while this is compiled for one person more."""
         redetection.prepare(state, self.rig)
+        self._meshes.prepare()
         return recognised(self._people_with(system, state), self.rig, state, self._compiled)
 
     def empty(self, count: int) -> MonoTrack:

@@ -135,7 +135,8 @@ class MonoTrack(NamedTuple):
     deformation: Float[Array | np.ndarray, "b A"]
     """Expression, in standard deviations of the training set's about their mean."""
     shape: Float[Array | np.ndarray, "b K 3"]
-    """Landmarks in the model frame, millimetres."""
+    """Landmarks in the model frame, millimetres. With a detector of meshes they are turned with the axes of `pose`;
+    identity and offset are about the axes of the tracker alone."""
     image_points: Float[Array | np.ndarray, "b 1 K 2"]
     """Pixels."""
     score: Float[Array | np.ndarray, " b"]

@@ -44,13 +44,15 @@ def test_vertices_become_landmarks(monkeypatch):
 def test_of_two_faces_the_nearest_or_largest_is_taken(monkeypatch):
     small = np.random.default_rng(0).uniform(0, 100, (478, 2))
     large = np.random.default_rng(1).uniform(200, 400, (478, 2))
-    detector = detector_of(monkeypatch, lambda image: [solid(small), solid(large)])
+    looked = []
+    detector = detector_of(monkeypatch, lambda image: [solid(small), solid(large)], looked)
     alone, beside = detector.detect(IMAGE, None), detector.detect(IMAGE, np.array([60.0, 60.0]))
     assert alone.num_faces == beside.num_faces == 2
     np.testing.assert_array_equal(alone.dense[30], large[4])
     np.testing.assert_array_equal(beside.dense[30], small[4])
     np.testing.assert_array_equal(beside.solid, solid(small))
     np.testing.assert_array_equal(detector.glance(IMAGE, np.array([60.0, 60.0])), solid(small))
+    assert looked == [LOOKS, LOOKS, 1]
     assert detector_of(monkeypatch, lambda image: []).glance(IMAGE, np.zeros(2)) is None
 
 
@@ -67,23 +69,22 @@ def test_the_mesh_is_the_default_where_it_can_be_loaded(monkeypatch):
     assert best_detector()[0] == "cascades"
 
 
-def detector_of(monkeypatch, solids):
-    """The detector on a mesh whose faces in an image are those of a function; it glances once, and looks often."""
-    made = []
+def detector_of(monkeypatch, solids, looked=None):
+    """The detector on a mesh whose faces in an image are those of a function; `looked` has the looks at each image."""
+    looked = [] if looked is None else looked
 
     class FakeMesh:
         def __init__(self, *, refined, most_faces, looks=1):
             assert refined
             assert most_faces > 1
-            made.append(looks)
+            self.looks = looks
 
         def solids(self, image):
+            looked.append(self.looks)
             return solids(image)
 
     monkeypatch.setattr(module, "MeshDetector", FakeMesh)
-    detector = DETECTORS["mediapipe"]()
-    assert made == [LOOKS, 1]
-    return detector
+    return DETECTORS["mediapipe"]()
 
 
 def solid(mesh):

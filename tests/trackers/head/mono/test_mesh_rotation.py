@@ -85,7 +85,7 @@ def rows_of(angles, std):
 
 def mesh_beside(track, row, time, apart, yaw=0.0):
     own = track.pose[row, 3:]
-    return MeshRotation(time, own + apart, yaw, own, np.square(track.pose_std[row, 3:]))
+    return MeshRotation(time, own + apart, yaw, np.zeros(3), own, np.square(track.pose_std[row, 3:]))
 
 
 def test_a_track_and_a_mesh_are_one_gaussian():
@@ -109,18 +109,18 @@ def test_a_track_and_a_mesh_are_one_gaussian():
     assert with_meshes(beyond, times, [over]).pose[1, 3] == pytest.approx(np.pi, abs=0.002)
 
 
-@pytest.mark.parametrize("apart", [0.03, 0.15, 0.6])
-def test_a_turned_mesh_may_be_off_grossly(apart):
+@pytest.mark.parametrize(("apart", "degrees"), [(0.03, 20.0), (0.15, 20.0), (0.6, 20.0), (0.1, 60.0)])
+def test_a_turned_mesh_may_be_off_grossly(apart, degrees):
     """Mean and standard deviation of 400,000 weighted draws of the track's error; 5 of their standard errors."""
-    track, yaw = rows_of(TRUE[None], np.array([[0.05, 0.12, 0.1]])), np.radians(20.0)
+    track, yaw = rows_of(TRUE[None], np.array([[0.05, 0.12, 0.1]])), np.radians(degrees)
     mesh = mesh_beside(track, 0, 0.0, np.array([0.2, 1.0, -0.5]) * apart, yaw)
     found = with_meshes(track, np.zeros(1), [mesh])
     draws = np.random.default_rng(0).normal(0, track.pose_std[0, 3:], (400_000, 3))
-    turned = (20.0 / 30.0) ** 2
-    usual = STD + STD_BY_YAW * turned
+    turned = (degrees / 30.0) ** 2
+    gross, usual = min(GROSS_SHARE * turned, 0.9), STD + STD_BY_YAW * turned
     left = mesh.angles - TRUE - draws
     density = lambda std: np.prod(np.exp(-0.5 * np.square(left / std)) / std, axis=1)
-    weights = (1 - GROSS_SHARE * turned) * density(usual) + GROSS_SHARE * turned * density(usual + GROSS_STD)
+    weights = (1 - gross) * density(usual) + gross * density(usual + GROSS_STD)
     weights /= weights.sum()
     mean = weights @ draws
     std = np.sqrt(weights @ np.square(draws - mean))
@@ -137,15 +137,76 @@ def test_a_mesh_is_carried_on_by_the_motion_of_the_track():
     found = with_meshes(track, times, [mesh])
     variance = np.square(STD) + np.outer(times, np.square(MOTION_STD))
     np.testing.assert_allclose(found.pose[:, 3:] - angles, 0.05 * 0.01 / (0.01 + variance), rtol=1e-5)
-    # A track that has become less certain may have errors that it had not beside the mesh.
-    unsure = track._replace(pose_std=track.pose_std.copy())
-    unsure.pose_std[2, 3:] = 0.3
-    later = with_meshes(unsure, times, [mesh]).pose[2, 3:] - angles[2]
-    np.testing.assert_allclose(later, 0.05 * 0.09 / (0.09 + variance[2] + 0.08), rtol=1e-5)
+    # A track that has become less certain has further errors, which the mesh before tells nothing of; one that has
+    # become more certain has lost some of those that it had.
+    for std, lasting in ((0.3, 0.01), (0.05, 0.0025)):
+        other = track._replace(pose_std=track.pose_std.copy())
+        other.pose_std[2, 3:] = std
+        later = with_meshes(other, times, [mesh])
+        gain = lasting / (0.01 + variance[2])
+        np.testing.assert_allclose(later.pose[2, 3:] - angles[2], 0.05 * gain, rtol=1e-5)
+        np.testing.assert_allclose(np.square(later.pose_std[2, 3:]), std**2 - gain * lasting, rtol=1e-5)
+
+
+def test_errors_of_the_focal_length_are_those_of_both():
+    """What track and mesh have in common is neither reduced nor a reason to believe one of them."""
+    track = rows_of(TRUE[None], np.full((1, 3), 0.1))
+    shared = np.array([0.0, 0.0036, 0.0064])
+    mesh = mesh_beside(track, 0, 0.0, np.full(3, 0.05))._replace(shared_variance=shared)
+    mesh = mesh._replace(track_variance=0.01 - shared)
+    found, own = with_meshes(track, np.zeros(1), [mesh]), 0.01 - shared
+    gain = own / (own + np.square(STD))
+    np.testing.assert_allclose(found.pose[0, 3:] - TRUE, 0.05 * gain, rtol=1e-5)
+    np.testing.assert_allclose(np.square(found.pose_std[0, 3:]), shared + (1 - gain) * own, rtol=1e-5)
+
+
+def in_image(track, uv):
+    """With landmarks about a pixel."""
+    about = 30.0 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1), (0, 0), (0, 0)])
+    return track._replace(image_points=np.broadcast_to(uv + about, (len(track.pose), 1, 10, 2)))
+
+
+def test_meshes_are_of_the_track_before_them(rig, face):
+    """After a loss, and where the track was put elsewhere, the meshes before count no more; nor do other faces."""
+    uv, times = np.array([400.0, 200.0]), np.array([0.0, 0.1, 0.2])
+    vertices = np.random.default_rng(0).normal(0, 40.0, (60, 3))
+    track = in_image(rows_of(np.tile(TRUE, (3, 1)), np.full((3, 3), 0.1)), uv)
+    row = jax.tree.map(lambda leaf: leaf[0], track)
+    solid, _ = solid_of(on_axes_of(face, vertices), TRUE + 0.05, uv, rig)
+
+    def meshes(**options):
+        made = MeshRotations(face, rig, vertices, **options)
+        made.add(solid, row, 0.0)
+        return made
+
+    corrected = lambda found: (np.abs(found.pose[:, 4] - TRUE[1]) > 1e-3).tolist()
+    assert corrected(meshes().reported(track, times)) == [True] * 3
+    lost = track._replace(pose=track.pose.copy())
+    lost.pose[1] = np.nan
+    found = meshes()
+    assert corrected(found.reported(lost, times)) == [True, False, False]
+    assert not found.saved()
+    put = meshes()
+    put.add(None, row, 0.2, replaced=row)
+    assert corrected(put.reported(track, times)) == [True, True, False]
+    assert not put.saved()
+    again = meshes()
+    again.add(solid, row, 0.2, replaced=row)
+    assert corrected(again.reported(track, times)) == [True] * 3
+    assert [mesh.time for mesh in again.saved()] == [0.2]
+    other = MeshRotations(face, rig, vertices)
+    other.add(solid + np.array([120.0, 0.0, 0.0]), row, 0.0)
+    assert not other.saved()
+    (mesh,) = meshes(focal_log_std=0.25).saved()
+    x, y = (uv - np.asarray(rig.center[0])) / 800.0
+    slopes = 0.25 * np.array([0.0, x / (1 + x * x), y / (1 + y * y)])  # of the direction of a pixel
+    np.testing.assert_allclose(mesh.shared_variance, np.square(slopes), rtol=1e-3)
+    with pytest.raises(ValueError, match=r"solid must have the vertices of the mean mesh, \(60, 3\); got \(59, 3\)"):
+        MeshRotations(face, rig, vertices).add(solid[1:], row, 0.0)
 
 
 def test_frames_without_a_mesh_or_without_a_face_add_none(rig, face):
-    track = rows_of(np.tile(TRUE, (1, 1)), np.full((1, 3), 0.1))
+    track = in_image(rows_of(TRUE[None], np.full((1, 3), 0.1)), np.array([300.0, 200.0]))
     row = jax.tree.map(lambda leaf: leaf[0], track)
     without = MeshRotations(face, rig, None)
     without.add(np.zeros((20, 3)), row, 0.0)
@@ -195,10 +256,15 @@ def test_a_session_reports_both_and_goes_on_the_same_after_it_was_saved(rig, fac
         alone = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], track)
         own = alone.pose[0, 3:].astype(float), np.square(alone.pose_std[0, 3:].astype(float))
         angles, middle = made.poses[i, 3:] + WRONG, made.uv[i, 0].mean(axis=0)
-        mesh = MeshRotation(made.times[i], angles, solid_of(vertices, angles, middle, rig)[1], *own)
+        mesh = MeshRotation(made.times[i], angles, solid_of(vertices, angles, middle, rig)[1], np.zeros(3), *own)
         expected = with_meshes(alone, made.times[i : i + 1], [mesh])
         np.testing.assert_allclose(whole.pose[i, 3:], expected.pose[0, 3:], atol=1e-3)
         np.testing.assert_allclose(whole.pose_std[i], expected.pose_std[0], rtol=1e-2)
+    # The frames between have the last mesh before them, and those before the first one have none.
+    between = rows[rows < asked[0]]
+    np.testing.assert_array_equal(whole.pose[between], track.pose[between])
+    later = np.setdiff1d(rows[rows > asked[0]], asked)
+    assert np.all(np.any(np.abs(whole.pose[later, 3:] - track.pose[later, 3:]) > 1e-4, axis=1))
     nearer = np.abs(whole.pose[asked, 3:] - made.poses[asked, 3:] - WRONG) < np.abs(
         track.pose[asked, 3:] - made.poses[asked, 3:] - WRONG
     )
