@@ -165,6 +165,7 @@ def test_exact_flow_gives_exact_poses_without_a_tracker(monkeypatch):
 
 
 @pytest.mark.system
+@pytest.mark.optimised
 def test_a_head_that_turns_far_comes_back_to_where_it_is(data_dir):
     """Turned by up to 60 degrees for most of ten seconds: without key frames it comes back off by 8 and 10 degrees."""
     model = head_real.read_ict(data_dir / "ict_face_model")
