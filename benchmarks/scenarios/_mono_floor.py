@@ -87,9 +87,8 @@ def modelled_rotation_metrics(seed: int) -> dict[str, Metric]:
             observed = faces + draw.normal(0, NOISE_MM["one_mm"], faces.shape)
             rms = np.degrees(np.sqrt(np.mean(np.square(_rotation_errors_of_others(observed)), axis=0)))
             metrics |= {
-                f"error_modelled_{axis}_of_{name}_{how}": Metric(float(rms[i]), "deg", "lower")
-                for i, axis in enumerate(("roll", "yaw", "pitch"))
-                if i
+                f"error_modelled_{axis}_of_{name}_{how}": Metric(float(value), "deg", "lower")
+                for axis, value in zip(("yaw", "pitch"), rms[1:], strict=True)
             }
     return metrics
 

@@ -5,9 +5,14 @@ no rotation. Positive yaw turns the nose towards the image's left. Everything is
 `vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble.
 """
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+Angles = TypeVar("Angles", Array, np.ndarray)
 
 
 @jax.jit  # traced once for each shape, though called at many places of a program
@@ -35,6 +40,11 @@ def angles(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     roll = jnp.arctan2(jnp.where(locked, 0.0, r10), jnp.where(locked, 1.0, r00))
     pitch = jnp.arctan2(jnp.where(locked, -r12, r21), jnp.where(locked, r11, r22))
     return jnp.stack([roll, jnp.arctan2(-r20, cosine), pitch])
+
+
+def within_half_turn(radians: Angles) -> Angles:
+    """The same angles from -pi up to pi; arrays of NumPy or JAX."""
+    return (radians + np.pi) % (2 * np.pi) - np.pi
 
 
 def turning_axes(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfilters.models.face.pose import within_half_turn
 from jaxfilters.trackers.head.common.table import (
     AXES,
     SKIPPED,
@@ -49,7 +50,7 @@ def errors(track: HeadRows, truth: HeadTruth | None) -> dict[str, Any]:
     if truth is None or not len(tracked):
         return {}
     offsets = track.pose[tracked].astype(float) - truth.poses[tracked]
-    offsets[:, 3:] = (offsets[:, 3:] + np.pi) % (2 * np.pi) - np.pi
+    offsets[:, 3:] = within_half_turn(offsets[:, 3:])
     inside = np.abs(offsets) <= _SIGMAS * track.pose_std[tracked]
     pixels = track.image_points[tracked].astype(float) - truth.uv[tracked]
     rmse = np.sqrt(np.mean(offsets**2, axis=0))

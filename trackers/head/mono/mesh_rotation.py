@@ -23,7 +23,7 @@ from jaxfilters._full_precision import dot
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
-from jaxfilters.models.face.pose import angles, rotation, turn
+from jaxfilters.models.face.pose import angles, rotation, turn, within_half_turn
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.rigid import align
 from jaxfilters.trackers.head.mono.state import MonoTrack
@@ -241,7 +241,7 @@ def _together(
     lasting, turned = np.minimum(own, mesh.track_variance), np.square(mesh.yaw / REFERENCE_YAW)
     usual = STD + STD_BY_YAW * turned
     variance = np.square(np.stack([usual, usual + GROSS_STD])) + np.square(MOTION_STD) * (time - mesh.time)
-    apart = (mesh.angles - mesh.track_angles + np.pi) % (2 * np.pi) - np.pi
+    apart = within_half_turn(mesh.angles - mesh.track_angles)
     both = mesh.track_variance + variance
     gross = min(GROSS_SHARE * turned, MOST_GROSS)
     with np.errstate(divide="ignore"):

@@ -21,6 +21,7 @@ from jaxfilters._full_precision import dot
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.alignment import Alignment
+from jaxfilters.models.face.pose import within_half_turn
 from jaxfilters.models.face.refinement import refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import shape
@@ -141,7 +142,7 @@ def is_better(other: MonoTrack, track: MonoTrack, *, agrees: bool = False) -> bo
 def _distance(pose: Float[np.ndarray, " 6"], track: MonoTrack) -> float:
     """Squared distance of a pose from a track by what both are off by, all but the depth."""
     apart = pose - np.asarray(track.pose, float)
-    apart[3:] = (apart[3:] + np.pi) % (2 * np.pi) - np.pi
+    apart[3:] = within_half_turn(apart[3:])
     variance = np.square(track.pose_std) + np.square(LASTING_STD)
     return float(np.sum(np.delete(np.square(apart) / variance, 2)))
 
@@ -202,7 +203,7 @@ def _fused(state: MonoState, found: Gaussian) -> Gaussian:
     num_sure = jnp.sum(jnp.any(~state.recent.has_changed, axis=0)).astype(found.mean.dtype)
     mean, covariance = state.belief.mean, frame_covariance(state.belief.covariance, num_sure)
     apart = found.mean - mean
-    turned = (apart[3:POSE] + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    turned = within_half_turn(apart[3:POSE])
     gain = jnp.linalg.solve(covariance + found.covariance, covariance).T
     both = covariance - dot(gain, covariance)
     return Gaussian(mean + dot(gain, apart.at[3:POSE].set(turned)), 0.5 * (both + both.T))
