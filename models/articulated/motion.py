@@ -63,7 +63,8 @@ class AboutEase:
 
     With `a = 1 / time`, position and quaternion follow `p'' = -a p' + w`, angles `p'' = -2 a p' - a^2 (p - ease) + w`,
     solved exactly. What the image says nothing about comes to rest at the deviations of a hand of which nothing is
-    known: `speed_std` of the rates and `time * speed_std` of the angles, however long a gap between frames is.
+    known: `speed_std` of the rates and `time * speed_std` of the angles, however long a gap between frames is. With a
+    correlation, the accelerations of the angles and with them the angles at rest have it.
     """
 
     ease: Float[Array, " angles"]
@@ -75,6 +76,9 @@ class AboutEase:
     lean_std: Float[Array, ""] | None = None
     """Standard deviation of the sine of the angle between the hand's long axis and the image plane, of a hand of which
     nothing is known; `None` where it points anywhere alike."""
+    angle_root: Float[Array, "angles angles"] | None = None
+    """Lower triangular root of the correlation of the angles of a hand of which nothing is known; `None` where each
+    moves on its own."""
 
     def advance(self, x: Float[Array, " n"], layout: Layout, dt: Float[Array, ""] | float) -> Float[Array, " n"]:
         """The expected state `dt` frames later."""
@@ -100,6 +104,9 @@ class AboutEase:
         recent = jnp.minimum(dt, REMEMBERED * self.time)
         push = self.speed_std * jnp.sqrt(np.where(is_angle, 4.0, 2.0) / self.time)
         nothing = jnp.zeros((layout.size - layout.static.start, layout.num_moving), push.dtype)
+        together = jnp.eye(layout.num_moving, dtype=push.dtype)
+        if self.angle_root is not None:
+            together = together.at[layout.angles, layout.angles].set(self.angle_root)
         columns = []
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
             since = 0.5 * (1 + float(node)) * recent
@@ -107,7 +114,9 @@ class AboutEase:
             moved = jnp.where(is_angle, since * kept, -self.time * jnp.expm1(-since / self.time))
             rate = jnp.where(is_angle, (1 - since / self.time) * kept, kept)
             now = push * safe_sqrt(0.5 * float(weight) * recent)
-            columns.append(jnp.concatenate([jnp.diag(now * moved), jnp.diag(now * rate), nothing]))
+            columns.append(
+                jnp.concatenate([(now * moved)[:, None] * together, (now * rate)[:, None] * together, nothing])
+            )
         before = jnp.where(is_angle, 0.0, push * self.time * safe_sqrt(dt - recent))
         columns.append(jnp.concatenate([jnp.diag(before), jnp.zeros_like(jnp.diag(before)), nothing]))
         return jnp.concatenate(columns, axis=1)
@@ -149,6 +158,7 @@ def about_ease(
     speed_std: tuple[float, float, float] = SPEED,
     time: float = MOVEMENT_TIME,
     lean_std: float | None = None,
+    correlation: Float[Array | np.ndarray, "k k"] | None = None,
 ) -> AboutEase:
     """The motion of a hand about its angles at ease, with checked numbers.
 
@@ -159,9 +169,11 @@ def about_ease(
         speed_std: Of wrist (metres), quaternion and angles, per frame.
         time: Frames in which a rate falls to 1/e.
         lean_std: Of the sine of the angle between the hand's long axis and the image plane; `None` for any rotation.
+        correlation: Of the angles; `None` where each moves on its own.
 
     Raises:
-        ValueError: if the angles are not those of the layout, or a number is not finite or has the wrong sign.
+        ValueError: if the angles are not those of the layout, a number is not finite or has the wrong sign, or the
+            correlation is not symmetric, positive definite and 1 on its diagonal.
     """
     expected = layout.angles.stop - layout.angles.start
     if np.shape(ease) != (expected,) or not np.all(np.isfinite(ease)):
@@ -178,7 +190,22 @@ def about_ease(
         speed_std=layout.per_moving(per_metre * wrist, quaternion, angle),
         time=layout.per_moving(time, time, time),
         lean_std=None if lean_std is None else jnp.asarray(lean_std, dtype=float),
+        angle_root=None if correlation is None else jnp.asarray(_root_of(correlation, expected), dtype=float),
     )
+
+
+def _root_of(correlation, size):
+    """The Cholesky root of a correlation matrix (size, size)."""
+    C = np.asarray(correlation, float)
+    if C.shape != (size, size) or not np.allclose(C, C.T) or not np.allclose(np.diagonal(C), 1.0):
+        raise ValueError(
+            f"correlation must be symmetric ({size}, {size}) with ones on its diagonal; got {correlation}."
+        )
+    try:
+        return np.linalg.cholesky(C)
+    except np.linalg.LinAlgError as error:
+        least = np.linalg.eigvalsh(C)[0]
+        raise ValueError(f"correlation must be positive definite; its least eigenvalue is {least:.3g}.") from error
 
 
 def _pose(layout):

@@ -191,14 +191,15 @@ def keypoint_noise(points: np.ndarray) -> float:
 def persistence(times_s: np.ndarray) -> float:
     """By which a filter of white noise has to raise the noise of a detector that looks at times (frames,), seconds.
 
-    A detector errs by what it sees: its errors last as long as a pose. Errors with the correlation exp(-t / T), where
-    T is `MOVEMENT_TIME`, have a mean over many frames dt apart whose variance is coth(dt / 2 T) times that of white
-    errors; at 30 frames/s the standard deviation is raised by 4.5. The median of the steps counts.
+    A detector errs by what it sees: its errors last as long as a pose. A filter that forgets by exp(-t / M) takes a
+    mean of errors with the correlation exp(-t / T). For frames dt apart, the variance of this mean is
+    coth(dt (1 / T + 1 / M) / 2) times that of white errors. T and M are both `MOVEMENT_TIME`, in which errors and pose
+    change; at 30 frames/s the standard deviation is raised by 3.2. The median of the steps counts.
     """
     if len(times_s) < 2:
         return 1.0
     step = float(np.median(np.diff(times_s))) / (FRAME_INTERVAL * MOVEMENT_TIME)
-    return 1 / math.sqrt(math.tanh(0.5 * step))
+    return 1 / math.sqrt(math.tanh(step))
 
 
 def features_named(names: list[str], recording: str) -> tuple[int, FeatureSet, list[int]]:

@@ -12,10 +12,11 @@ from jaxtyping import Array, Bool, Float
 from jaxfilters._full_precision import dot
 from jaxfilters.gaussian.constraints import LinearConstraints
 from jaxfilters.math.lie import quaternion_multiply, so3_exp
+from jaxfilters.math.linalg import solve_triangular
 from jaxfilters.models.articulated.anatomy import PALM_WIDTH, relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
-from jaxfilters.models.articulated.motion import ANGLE_SPREAD, AboutEase, lean_axes
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD, AboutEase, Motion, lean_axes
 from jaxfilters.models.articulated.projection import Perspective
 
 NUM_STARTS = 6
@@ -208,7 +209,7 @@ def _fitted(
         missed = jnp.where(observed, (hand.observe(x) - y) / std, 0.0)
         pair = jnp.sum(jax.lax.stop_gradient(missed).reshape(-1, 2) ** 2, axis=1)
         missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
-        parts = [missed, (x[layout.angles] - relaxed) / ANGLE_STD]
+        parts = [missed, _apart_from_alike(hand.motion, x[layout.angles] - relaxed) / ANGLE_STD]
         parts += [p[rotation:angles] / size.std] if in_space else []
         if isinstance(hand.motion, AboutEase) and hand.motion.lean_std is not None:
             axis, sight = lean_axes(x, layout)
@@ -237,6 +238,13 @@ def _fitted(
     return state(p), cost
 
 
+def _apart_from_alike(motion: Motion, angles: Array) -> Array:
+    """Deviations of the angles, made independent of one another where fingers and joints flex together."""
+    if not isinstance(motion, AboutEase) or motion.angle_root is None:
+        return angles
+    return solve_triangular(motion.angle_root, angles)
+
+
 def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
     """Pose as fitted; a hand as a whole may be larger or smaller, in perspective at a distance in proportion."""
     layout: Layout = hand.layout
@@ -254,6 +262,9 @@ def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
     q = x[layout.quaternion]
     across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
     covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)
+    if isinstance(hand.motion, AboutEase) and hand.motion.angle_root is not None:
+        root = ANGLE_STD * hand.motion.angle_root
+        covariance = covariance.at[layout.angles, layout.angles].set(dot(root, root.T))
     grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static])
     if isinstance(projection, Perspective):
         grows = grows.at[layout.position].set(x[layout.position]).at[width].multiply(size.width_varies)

@@ -4,7 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles, template_lengths, template_shape
+from jaxfilters.models.articulated.anatomy import (
+    five_finger_limits,
+    flexion_correlation,
+    relaxed_angles,
+    template_lengths,
+    template_shape,
+)
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
 
@@ -50,6 +56,18 @@ def test_little_finger_spreads_away_from_the_thumb():
 def test_lengths_can_be_asked_for_while_something_is_traced():
     inside = jax.jit(lambda: template_lengths() + 0.0)()
     np.testing.assert_allclose(inside, template_lengths(), rtol=1e-6)
+
+
+def test_fingers_and_the_joints_of_one_flex_together_and_nothing_else():
+    C = flexion_correlation(five_fingers()).reshape(5, 4, 5, 4)
+    assert np.linalg.eigvalsh(C.reshape(20, 20))[0] > 0.02
+    np.testing.assert_array_equal(C.reshape(20, 20), C.reshape(20, 20).T)
+    np.testing.assert_allclose([C[2, 1, 3, 1], C[1, 2, 4, 2], C[0, 2, 0, 3], C[4, 1, 4, 2]], [0.6, 0.6**3, 0.8, 0.3])
+    # What flexes a joint flexes the outer joint beside it in every finger.
+    assert C[1, 2, 2, 3] == pytest.approx(0.6 * 0.8)
+    spreads = C[:, 0].reshape(5, 20)
+    np.testing.assert_array_equal(spreads, np.eye(20)[::4])
+    assert not C[0, :, 1:].any()
 
 
 def test_limits_refuse_other_hands():

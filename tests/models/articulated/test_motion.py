@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.linalg import expm
 
-from jaxfilters.models.articulated.anatomy import relaxed_angles
+from jaxfilters.models.articulated.anatomy import flexion_correlation, relaxed_angles
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.motion import ANGLE_SPREAD, MOVEMENT_TIME, AboutEase, about_ease, lean_axes
 
@@ -59,7 +59,8 @@ def test_a_hand_about_its_ease_solves_its_equation(dt, x64, random_state):
 def test_angles_that_nobody_sees_come_to_the_spread_of_hands():
     layout = five_fingers()
     ease = relaxed_angles(layout).ravel()
-    motion = about_ease(layout, ease)
+    alike = flexion_correlation(layout)
+    motion = about_ease(layout, ease, correlation=alike)
     F = jax.jacfwd(lambda x: motion.advance(x, layout, 1.0))(jnp.zeros(layout.size))
     G = motion.noise_root(layout, 1.0)
 
@@ -67,7 +68,7 @@ def test_angles_that_nobody_sees_come_to_the_spread_of_hands():
         return F @ P @ F.T + G @ G.T, None
 
     P, _ = jax.lax.scan(step, jnp.zeros((layout.size, layout.size)), None, length=int(20 * MOVEMENT_TIME))
-    np.testing.assert_allclose(np.sqrt(np.diagonal(P)[layout.angles]), ANGLE_SPREAD, rtol=1e-3)
+    np.testing.assert_allclose(P[layout.angles, layout.angles], ANGLE_SPREAD**2 * alike, atol=2e-3 * ANGLE_SPREAD**2)
     np.testing.assert_allclose(np.sqrt(np.diagonal(P)[layout.rates]), motion.speed_std, rtol=1e-3)
 
 
@@ -137,6 +138,9 @@ def test_speeds_in_an_image_are_those_in_space_times_its_scale():
         (dict(time=0.0), "time must be positive; got 0.0"),
         (dict(lean_std=0.0), "lean_std must be positive; got 0.0"),
         (dict(per_metre=float("inf")), "per_metre must be positive; got inf"),
+        (dict(correlation=np.eye(7)), r"correlation must be symmetric \(8, 8\) with ones on its diagonal"),
+        (dict(correlation=2 * np.eye(8)), "with ones on its diagonal"),
+        (dict(correlation=np.ones((8, 8)) - 2 * np.eye(8, k=1) - 2 * np.eye(8, k=-1)), "must be positive definite"),
     ],
 )
 def test_bad_motions_are_refused(options, message):

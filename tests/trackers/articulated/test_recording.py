@@ -198,16 +198,18 @@ def test_default_noise_is_a_share_of_the_hand_in_the_image():
 
 @pytest.mark.parametrize("interval", [1 / 120, 1 / 30, 0.2, 1.0])
 def test_errors_that_last_are_raised_to_what_their_mean_is_off_by(interval):
-    # The variance of a mean of n errors with correlation exp(-3 |i - j| dt), times n, from the sum over all pairs.
-    n = 20_000
-    correlation = np.exp(-3 * interval * np.arange(1, n))
-    of_the_mean = 1 + 2 * np.sum((1 - np.arange(1, n) / n) * correlation)
-    assert persistence(interval * np.arange(50.0)) == pytest.approx(np.sqrt(of_the_mean), rel=0.005)
+    # The variance of a mean with weights exp(-3 k dt) of errors with correlation exp(-3 |i - j| dt), from the sum over
+    # all pairs, over that of the same mean of white errors.
+    times = interval * np.arange(round(10 / interval))
+    weights = np.exp(-3 * times)
+    correlation = np.exp(-3 * np.abs(times[:, None] - times))
+    ratio = weights @ correlation @ weights / (weights @ weights)
+    assert persistence(interval * np.arange(50.0)) == pytest.approx(np.sqrt(ratio), rel=1e-6)
 
 
 def test_persistence_is_that_of_most_steps_and_nothing_for_one_frame():
     steady = np.arange(40) / 30
-    assert persistence(steady) == pytest.approx(4.47, abs=0.01)
+    assert persistence(steady) == pytest.approx(3.17, abs=0.01)
     assert persistence(np.delete(steady, slice(10, 19))) == pytest.approx(persistence(steady))
     assert persistence(np.zeros(1)) == 1.0
 

@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxfilters.models.articulated.anatomy import five_finger_limits, relaxed_angles, template_shape
+from jaxfilters.models.articulated.anatomy import (
+    five_finger_limits,
+    flexion_correlation,
+    relaxed_angles,
+    template_shape,
+)
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
+from jaxfilters.models.articulated.motion import about_ease
 from jaxfilters.models.articulated.projection import Perspective, WeakPerspective
 from jaxfilters.models.camera import Pinhole
-from jaxfilters.trackers.articulated.start import NUM_STARTS, size_of, starts_from_points
+from jaxfilters.trackers.articulated.start import ANGLE_STD, NUM_STARTS, size_of, starts_from_points
 
 pytestmark = pytest.mark.system
 
@@ -86,6 +92,30 @@ def test_covariances_are_positive_and_leave_a_weak_scale_alone(scene):
         assert eigenvalues[0] > -1e-6 * eigenvalues[-1]
         q = mean[hand.layout.quaternion]
         assert abs(q @ covariance[hand.layout.quaternion, hand.layout.quaternion] @ q) < 1e-6
+
+
+def test_a_hidden_finger_is_as_those_beside_it_let_expect():
+    """What nothing is measured of has its conditional mean, and a start the correlation of angles at rest."""
+    layout, projection = five_fingers(3), Perspective(CAMERA)
+    alike, ease = flexion_correlation(layout), relaxed_angles(layout).ravel()
+    motion = about_ease(layout, ease, correlation=alike)
+    hand = articulated_hand(layout, projection=projection, features=KEYPOINTS, motion=motion)
+    truth = np.array(true_state(hand, (20, 0, 0), np.random.default_rng(5)))
+    bent = np.radians([[0, 0, 0, 0], *[[0, 10, 25, 20]] * 4])
+    truth[layout.angles] += bent.ravel()
+    hidden = np.zeros((5, 4), bool)
+    hidden[3, 1:] = True  # the flexions of the ring finger
+    points = np.ones((5, 3, 2), bool)
+    points[3] = False
+    mask = jnp.asarray(np.concatenate([np.ones(12, bool), points.ravel()]))
+    found = starts_from_points(hand, None, hand.observe(jnp.asarray(truth)), mask, jnp.full(42, 1.0))
+    off = np.asarray(found.means[0])[layout.angles] - ease
+    ring = hidden.ravel()
+    expected = alike[np.ix_(ring, ~ring)] @ np.linalg.solve(alike[np.ix_(~ring, ~ring)], off[~ring])
+    assert (expected[1:] > np.radians(8.0)).all()
+    np.testing.assert_allclose(off[ring], expected, atol=np.radians(0.5))
+    block = np.asarray(found.covariances[0])[layout.angles, layout.angles]
+    np.testing.assert_allclose(block, ANGLE_STD**2 * alike, atol=1e-6)
 
 
 def test_too_few_points_are_no_start(scene):
