@@ -8,9 +8,9 @@ with that how large it is, which no other variant knows. `backprojection_estimat
 an average hand of the same extent would have. `recommended_known_size` is the tracker with the width of the palm.
 
 What limits it: a hand of 90 pixels that faces the camera (ICVL) is flatter, 22 mm in depth, than its foreshortening can
-be read from detections that are 4 pixels off; there the plane at the depth of the root is nearer to the truth. Even of
+be read from detections that are 4 pixels off; there the plane at the depth of the root is hard to beat. Even of
 exact points the most likely pose of such a hand is tilted by 17 degrees where all rotations are alike, since the joint
-density of pose and angles is higher, though narrower, where fingers point to the camera; hence `LEAN_STD`.
+density of pose and angles is higher, though narrower, where fingers point to the camera; hence `motion.LEAN_STD`.
 """
 
 import time
@@ -25,12 +25,11 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._real_markers import MarkedHand, Marker, marked_hand
 from jaxfilters.benchmarks.scenarios._real_mocap import mocap_metrics
-from jaxfilters.models.articulated.anatomy import five_finger_limits, flexion_correlation, relaxed_angles
+from jaxfilters.models.articulated.anatomy import five_finger_limits, motion_about_ease
 from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
-from jaxfilters.models.articulated.motion import LEAN_STD, about_ease
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
@@ -165,11 +164,8 @@ def back_projected(camera: Pinhole, uvd: np.ndarray) -> np.ndarray:
 def hand_of(chosen: HandSet, detections: Detections) -> tuple[MarkedHand, Inequalities]:
     """The average hand before the camera, and its limits."""
     layout = five_fingers(3, chosen.side)
-    ease, alike = relaxed_angles(layout).ravel(), flexion_correlation(layout)
-    motion = about_ease(layout, ease, lean_std=LEAN_STD, correlation=alike)
-    hand = articulated_hand(
-        layout, projection=Perspective(detections.camera), motion=motion, point_std=detections.noise
-    )
+    projection, motion = Perspective(detections.camera), motion_about_ease(layout)
+    hand = articulated_hand(layout, projection=projection, motion=motion, point_std=detections.noise)
     marked = marked_hand(hand, chosen.markers)
     return marked, inequalities(limit_rows(layout, five_finger_limits(layout)))
 

@@ -1,4 +1,4 @@
-"""An average hand as a template for articulated hands with five fingers: lengths, and limits that most people keep.
+"""An average hand as a template for articulated hands with five fingers: lengths, limits that most people keep, motion.
 
 Lengths are those of `jaxfilters.models.hand.skeleton`; limits of angles are its, with those of the last joints beside
 them, and lengths may differ from the template by a share.
@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxfilters.models.articulated.layout import LINKS, Layout
 from jaxfilters.models.articulated.limits import Limit, difference, proportions, within
+from jaxfilters.models.articulated.motion import LEAN_STD, AboutEase, about_ease
 from jaxfilters.models.hand.skeleton import hand_geometry
 
 PALM_WIDTH, PALM_HEIGHT, PALM_THICKNESS = 80.0, 95.0, 26.0
@@ -54,18 +55,28 @@ def relaxed_angles(layout: Layout) -> np.ndarray:
 def flexion_correlation(layout: Layout) -> np.ndarray:
     """(20, 20): correlation of the angles of a hand at ease, finger by finger, abduction before flexions.
 
-    Flexions of fingers that are `d` apart have the correlation of their joints times `ALIKE_FINGERS ** d`; the thumb
-    and all abductions move on their own, except that the joints of the thumb are alike as those of a finger.
+    Flexions of fingers that are `d` apart have the correlation of their joints times `ALIKE_FINGERS ** d`. The thumb
+    and all abductions are independent of the rest; the joints of the thumb are correlated as those of a finger.
+
+    Raises:
+        ValueError: if the layout has not five fingers.
     """
+    _check_five(layout)
     place = np.arange(layout.num_fingers)
     fingers = ALIKE_FINGERS ** np.abs(place[:, None] - place).astype(float)
     fingers[0, 1:] = fingers[1:, 0] = 0.0
-    joints = np.array([[1, ALIKE_INNER, ALIKE_INNER * ALIKE_OUTER], [0, 1, ALIKE_OUTER], [0, 0, 1]])
-    flexions = np.kron(fingers, np.triu(joints) + np.triu(joints, 1).T)
+    ends = ALIKE_INNER * ALIKE_OUTER
+    joints = [[1, ALIKE_INNER, ends], [ALIKE_INNER, 1, ALIKE_OUTER], [ends, ALIKE_OUTER, 1]]
     whole = np.eye((LINKS + 1) * layout.num_fingers)
     flexes = np.flatnonzero(np.arange(len(whole)) % (LINKS + 1))
-    whole[np.ix_(flexes, flexes)] = flexions
+    whole[np.ix_(flexes, flexes)] = np.kron(fingers, joints)
     return whole
+
+
+def motion_about_ease(layout: Layout, per_metre: float = 1.0) -> AboutEase:
+    """How a hand of five fingers moves before a camera; `per_metre` as for `about_ease`."""
+    ease, alike = relaxed_angles(layout).ravel(), flexion_correlation(layout)
+    return about_ease(layout, ease, per_metre=per_metre, lean_std=LEAN_STD, correlation=alike)
 
 
 def five_finger_limits(layout: Layout, tolerance: float = TOLERANCE) -> Sequence[Limit]:
@@ -74,8 +85,7 @@ def five_finger_limits(layout: Layout, tolerance: float = TOLERANCE) -> Sequence
     Raises:
         ValueError: if the layout has not five fingers, or the tolerance is not in (0, 1).
     """
-    if layout.num_fingers != 5:
-        raise ValueError(f"layout must have five fingers; got {layout.num_fingers}.")
+    _check_five(layout)
     limits: list[Limit] = []
     fan = _side(layout) * _fan()
     for finger in range(1, 6):
@@ -86,6 +96,11 @@ def five_finger_limits(layout: Layout, tolerance: float = TOLERANCE) -> Sequence
             last = math.radians(35.0)
             limits.append(difference(f"theta_{finger}{LINKS - 1}", f"theta_{finger}{LINKS}", -0.3 * last, 1.5 * last))
     return (*limits, *proportions(layout, template_lengths(), PALM_HEIGHT, tolerance))
+
+
+def _check_five(layout):
+    if layout.num_fingers != 5:
+        raise ValueError(f"layout must have five fingers; got {layout.num_fingers}.")
 
 
 def _fan():

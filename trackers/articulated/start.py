@@ -16,7 +16,7 @@ from jaxfilters.math.linalg import solve_triangular
 from jaxfilters.models.articulated.anatomy import PALM_WIDTH, relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import ArticulatedHand
 from jaxfilters.models.articulated.layout import Layout
-from jaxfilters.models.articulated.motion import ANGLE_SPREAD, AboutEase, Motion, lean_axes
+from jaxfilters.models.articulated.motion import ANGLE_SPREAD, AboutEase, lean_axes
 from jaxfilters.models.articulated.projection import Perspective
 
 NUM_STARTS = 6
@@ -197,7 +197,7 @@ def _fitted(
     position, rotation, angles = layout.position.stop, layout.position.stop + 3, layout.position.stop + 4
     in_space = isinstance(hand.projection, Perspective)
     unit = start[2] if in_space else 1.0
-    relaxed = jnp.asarray(relaxed_angles(layout), start.dtype).ravel()
+    relaxed, spread = jnp.asarray(relaxed_angles(layout), start.dtype).ravel(), _angle_root(hand)
 
     def state(p: Array) -> Array:
         x = start.at[layout.position].add(unit * p[:position])
@@ -209,7 +209,7 @@ def _fitted(
         missed = jnp.where(observed, (hand.observe(x) - y) / std, 0.0)
         pair = jnp.sum(jax.lax.stop_gradient(missed).reshape(-1, 2) ** 2, axis=1)
         missed = missed * jnp.repeat(1 / jnp.sqrt(1 + pair / _OUTLIER**2), 2)
-        parts = [missed, _apart_from_alike(hand.motion, x[layout.angles] - relaxed) / ANGLE_STD]
+        parts = [missed, solve_triangular(spread, x[layout.angles] - relaxed)]
         parts += [p[rotation:angles] / size.std] if in_space else []
         if isinstance(hand.motion, AboutEase) and hand.motion.lean_std is not None:
             axis, sight = lean_axes(x, layout)
@@ -238,11 +238,10 @@ def _fitted(
     return state(p), cost
 
 
-def _apart_from_alike(motion: Motion, angles: Array) -> Array:
-    """Deviations of the angles, made independent of one another where fingers and joints flex together."""
-    if not isinstance(motion, AboutEase) or motion.angle_root is None:
-        return angles
-    return solve_triangular(motion.angle_root, angles)
+def _angle_root(hand: ArticulatedHand) -> Float[Array, "angles angles"]:
+    """Lower triangular root of the covariance of the angles about the relaxed hand, radians."""
+    alike = hand.motion.angle_root if isinstance(hand.motion, AboutEase) else None
+    return ANGLE_STD * (jnp.eye(4 * hand.layout.num_fingers) if alike is None else alike)
 
 
 def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
@@ -252,7 +251,7 @@ def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
     pixel = x[2] / projection.camera.focal[0] if isinstance(projection, Perspective) else 1.0
     position, quaternion, angle = RATE_STD
     rates = layout.per_moving(1.0, quaternion, angle).at[layout.position].multiply(position * pixel) ** 2
-    moving = layout.per_moving(1.0, 0.0, ANGLE_STD).at[layout.position].multiply(POSITION_STD * pixel) ** 2
+    moving = layout.per_moving(1.0, 0.0, 0.0).at[layout.position].multiply(POSITION_STD * pixel) ** 2
     if not isinstance(projection, Perspective):
         size = AVERAGE_SIZE
     width = layout.palm.start
@@ -262,9 +261,8 @@ def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
     q = x[layout.quaternion]
     across = jnp.eye(4, dtype=x.dtype) - jnp.outer(q, q)
     covariance = jnp.diag(variances).at[layout.quaternion, layout.quaternion].set((0.5 * ROTATION_STD) ** 2 * across)
-    if isinstance(hand.motion, AboutEase) and hand.motion.angle_root is not None:
-        root = ANGLE_STD * hand.motion.angle_root
-        covariance = covariance.at[layout.angles, layout.angles].set(dot(root, root.T))
+    root = _angle_root(hand)
+    covariance = covariance.at[layout.angles, layout.angles].set(dot(root, root.T))
     grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static])
     if isinstance(projection, Perspective):
         grows = grows.at[layout.position].set(x[layout.position]).at[width].multiply(size.width_varies)

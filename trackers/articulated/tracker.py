@@ -21,7 +21,7 @@ from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.gaussian_sum import GaussianSumState, gaussian_sum, map_component
 from jaxfilters.models.articulated.ambiguity import shows_length
-from jaxfilters.models.articulated.anatomy import five_finger_limits, flexion_correlation, relaxed_angles
+from jaxfilters.models.articulated.anatomy import five_finger_limits, motion_about_ease
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import (
     FeatureObservation,
@@ -38,7 +38,7 @@ from jaxfilters.models.articulated.filters import (
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows, table_1
-from jaxfilters.models.articulated.motion import FRAME_INTERVAL, LEAN_STD, about_ease
+from jaxfilters.models.articulated.motion import FRAME_INTERVAL
 from jaxfilters.models.articulated.projection import Perspective
 from jaxfilters.models.synthetic.articulated import paper_hand, simulate_paper
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
@@ -134,8 +134,7 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
         layout = five_fingers(2 if camera is None else 3, side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
         per_metre = diagonal / HAND_DIAGONAL if camera is None else 1.0
-        ease, alike = relaxed_angles(layout).ravel(), flexion_correlation(layout)
-        motion = about_ease(layout, ease, per_metre=per_metre, lean_std=LEAN_STD, correlation=alike)
+        motion = motion_about_ease(layout, per_metre)
         # Views differ by what a detector errs by in one frame, however long its errors last.
         noise = sequence.noise_px or float(np.median(sequence.std[np.isfinite(sequence.y)]))
         projection = None if camera is None else Perspective(camera)

@@ -70,6 +70,7 @@ def test_fingers_and_the_joints_of_one_flex_together_and_nothing_else():
     assert not C[0, :, 1:].any()
 
 
-def test_limits_refuse_other_hands():
+@pytest.mark.parametrize("make", [five_finger_limits, flexion_correlation])
+def test_other_hands_are_refused(make):
     with pytest.raises(ValueError, match="five fingers; got 2"):
-        five_finger_limits(Layout(2))
+        make(Layout(2))

@@ -20,7 +20,7 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
-from jaxfilters.trackers.articulated.recording import FeatureSequence, from_keypoints
+from jaxfilters.trackers.articulated.recording import FeatureSequence, from_keypoints, persistence
 from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING
 
 KEY = jax.random.key(0)
@@ -178,7 +178,7 @@ def test_what_is_a_new_view_follows_from_the_noise_in_one_frame():
     sequence = from_keypoints(np.arange(20) / 30, points, "keypoints", noise_px=3.0)
     hand = tracker.hand_model(sequence, ArticulatedConfig())
     assert float(hand.point_std) == pytest.approx(3.0)
-    assert sequence[0].std.min() > 3 * float(hand.point_std)
+    np.testing.assert_allclose(sequence[0].std, 3.0 * persistence(sequence.times_s), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
