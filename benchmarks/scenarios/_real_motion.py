@@ -25,8 +25,9 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios._real_markers import MarkedHand, Marker, marked_hand
 from jaxfilters.benchmarks.scenarios._real_mocap import mocap_metrics
+from jaxfilters.gaussian.gaussian_sum import map_component
 from jaxfilters.models.articulated.anatomy import five_finger_limits, motion_about_ease
-from jaxfilters.models.articulated.filters import Inequalities, inequalities
+from jaxfilters.models.articulated.filters import Inequalities, belief_of, inequalities, standard_deviations
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.layout import five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
@@ -35,7 +36,8 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, keypoint_noise, persistence
 from jaxfilters.trackers.articulated.start import starts_from_points
-from jaxfilters.trackers.articulated.tracker import HAND_DIAGONAL, TRACKING, tracker_of
+from jaxfilters.trackers.articulated.tracker import HAND_DIAGONAL, TRACKING, TrackState, tracker_of
+from jaxfilters.trackers.tracker import Tracker
 
 HYPOTHESES = 4
 QUICK_FRAMES = 240
@@ -210,17 +212,7 @@ def filtered(variant: str, *, known_size: bool = False) -> Callable[[HandSet, De
     """The tracker in one of its variants, started by itself, and given the width of the palm if asked for."""
 
     def lift(chosen: HandSet, detections: Detections) -> Lifted:
-        times = np.arange(len(detections.pixels)) / chosen.rate
-        hand, limits = hand_of(chosen, detections)
-        # What is a new view follows from the noise in one frame; the filter takes errors that last for larger ones.
-        frames = _frames(detections._replace(noise=persistence(times) * detections.noise))
-        config = ArticulatedConfig(
-            variant=variant,
-            hypotheses=HYPOTHESES,
-            focal=float(np.mean(np.asarray(detections.camera.focal))),
-            palm_width=chosen.palm_width if known_size else None,
-        )
-        tracker = tracker_of(hand, limits, None, config)
+        hand, tracker, frames, times = _tracked(chosen, detections, variant, known_size)
         state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
         jax.block_until_ready(tracker.step(state, frames, times))
         start = time.perf_counter()
@@ -230,6 +222,48 @@ def filtered(variant: str, *, known_size: bool = False) -> Callable[[HandSet, De
         return Lifted(1e3 * np.asarray(points), seconds, float(np.mean(np.asarray(track.status) == TRACKING)))
 
     return lift
+
+
+def claimed(chosen: HandSet, detections: Detections, *, known_size: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the tracker and the standard deviations that it claims, millimetres, both (frames, markers, 6).
+
+    The coordinates are those in the camera frame, then those from the root.
+    """
+    hand, tracker, frames, times = _tracked(chosen, detections, "recommended", known_size)
+    from_root = lambda points: points - points[chosen.root]
+
+    def step(state: TrackState, inputs: tuple[FeatureFrame, jax.Array]) -> tuple[TrackState, jax.Array]:
+        state, _ = tracker.step(state, *jax.tree.map(lambda leaf: leaf[None], inputs))
+        belief = belief_of(map_component(state.bank))
+        points = hand.marker_points(belief.mean)
+        std = standard_deviations(hand.marker_points, belief)
+        relative_std = standard_deviations(lambda x: from_root(hand.marker_points(x)), belief)
+        estimate = jnp.concatenate([points, from_root(points)], axis=1)
+        return state, jnp.stack([estimate, jnp.concatenate([std, relative_std], axis=1)])
+
+    state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
+    _, found = jax.jit(lambda *inputs: jax.lax.scan(step, state, inputs))(frames, jnp.asarray(times, dtype=float))
+    truth = detections.truth
+    truth = np.concatenate([truth, truth - truth[:, chosen.root, None]], axis=2)
+    estimate, std = np.moveaxis(1e3 * np.asarray(found, float), 1, 0)
+    return estimate - truth, std
+
+
+def _tracked(
+    chosen: HandSet, detections: Detections, variant: str, known_size: bool
+) -> tuple[MarkedHand, Tracker, FeatureFrame, np.ndarray]:
+    """The hand, its tracker, and the frames with their times."""
+    times = np.arange(len(detections.pixels)) / chosen.rate
+    hand, limits = hand_of(chosen, detections)
+    # What is a new view follows from the noise in one frame; the filter takes errors that last for larger ones.
+    frames = _frames(detections._replace(noise=persistence(times) * detections.noise))
+    config = ArticulatedConfig(
+        variant=variant,
+        hypotheses=HYPOTHESES,
+        focal=float(np.mean(np.asarray(detections.camera.focal))),
+        palm_width=chosen.palm_width if known_size else None,
+    )
+    return hand, tracker_of(hand, limits, None, config), frames, times
 
 
 def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detections) -> dict[str, Metric]:

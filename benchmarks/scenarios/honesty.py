@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from jaxfilters.benchmarks.scenarios import (
     _mono_detected,
     _mono_real,
     _real_hands,
+    _real_motion,
     head_real,
     people_pets,
 )
@@ -70,6 +72,17 @@ QUICK_KEYPOINT_FRAMES = 400
 QUICK_HANDS, QUICK_HAND_FRAMES = 2, 16
 PIP_COLUMNS = np.array([12, 15, 18, 21])
 """Of the pose: flexion of the second joint of the four fingers."""
+CHOSEN_FRAMES = 350
+"""Of the key points of real hands: constants of the articulated tracker were chosen on them."""
+DETECTED_HANDS: dict[str, dict[str, Any]] = {
+    "nyu_feedback": {"hands": "nyu"},
+    "nyu_v2v": {"hands": "nyu", "network": 1},
+    "icvl_v2v": {"hands": "icvl"},
+    "nyu_feedback_palm_width": {"hands": "nyu", "known_size": True},
+    "nyu_v2v_palm_width": {"hands": "nyu", "network": 1, "known_size": True},
+    "icvl_v2v_palm_width": {"hands": "icvl", "known_size": True},
+}
+"""Recordings and networks by name, without and with the width of the palm."""
 SETTLED = 30
 """Frames of key points after which the start is forgotten."""
 
@@ -161,6 +174,26 @@ def articulated_claims(quick: bool, seed: int) -> Claims:
     return Claims("articulated", "dfki", tuple(f"{finger}_mm" for finger in FINGERS), recordings)
 
 
+def articulated_points_claims(
+    quick: bool, seed: int, *, data: str, hands: str, network: int = 0, known_size: bool = False
+) -> Claims:
+    """Joints of hands whose key points a network detected; one recording a joint, as in `keypoint_claims`.
+
+    Constants were chosen on the frames that are left out, the first `CHOSEN_FRAMES`.
+    """
+    del seed
+    chosen = _real_motion.SETS[hands]
+    frames = CHOSEN_FRAMES + QUICK_KEYPOINT_FRAMES if quick else None
+    folder = recording_folder("handpose_tracks").parent
+    detections = _real_motion.load(folder, chosen, chosen.networks[network], frames)
+    errors, std = _real_motion.claimed(chosen, detections, known_size=known_size)
+    joints = [i for i in range(errors.shape[1]) if i != chosen.root]
+    recordings = [Recording(errors[CHOSEN_FRAMES:, i], std[CHOSEN_FRAMES:, i]) for i in joints]
+    return Claims(
+        "articulated", data, ("x_mm", "y_mm", "z_mm", *(f"from_palm_{axis}_mm" for axis in "xyz")), recordings
+    )
+
+
 def people_claims(quick: bool, seed: int) -> Claims:
     """People on PETS 2009, along and across the line of sight; one recording a person."""
     del seed
@@ -243,6 +276,10 @@ def _where(is_tracked: np.ndarray, errors: np.ndarray, deviations: np.ndarray) -
 SYSTEMS: dict[str, Callable[[bool, int], Claims]] = {
     "hand from depth, real motions": hand_claims,
     "articulated hand, motion capture": articulated_claims,
+    **{
+        f"articulated hand, {data}": partial(articulated_points_claims, data=data, **chosen)
+        for data, chosen in DETECTED_HANDS.items()
+    },
     "people, PETS 2009": people_claims,
     "head before two cameras, rendered": stereo_claims,
     "head before one camera, rendered": mono_claims,

@@ -148,8 +148,7 @@ def reverse_depth(x: Float[Array, " n"], hand: ArticulatedHand) -> Float[Array, 
     than about the palm's normal. In perspective it is an approximation for a hand far away.
     """
     layout = hand.layout
-    wrist = hand.projection.camera_points(x, layout, jnp.zeros(3, x.dtype))
-    sight = jnp.concatenate([jnp.zeros(1, x.dtype), hand.projection.line_of_sight(wrist)])
+    sight = jnp.concatenate([jnp.zeros(1, x.dtype), hand.projection.line_of_sight(hand.wrist(x))])
     normal = jnp.array([0.0, 0.0, 1.0, 0.0], x.dtype)
     for block in (layout.quaternion, layout.quaternion_rate):
         x = x.at[block].set(quaternion_multiply(sight, quaternion_multiply(x[block], normal)))

@@ -139,8 +139,14 @@ def lasting_curvature(f: Function, belief: Gaussian | GaussianRoot) -> Lineariza
 def signature(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, " d"]:
     """What is visible of a hand wherever it is in the image: its joints from the wrist, pixels."""
     points = hand.points(x)
-    wrist = hand.projection.camera_points(x, hand.layout, jnp.zeros(3, x.dtype))
-    return (hand.projection.image_points(points) - hand.projection.image_points(wrist)).ravel()
+    return (hand.projection.image_points(points) - hand.projection.image_points(hand.wrist(x))).ravel()
+
+
+def standard_deviations(points: Callable[[Array], Float[Array, "*shape"]], belief: Gaussian) -> Float[Array, "*shape"]:
+    """Of points of a hand in its state: `points` is made linear at the mean of the belief about the state."""
+    shape = jax.eval_shape(points, belief.mean).shape
+    F = taylor(lambda x: points(x).ravel(), belief).F
+    return linalg.safe_sqrt(jnp.sum(dot(F, belief.covariance) * F, axis=1)).reshape(shape)
 
 
 def one_by_one(belief: Any, constraints: LinearConstraints) -> tuple[Any, TruncationInfo]:

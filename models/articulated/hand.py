@@ -86,6 +86,10 @@ class ArticulatedHand:
         points = finger_points(x, self.layout, pivot=self.pivot)
         return self.projection.camera_points(x, self.layout, points)
 
+    def wrist(self, x: Float[Array, " n"]) -> Float[Array, " 3"]:
+        """The wrist in the frame and unit of `points`."""
+        return self.projection.camera_points(x, self.layout, jnp.zeros(3, x.dtype))
+
     def image_points(self, x: Float[Array, " n"]) -> Float[Array, "fingers 4 2"]:
         """Pixels of `points`."""
         return self.projection.image_points(self.points(x))

@@ -184,10 +184,7 @@ def _palm_corners(states: jax.Array, hand: ArticulatedHand) -> jax.Array:
 @jax.jit
 def _wrists(states: jax.Array, hand: ArticulatedHand) -> jax.Array:
     """(frames, 2) pixels."""
-    origin = jnp.zeros(3, states.dtype)
-    return jax.vmap(lambda x: hand.projection.image_points(hand.projection.camera_points(x, hand.layout, origin)))(
-        states
-    )
+    return jax.vmap(lambda x: hand.projection.image_points(hand.wrist(x)))(states)
 
 
 @jax.jit

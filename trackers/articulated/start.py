@@ -171,7 +171,7 @@ def _laid_over(hand: ArticulatedHand, x: Array, target: Array, observed: Array) 
     misfit = jnp.sum(weight * (b - dot(scale * a, turned.T)) ** 2)
     z = jnp.eye(3, dtype=x.dtype)[2]
     q = quaternion_multiply(so3_exp(angle * z), x[layout.quaternion])
-    origin = hand.projection.image_points(hand.projection.camera_points(x, layout, jnp.zeros(3, x.dtype)))
+    origin = hand.projection.image_points(hand.wrist(x))
     wrist = there + dot(scale * turned, origin - here)
     if isinstance(hand.projection, Perspective):
         camera = hand.projection.camera

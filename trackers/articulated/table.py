@@ -19,6 +19,8 @@ class TimedArticulatedTrack(NamedTuple):
     mean: np.ndarray
     std: np.ndarray
     points: np.ndarray
+    points_std: np.ndarray
+    points_from_wrist_std: np.ndarray
     image_points: np.ndarray
     scale: np.ndarray
     weight: np.ndarray

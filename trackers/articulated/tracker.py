@@ -33,6 +33,7 @@ from jaxfilters.models.articulated.filters import (
     literal,
     recommended,
     report_of,
+    standard_deviations,
     unconstrained,
 )
 from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
@@ -71,6 +72,10 @@ class ArticulatedTrack(NamedTuple):
     std: Float[Array | np.ndarray, "b n"]
     points: Float[Array | np.ndarray, "b fingers 4 3"]
     """Joints from base to tip in the camera frame: pixels, with depth counted from the wrist's; metres with `focal`."""
+    points_std: Float[Array | np.ndarray, "b fingers 4 3"]
+    """Standard deviations of `points`; with `focal`, most of that of the depth is the unknown distance of the hand."""
+    points_from_wrist_std: Float[Array | np.ndarray, "b fingers 4 3"]
+    """Standard deviations of the vectors from the wrist to `points`."""
     image_points: Float[Array | np.ndarray, "b fingers 4 2"]
     """Pixels."""
     scale: Float[Array | np.ndarray, " b"]
@@ -133,8 +138,7 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
         camera = None if config.focal is None else camera_of(sequence, config.focal)
         layout = five_fingers(2 if camera is None else 3, side=1.0 if config.hand == "right" else -1.0)
         diagonal = keypoint_noise(sequence.y.reshape(len(sequence), -1, 2)) / NOISE_SHARE
-        per_metre = diagonal / HAND_DIAGONAL if camera is None else 1.0
-        motion = motion_about_ease(layout, per_metre)
+        motion = motion_about_ease(layout, diagonal / HAND_DIAGONAL if camera is None else 1.0)
         # Views differ by what a detector errs by in one frame, however long its errors last.
         noise = sequence.noise_px or float(np.median(sequence.std[np.isfinite(sequence.y)]))
         projection = None if camera is None else Perspective(camera)
@@ -332,8 +336,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
         filter.params, update_key, predicted, FeatureObservation(frame.y, frame.mask, frame.std), elapsed
     )
     measured = jnp.any(frame.mask)
-    best = jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components)
-    reported = report_of(best)
+    reported = report_of(jax.tree.map(lambda leaf: leaf[jnp.argmax(bank.log_weights)], info.components))
     nis = reported.kalman.nis / jnp.maximum(reported.kalman.rank, 1)
     # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
     rows = jnp.sum(frame.mask)
@@ -341,9 +344,8 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
     # Only keypoints are searched for. With a given start the hypotheses go on, and fit again when the hand is back.
     searching = (state.misses > PATIENCE) if setup.start is None else jnp.zeros((), bool)
-    misses = jnp.where(observed, 0, state.misses + 1).astype(jnp.int32)
     status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
-    misses = jnp.where(searching, state.misses, misses)
+    misses = jnp.where(searching, state.misses, jnp.where(observed, 0, state.misses + 1)).astype(jnp.int32)
     shown = shows_length(belief_of(map_component(bank)).mean, setup.hand).ravel()
     shown = state.length_observed | (shown & observed & (status == TRACKING))
     log_evidence = jnp.where(measured, info.log_evidence, jnp.nan)
@@ -366,6 +368,8 @@ def _report(
         mean=belief.mean[:body],
         std=jnp.sqrt(jnp.maximum(jnp.diagonal(belief.covariance)[:body], 0.0)),
         points=hand.points(belief.mean),
+        points_std=standard_deviations(hand.points, belief),
+        points_from_wrist_std=standard_deviations(lambda x: hand.points(x) - hand.wrist(x), belief),
         image_points=hand.image_points(belief.mean),
         scale=jnp.sum(q * q),
         weight=jnp.exp(jnp.max(bank.log_weights)),

@@ -12,6 +12,7 @@ from scipy import stats
 
 import jaxfilters
 from jaxfilters import Gaussian
+from jaxfilters._full_precision import dot
 from jaxfilters.gaussian import gaussian_sum
 from jaxfilters.gaussian.constraints import expectation_propagation, linear_constraints
 from jaxfilters.gaussian.extended import Observation, condition
@@ -35,6 +36,20 @@ def hand():
 @pytest.fixture(scope="module")
 def limits():
     return filters.inequalities(limit_rows(LAYOUT, table_1()))
+
+
+def test_standard_deviations_of_points_are_those_of_points_of_drawn_states(hand):
+    """4,000 draws; all 48 ratios lie within 6 % but once in 10,000 runs, as one has a standard error of 1.1 %."""
+    x = synthetic.simulate_paper(jax.random.key(0)).initial_mean
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(x.size, x.size)) * np.where(np.abs(np.asarray(x)) > 5, 0.02, 2e-4)[:, None]
+    belief = Gaussian(x, jnp.asarray(root @ root.T, jnp.float32))
+    drawn = jax.vmap(lambda e: x + dot(jnp.asarray(root, jnp.float32), e))(
+        jax.random.normal(jax.random.key(1), (4000, x.size))
+    )
+    for points in (hand.points, lambda x: hand.points(x) - hand.wrist(x)):
+        expected = np.std(np.asarray(jax.vmap(points)(drawn), float), axis=0)
+        np.testing.assert_allclose(filters.standard_deviations(points, belief), expected, rtol=0.06)
 
 
 def looks(sequence):
