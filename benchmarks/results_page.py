@@ -101,7 +101,7 @@ ON_RECORDINGS = (
         Row(
             "hand from key points",
             f"{name}, key points of a network, size unknown",
-            "joints from the wrist",
+            "joints from the palm",
             "projection back from the estimated depth",
             "articulated",
             f"{name.lower()}_root_relative_mm_recommended",
