@@ -47,9 +47,16 @@ class Calibration(NamedTuple):
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """(n, 2) undistorted pixels of pixels (n, 2) in the image with distortion."""
-        raw = np.asarray(pixels, float).reshape(-1, 1, 2)
-        found = cv2.undistortPointsIter(raw, self.K, self.distortion, np.eye(3), self.K, _UNDISTORT_UNTIL)
-        return found.reshape(-1, 2)
+        return undistort_pixels(pixels, self.K, self.distortion)
+
+
+def undistort_pixels(pixels: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) without lens distortion of pixels (n, 2) of an image with it.
+
+    OpenCV's `undistortPoints` ends after five iterations, which leaves tens of pixels near the border of wide lenses.
+    """
+    raw = np.asarray(pixels, float).reshape(-1, 1, 2)
+    return cv2.undistortPointsIter(raw, K, distortion, np.eye(3), K, _UNDISTORT_UNTIL).reshape(-1, 2)
 
 
 def calibrate_dlt(points_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:

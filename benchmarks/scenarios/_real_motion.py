@@ -36,10 +36,10 @@ from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import NOISE_SHARE, FeatureFrame, keypoint_noise, persistence
 from jaxfilters.trackers.articulated.start import starts_from_points
-from jaxfilters.trackers.articulated.tracker import HAND_DIAGONAL, TRACKING, TrackState, tracker_of
+from jaxfilters.trackers.articulated.state import TRACKING, TrackState
+from jaxfilters.trackers.articulated.tracker import HAND_DIAGONAL, tracker_of
 from jaxfilters.trackers.tracker import Tracker
 
-HYPOTHESES = 4
 QUICK_FRAMES = 240
 VARIANTS = (
     "backprojection",
@@ -259,7 +259,6 @@ def _tracked(
     frames = _frames(detections._replace(noise=persistence(times) * detections.noise))
     config = ArticulatedConfig(
         variant=variant,
-        hypotheses=HYPOTHESES,
         focal=float(np.mean(np.asarray(detections.camera.focal))),
         palm_width=chosen.palm_width if known_size else None,
     )

@@ -165,6 +165,8 @@ def perfect_track(features):
         mean=features.truth.astype(np.float32),
         std=np.full(features.truth.shape, 0.1, np.float32),
         points=points,
+        points_std=np.full_like(points, 0.5),
+        points_from_wrist_std=np.full_like(points, 0.25),
         image_points=points[..., :2],
         scale=(features.truth[:, hand.layout.quaternion] ** 2).sum(axis=1).astype(np.float32),
         weight=ones,
@@ -189,6 +191,8 @@ def nothing_tracked():
             mean=np.zeros((frames, layout.size), np.float32),
             std=np.zeros((frames, layout.size), np.float32),
             points=np.zeros((*joints, 3), np.float32),
+            points_std=np.zeros((*joints, 3), np.float32),
+            points_from_wrist_std=np.zeros((*joints, 3), np.float32),
             image_points=np.zeros((*joints, 2), np.float32),
             scale=one,
             weight=one,
@@ -218,7 +222,7 @@ def build_fake_articulated(sequence, config):
 
     A frame without any measurement has a row of NaN and the status `searching`.
     """
-    from jaxfilters.trackers.articulated.tracker import ArticulatedTrack
+    from jaxfilters.trackers.articulated.state import ArticulatedTrack
 
     del config
     layout = Layout(sequence.num_fingers)
@@ -241,6 +245,8 @@ def build_fake_articulated(sequence, config):
             mean=mean,
             std=jnp.full(layout.size, 0.5, jnp.float32),
             points=points,
+            points_std=jnp.full_like(points, 0.5),
+            points_from_wrist_std=jnp.full_like(points, 0.25),
             image_points=points[..., :2],
             scale=jnp.sum(mean[layout.quaternion] ** 2),
             weight=0.75 * one,

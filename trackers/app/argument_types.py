@@ -43,9 +43,10 @@ def positive_integer(text: str) -> int:
 
 def seed(text: str) -> int:
     """The seed of a random key."""
-    value = int(text) if re.fullmatch(r"[+-]?\d{1,19}", text.strip(), re.ASCII) else None
-    if value is None or not -(2**63) <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"a seed must fit into 64 bits; got {_shown(text)}")
+    # Of larger numbers, JAX takes the last 32 bits only.
+    value = int(text) if re.fullmatch(r"\+?\d{1,10}", text.strip(), re.ASCII) else None
+    if value is None or value >= 2**32:
+        raise argparse.ArgumentTypeError(f"a seed must be from 0 to {2**32 - 1}; got {_shown(text)}")
     return value
 
 

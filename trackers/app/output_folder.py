@@ -32,8 +32,9 @@ class OutputFolder:
 
     def close(self) -> None:
         """Let other runs have it."""
-        self._lock.release()
+        # Removed while it is held: a run that comes between would hold a file that is not there any more.
         (self.path / LOCK).unlink(missing_ok=True)
+        self._lock.release()
 
 
 def check_free(path: Path) -> None:

@@ -20,9 +20,9 @@ class ArticulatedConfig:
 
     variant: Annotated[str, OneOf("recommended", "published", "unconstrained")] = "recommended"
     """How estimates are kept within the limits of a hand; published is the filter of the paper, with one hypothesis, no
-    mirrored one beside it and no gate, and unconstrained has no limits and one hypothesis."""
+    mirrored one beside it and no gate, and unconstrained has no limits and one hypothesis after the first frame."""
     hypotheses: int = 6
-    """Largest number of hypotheses about the depth."""
+    """Largest number of hypotheses about the depth; at the start there are six where the hand is found by keypoints."""
     hand: Annotated[str, OneOf("right", "left")] = "right"
     """Which hand."""
     gate: float = 5.0

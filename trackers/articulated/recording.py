@@ -26,6 +26,8 @@ better. Detectors look at a crop around the hand, so that their error grows with
 real-time hand tracking, 2020; which distances it takes is not said), which would be 4.7 % of the diagonal for a palm of
 half of it. `persistence` then raises what is taken for one frame, since errors last."""
 
+_LARGEST_SHARE = 2.0
+"""Coordinates that all stay within it are shares of the image, some of them outside: no hand fits into two pixels."""
 _PATTERNS = {
     "wrist": "wrist_[xy]",
     "bases": "p_([1-9][0-9]*)0_[xy]",
@@ -108,7 +110,7 @@ class FeatureSequence:
 
     def fingerprint(self) -> str:
         """A hash of everything that an estimate rests on: equal for the same recording wherever it lies."""
-        digest = hashlib.sha256(repr((self.num_fingers, self.features.blocks)).encode())
+        digest = hashlib.sha256(repr((self.num_fingers, self.features.blocks, self.image_shape)).encode())
         for part in (self.times_s, self.y, self.std, *(self.start or ())):
             digest.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
         return digest.hexdigest()[:16]
@@ -157,6 +159,11 @@ def from_keypoints(
     if not observed.any():
         raise InputError(f"{name}: no keypoint has a confidence of {LEAST_CONFIDENCE} or more in any frame.")
     points = np.where(observed[..., None], points, np.nan)
+    if looks_normalized(points):
+        raise InputError(
+            f"{name}: keypoints must be in pixels; got coordinates within {np.nanmin(points):.3g} and "
+            f"{np.nanmax(points):.3g}, shares of the image's width and height: multiply by these."
+        )
     noise_px = keypoint_noise(points) if noise_px is None else noise_px
     if not 0 < noise_px < np.inf:
         raise InputError(f"{name}: noise must be positive, in pixels; got {noise_px}.")
@@ -172,6 +179,12 @@ def from_keypoints(
         image_shape=image_shape,
         noise_px=noise_px,
     )
+
+
+def looks_normalized(points: np.ndarray) -> bool:
+    """Whether coordinates, NaN aside, can only be shares of the image's width and height."""
+    observed = points[np.isfinite(points)]
+    return bool(observed.size) and float(np.abs(observed).max()) <= _LARGEST_SHARE
 
 
 def keypoint_noise(points: np.ndarray) -> float:

@@ -8,12 +8,12 @@ import math
 from collections.abc import Callable
 from dataclasses import field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.compiled_quickly import compiled_fully
@@ -53,60 +53,15 @@ from jaxfilters.trackers.articulated.recording import (
     keypoint_noise,
 )
 from jaxfilters.trackers.articulated.start import NUM_STARTS, HandSize, Starts, size_of, starts_from_points
+from jaxfilters.trackers.articulated.state import LOST, SEARCHING, TRACKING, ArticulatedTrack, TrackState
 from jaxfilters.trackers.tracker import Tracker, checked_times, track_frames
 
-SEARCHING, TRACKING, LOST = range(3)
 LOST_NIS = 25.0
 """Normalised innovation squared, per measured row, above which the hand counts as not there: 5 deviations each."""
 HAND_DIAGONAL = 0.19
 """Metres: of the box around the keypoints of an average hand; what a hand's speed in the image is measured by."""
 PATIENCE = 10
 """Frames in a row without the hand before it is searched anew, where keypoints allow it."""
-
-
-class ArticulatedTrack(NamedTuple):
-    """What is known of the hand in each of `b` frames, by the heaviest hypothesis."""
-
-    mean: Float[Array | np.ndarray, "b n"]
-    """States, in the order of the layout."""
-    std: Float[Array | np.ndarray, "b n"]
-    points: Float[Array | np.ndarray, "b fingers 4 3"]
-    """Joints from base to tip in the camera frame: pixels, with depth counted from the wrist's; metres with `focal`."""
-    points_std: Float[Array | np.ndarray, "b fingers 4 3"]
-    """Standard deviations of `points`; with `focal`, most of that of the depth is the unknown distance of the hand."""
-    points_from_wrist_std: Float[Array | np.ndarray, "b fingers 4 3"]
-    """Standard deviations of the vectors from the wrist to `points`."""
-    image_points: Float[Array | np.ndarray, "b fingers 4 2"]
-    """Pixels."""
-    scale: Float[Array | np.ndarray, " b"]
-    """The quaternion's squared length: pixels of the image for one of a length; 1 with `focal`."""
-    weight: Float[Array | np.ndarray, " b"]
-    """Share of the heaviest hypothesis."""
-    num_hypotheses: Int[Array | np.ndarray, " b"]
-    is_new_view: Bool[Array | np.ndarray, " b"]
-    """Whether lengths were estimated from this frame."""
-    nis_per_row: Float[Array | np.ndarray, " b"]
-    """Normalised innovation squared over the number of rows that count; about 1 where all is well."""
-    least_distance: Float[Array | np.ndarray, " b"]
-    """Standard deviations to the nearest limit before truncation, negative outside; infinite without limits."""
-    log_evidence: Float[Array | np.ndarray, " b"]
-    length_observed: Bool[Array | np.ndarray, "b lengths"]
-    """Whether a link has lain near the image plane since the hand was found; until then its length is that of the
-    prior, of the limits and of what the model says of foreshortened links."""
-    status: Int[Array | np.ndarray, " b"]
-
-
-class TrackState(NamedTuple):
-    """Everything the next frame needs."""
-
-    bank: GaussianSumState
-    time: Float[Array, ""]
-    """Of the last frame, seconds."""
-    misses: Array
-    """Frames in a row in which the hand was not visible; above `PATIENCE` until keypoints of a hand are found."""
-    length_observed: Bool[Array, " lengths"]
-    """As in the track."""
-    key: Array
 
 
 @pytree_dataclass
@@ -269,9 +224,8 @@ def _first_bank(setup: _Setup, frame: FeatureFrame) -> tuple[GaussianSumState, A
         starts = Starts(setup.start.mean[None], setup.start.covariance[None], jnp.zeros(1), jnp.ones((), bool))
     else:
         starts = _keypoint_starts(setup, frame)
-    slots = setup.config.hypotheses if setup.config.variant == "recommended" else 1
     least = 1 if setup.start is not None or setup.config.variant == "published" else NUM_STARTS
-    return _with_slots(setup, _starting_bank(setup, starts), max(slots, least)), starts.found
+    return _with_slots(setup, _starting_bank(setup, starts), max(_most(setup), least)), starts.found
 
 
 def _with_slots(setup: _Setup, start: GaussianSumState, capacity: int) -> GaussianSumState:
@@ -341,7 +295,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
     rows = jnp.sum(frame.mask)
     observed = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
-    bank = _select(measured & jnp.isfinite(info.log_evidence), bank, predicted)
+    bank = _heaviest(_select(measured & jnp.isfinite(info.log_evidence), bank, predicted), _most(setup))
     # Only keypoints are searched for. With a given start the hypotheses go on, and fit again when the hand is back.
     searching = (state.misses > PATIENCE) if setup.start is None else jnp.zeros((), bool)
     status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
@@ -349,7 +303,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     shown = shows_length(belief_of(map_component(bank)).mean, setup.hand).ravel()
     shown = state.length_observed | (shown & observed & (status == TRACKING))
     log_evidence = jnp.where(measured, info.log_evidence, jnp.nan)
-    track = _report(setup, bank, reported, nis, log_evidence, status)._replace(length_observed=shown)
+    track = _unknown_where(searching, _report(setup, bank, reported, nis, log_evidence, status, shown))
     return TrackState(bank, time, misses, shown, key), track
 
 
@@ -358,8 +312,34 @@ def _none_observed(setup: _Setup) -> Bool[Array, " lengths"]:
     return jnp.zeros(lengths.stop - lengths.start, bool)
 
 
+def _most(setup: _Setup) -> int:
+    """Hypotheses that are followed at a time; there may be more at the start."""
+    return setup.config.hypotheses if setup.config.variant == "recommended" else 1
+
+
+def _heaviest(bank: GaussianSumState, most: int) -> GaussianSumState:
+    """The bank with `most` hypotheses or fewer: they are in descending order of their weights."""
+    kept = jnp.arange(len(bank.log_weights)) < most
+    return bank._replace(log_weights=jax.nn.log_softmax(jnp.where(kept, bank.log_weights, -jnp.inf)))
+
+
+def _unknown_where(searching: Bool[Array, ""], track: ArticulatedTrack) -> ArticulatedTrack:
+    """The row, with nothing but its status in a frame in which the hand is searched for."""
+
+    def unknown(leaf: Array) -> Array:
+        return jnp.where(searching, jnp.asarray(np.nan if leaf.dtype.kind == "f" else 0, leaf.dtype), leaf)
+
+    return jax.tree.map(unknown, track)._replace(status=track.status)
+
+
 def _report(
-    setup: _Setup, bank: GaussianSumState, reported: Report, nis: Array, log_evidence: Array, status: Array
+    setup: _Setup,
+    bank: GaussianSumState,
+    reported: Report,
+    nis: Array,
+    log_evidence: Array,
+    status: Array,
+    length_observed: Array,
 ) -> ArticulatedTrack:
     belief = belief_of(map_component(bank))
     hand, q = setup.hand, belief.mean[setup.hand.layout.quaternion]
@@ -378,7 +358,7 @@ def _report(
         nis_per_row=jnp.where(nothing, jnp.nan, nis),
         least_distance=jnp.where(nothing, jnp.nan, reported.least_distance),
         log_evidence=log_evidence,
-        length_observed=_none_observed(setup),
+        length_observed=length_observed,
         status=status,
     )
 

@@ -57,8 +57,11 @@ def from_array(camera: Pinhole, times_s: np.ndarray, depth: np.ndarray, name: st
     if depth.shape != (len(times_s), *camera.shape):
         raise InputError(f"{name}: depth must be {(len(times_s), *camera.shape)}; got {depth.shape}.")
 
-    def read(index: int) -> np.ndarray:
-        frame = depth[index].astype(np.float32)
-        return np.where(np.isfinite(frame) & (frame > 0), frame, np.float32(np.nan))
-
+    read = lambda index: with_nan_for_nothing(depth[index])
     return DepthSequence(camera, np.asarray(times_s, np.float64), read, name)
+
+
+def with_nan_for_nothing(frame: np.ndarray) -> np.ndarray:
+    """A frame (rows, cols) of float32 metres, NaN where it is NaN, 0, negative or infinite: nothing was read there."""
+    frame = frame.astype(np.float32)
+    return np.where(np.isfinite(frame) & (frame > 0), frame, np.float32(np.nan))

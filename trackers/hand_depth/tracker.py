@@ -44,7 +44,7 @@ from jaxfilters.trackers.hand_depth.filtering import (
     pose_moments,
     standard_deviations,
 )
-from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array
+from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array, with_nan_for_nothing
 from jaxfilters.trackers.hand_depth.search import race, search
 from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
@@ -78,7 +78,7 @@ def track(
     """The hand in every frame of a depth recording, equal to that of `jaxfilters track hand-depth` with the same seed.
 
     Args:
-        frames: (rows, cols) metres each, NaN where there is no reading.
+        frames: (rows, cols) metres each, as the camera's shape says; NaN, 0 or inf where there is no reading.
         times_s: (frames,) seconds, strictly increasing.
         camera: The depth camera.
         config: Options of the tracker.
@@ -87,10 +87,11 @@ def track(
         The track as NumPy arrays, the frame axis first.
 
     Raises:
-        ValueError: There are no frames, or more or fewer than times, or their unit cannot be metres.
+        ValueError: There are no frames, or more or fewer than times, or their size is not that of the camera's images,
+            or their unit cannot be metres.
     """
     config = config or HandDepthConfig()
-    source = iter(frames)
+    source = map(with_nan_for_nothing, map(np.asarray, frames))
     first = list(islice(source, 1))
     if first and (warning := check_unit(np.asarray(first[0]))):
         warnings.warn(warning, stacklevel=2)
@@ -99,6 +100,8 @@ def track(
 
 def _start(setup: Setup, key: Array, frame: np.ndarray) -> TrackState:
     """State before the first frame, placed by what that frame shows; searching where it shows no hand."""
+    if np.shape(frame) != setup.camera.shape:
+        raise ValueError(f"frame: expected the camera's {setup.camera.shape} rows and columns; got {np.shape(frame)}.")
     share_missing = float(np.mean(~np.isfinite(frame)))
     background = {"auto": share_missing > 0.5, "background": True, "unknown": False}[setup.config.missing]
     key, place_key = jax.random.split(key)
@@ -127,6 +130,8 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
 
     The search runs OpenCV on the host, so a chunk in which the hand is lost takes more than one compiled scan.
     """
+    if frames.shape[1:] != setup.camera.shape:
+        raise ValueError(f"frames: expected {setup.camera.shape} rows and columns each; got {frames.shape[1:]}.")
     pieces, first = [], 0
     while first < len(frames):
         due = float(state.race_time) <= float(times[first])

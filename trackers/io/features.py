@@ -6,7 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxfilters.trackers.articulated.recording import FeatureSequence, Start, features_named, from_keypoints
+from jaxfilters.trackers.articulated.recording import (
+    FeatureSequence,
+    Start,
+    features_named,
+    from_keypoints,
+    looks_normalized,
+)
 from jaxfilters.trackers.io import keypoints as keypoint_files
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.images import check_num_pixels
@@ -51,7 +57,7 @@ def open_features(
         return _open_npz(path, shape, noise_px, fps)
     detections = keypoint_files.read(path, hand, fps or FPS)
     points = detections.points
-    if keypoint_files.looks_normalized(points):
+    if looks_normalized(points):
         if image_size is None:
             raise InputError(
                 f"{path}: its coordinates lie within {np.nanmin(points):.3g} and {np.nanmax(points):.3g}, shares of "

@@ -15,15 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfilters.trackers.articulated.recording import NUM_KEYPOINTS
+from jaxfilters.trackers.articulated.recording import looks_normalized as looks_normalized
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.frame_numbers import frames_of, times_of
 from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
 from jaxfilters.trackers.io.json_files import read_json_value
 from jaxfilters.trackers.io.tables import Columns, read_table
 
-_SHORTEST_STEP_US = 1000
-"""Numbers of frames that step by less count frames, not microseconds: no camera runs at 1 kHz."""
-_LARGEST_SHARE = 2.0
-"""Coordinates that all stay within it are shares of the image, some of them outside: no hand fits into two pixels."""
 _MOST_GAPS = 100
 """Missing frames per frame that is there, at most: beyond it the numbers are no frame numbers."""
 _MOST_FRAMES = 1_000_000
@@ -48,6 +46,8 @@ class Detections(NamedTuple):
     """(frames, 21, 2), NaN where nothing was found."""
     confidence: np.ndarray
     """(frames, 21), 0 where nothing was found."""
+    frames: np.ndarray
+    """(frames,) numbers of the frames, which increase; from 0 where the recording does not count them."""
 
 
 def read(path: Path, hand: str, fps: float) -> Detections:
@@ -82,6 +82,8 @@ class HandDetections(NamedTuple):
     """(frames, hands, 21, 2), NaN where nothing was found."""
     confidence: np.ndarray
     """(frames, hands, 21), 0 where nothing was found."""
+    frames: np.ndarray
+    """(frames,) numbers of the frames, as of `Detections`."""
 
 
 def read_hands(path: Path, fps: float) -> HandDetections:
@@ -102,18 +104,18 @@ def read_hands(path: Path, fps: float) -> HandDetections:
         frames = [[hand for side in ("right", "left") for hand in _openpose_hands(file, side)] for file in files]
         values = _stacked(frames)
         found = values[..., 2] > 0
-        times_s, points, confidence = _times_of(numbers, fps), values[..., :2], np.where(found, values[..., 2], 0.0)
-        points = np.where(found[..., None], points, np.nan)
+        points, confidence = np.where(found[..., None], values[..., :2], np.nan), np.where(found, values[..., 2], 0.0)
+        detections = Detections(times_of(numbers, fps), points, confidence, frames_of(numbers))
     elif path.suffix == ".json":
         named, times_s = _mediapipe_frames(path, fps)
         values = _stacked([[_mediapipe_hand(hand, name) for hand in _hands_of(frame, name)] for frame, name in named])
-        times_s, points, confidence = _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+        detections = _detections(times_s, values[..., :2], _visibility(values[..., 2]), np.arange(len(values)))
     else:
         single = read(path, "right", fps)
-        times_s, points, confidence = single.times_s, single.points[:, None], single.confidence[:, None]
-    if not (confidence > 0).any():
-        raise InputError(f"{path}: no hand in any of {len(times_s)} frames.")
-    return HandDetections(times_s, points, confidence)
+        detections = single._replace(points=single.points[:, None], confidence=single.confidence[:, None])
+    if not (detections.confidence > 0).any():
+        raise InputError(f"{path}: no hand in any of {len(detections.times_s)} frames.")
+    return HandDetections(*detections)
 
 
 def _stacked(frames: list[list[np.ndarray]]) -> np.ndarray:
@@ -122,12 +124,6 @@ def _stacked(frames: list[list[np.ndarray]]) -> np.ndarray:
     for i, hands in enumerate(frames):
         values[i, : len(hands)] = np.reshape(hands, (-1, NUM_KEYPOINTS, 3))
     return values
-
-
-def looks_normalized(points: np.ndarray) -> bool:
-    """Whether coordinates, NaN aside, can only be shares of the image's width and height."""
-    observed = points[np.isfinite(points)]
-    return bool(observed.size) and float(np.abs(observed).max()) <= _LARGEST_SHARE
 
 
 def _openpose_files(folder: Path) -> tuple[list[Path], np.ndarray]:
@@ -158,7 +154,7 @@ def _read_openpose(folder: Path, hand: str, fps: float) -> Detections:
     values = np.stack(hands[hand])
     confidence = values[..., 2]
     points = np.where(confidence[..., None] == 0, np.nan, values[..., :2])
-    return Detections(_times_of(numbers, fps), points, confidence)
+    return Detections(times_of(numbers, fps), points, confidence, frames_of(numbers))
 
 
 def _openpose_hand(file: Path, side: str) -> np.ndarray:
@@ -193,7 +189,7 @@ def _read_mediapipe(file: Path, fps: float) -> Detections:
     named, times_s = _mediapipe_frames(file, fps)
     hands = [_mediapipe_hand(_hand_of(frame, name), name) for frame, name in named]
     values = np.stack(hands) if hands else np.zeros((0, NUM_KEYPOINTS, 3))
-    return _detections(times_s, values[..., :2], _visibility(values[..., 2]))
+    return _detections(times_s, values[..., :2], _visibility(values[..., 2]), np.arange(len(values)))
 
 
 def _mediapipe_frames(file: Path, fps: float) -> tuple[list[tuple[Any, str]], np.ndarray]:
@@ -317,24 +313,19 @@ def _with_gaps(file: Path, numbers: np.ndarray, values: np.ndarray, times: np.nd
     whole = np.full((places[-1] + 1, NUM_KEYPOINTS, 3), np.nan)
     whole[places] = values
     every = numbers[0] + step * np.arange(len(whole))
-    times_s = _times_of(every.astype(float), fps) if times is None else np.interp(every, numbers, times)
-    return _detections(times_s, whole[..., :2], whole[..., 2])
+    times_s = times_of(every, fps) if times is None else np.interp(every, numbers, times)
+    return _detections(times_s, whole[..., :2], whole[..., 2], frames_of(every))
 
 
-def _detections(times_s: np.ndarray, points: np.ndarray, confidence: np.ndarray) -> Detections:
+def _detections(times_s: np.ndarray, points: np.ndarray, confidence: np.ndarray, frames: np.ndarray) -> Detections:
     """Confidence 1 where a keypoint has none, 0 where it was not found."""
     found = ~np.isnan(points).any(axis=-1)
-    return Detections(times_s, points, np.where(found, np.where(np.isnan(confidence), 1.0, confidence), 0.0))
+    return Detections(times_s, points, np.where(found, np.where(np.isnan(confidence), 1.0, confidence), 0.0), frames)
 
 
 def _visibility(values: np.ndarray) -> np.ndarray:
     """As it is, or NaN where the detector left all of them at 0: they mean nothing then."""
     return values if np.nan_to_num(values).any() else np.full_like(values, np.nan)
-
-
-def _times_of(numbers: np.ndarray, fps: float) -> np.ndarray:
-    in_microseconds = len(numbers) > 1 and np.median(np.diff(numbers)) >= _SHORTEST_STEP_US
-    return numbers * 1e-6 if in_microseconds else numbers / fps
 
 
 def _json(file: Path) -> Any:

@@ -6,6 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from jaxfilters.models.calibration import undistort_pixels
 from jaxfilters.trackers.io.video_input import FrameSet
 
 
@@ -51,9 +52,7 @@ class Undistortion:
         if self.is_identity:
             return np.asarray(uv, float)
         assert self.K is not None
-        assert self.distortion is not None
-        points = np.asarray(uv, float).reshape(-1, 1, 2)
-        return cv2.undistortPoints(points, self.K, self.distortion, P=self.K).reshape(np.shape(uv))
+        return undistort_pixels(np.reshape(uv, (-1, 2)), self.K, self.distortion).reshape(np.shape(uv))
 
     def distorted(self, uv: np.ndarray) -> np.ndarray:
         """Pixels (..., 2) of the video at which pixels without lens distortion appear in it."""

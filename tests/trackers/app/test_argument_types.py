@@ -19,7 +19,7 @@ TYPES = {
     argument_types.positive_number: lambda value: math.isfinite(value) and value > 0,
     argument_types.finite_number: math.isfinite,
     argument_types.positive_integer: lambda value: 1 <= value < 10**18,
-    argument_types.seed: lambda value: -(2**63) <= value < 2**63,
+    argument_types.seed: lambda value: 0 <= value < 2**32,
     argument_types.image_size: lambda value: min(value) >= 1 and value[0] * value[1] <= 128 * 2**20,
 }
 """What each type promises of its value."""

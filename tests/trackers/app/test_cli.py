@@ -134,6 +134,10 @@ def test_resume_starts_anew_where_there_is_nothing_and_redraws_what_is_finished(
     assert "nothing to resume" in capsys.readouterr().err
     assert run("track", "hand-depth", npz_file, "--out", out, "--resume") == 0
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 40
+    before = (out / "track.csv").read_bytes()
+    assert run("track", "hand-depth", npz_file, "--out", out) == 2
+    assert "holds the track of another run; choose another --out, or --resume" in capsys.readouterr().err
+    assert (out / "track.csv").read_bytes() == before
 
 
 @pytest.mark.system
@@ -173,7 +177,7 @@ def test_an_unforeseen_error_is_one_line_and_its_traceback_lies_beside_the_resul
         ("demo --hand third", "--hand: invalid choice: 'third'"),
         ("demo --missing never", "--missing: invalid choice: 'never'"),
         ("demo --particles many", "--particles: invalid int value: 'many'"),
-        ("demo --seed 9223372036854775808", "--seed: a seed must fit into 64 bits; got 9223372036854775808"),
+        ("demo --seed 4294967296", "--seed: a seed must be from 0 to 4294967295; got 4294967296"),
     ],
 )
 def test_wrong_arguments_exit_with_two(arguments, message, capsys):

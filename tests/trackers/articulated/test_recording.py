@@ -44,6 +44,19 @@ def test_a_frame_says_what_was_measured_and_how_well(sequence):
         sequence[FRAMES]
 
 
+def test_the_size_of_the_image_is_part_of_a_recording(sequence):
+    """With a focal length, its middle is the axis of the camera."""
+    same, other = (replace(sequence, image_shape=shape).fingerprint() for shape in ((480, 640), (720, 1280)))
+    assert len({sequence.fingerprint(), same, other}) == 3
+
+
+def test_shares_of_the_image_are_no_pixels():
+    points = np.random.default_rng(0).uniform(0, 1, (3, NUM_KEYPOINTS, 2))
+    with pytest.raises(InputError, match="a: keypoints must be in pixels; got coordinates within .* multiply by"):
+        from_keypoints(np.arange(3) / 30, points, "a")
+    assert from_keypoints(np.arange(3) / 30, points * (640, 480), "a").noise_px > 1
+
+
 def changed(array, place, value):
     array = np.array(array, float)
     array[place] = value
@@ -103,7 +116,7 @@ def test_a_start_may_be_certain_of_something(sequence):
 
 
 def test_the_fingerprint_is_of_what_was_measured_and_believed(sequence):
-    same = replace(sequence, name="b", truth=np.zeros((FRAMES, N)), image_shape=(4, 5))
+    same = replace(sequence, name="b", truth=np.zeros((FRAMES, N)))
     assert same.fingerprint() == sequence.fingerprint()
     others = [
         replace(sequence, y=changed(sequence.y, (0, 0), 1)),
@@ -230,6 +243,6 @@ def test_persistence_is_that_of_most_steps_and_nothing_for_one_frame():
     ],
 )
 def test_keypoints_that_cannot_be_are_named(arguments, message):
-    good = {"times_s": np.arange(2.0), "points": np.ones((2, 21, 2)), "name": "a"}
+    good = {"times_s": np.arange(2.0), "points": np.full((2, 21, 2), 50.0), "name": "a"}
     with pytest.raises(InputError, match=f"^a: {message}"):
         from_keypoints(**(good | arguments))

@@ -1,8 +1,8 @@
 import numpy as np
 
 from jaxfilters.models.articulated.layout import Layout, five_fingers
+from jaxfilters.trackers.articulated.state import ArticulatedTrack
 from jaxfilters.trackers.articulated.table import TimedArticulatedTrack, articulated_table
-from jaxfilters.trackers.articulated.tracker import ArticulatedTrack
 
 DIAGNOSTICS = ("weight", "num_hypotheses", "is_new_view", "nis_per_row", "least_distance", "log_evidence")
 

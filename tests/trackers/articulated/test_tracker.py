@@ -21,7 +21,7 @@ from jaxfilters.models.synthetic.articulated import LAYOUT
 from jaxfilters.trackers.articulated import tracker
 from jaxfilters.trackers.articulated.config import ArticulatedConfig
 from jaxfilters.trackers.articulated.recording import FeatureSequence, from_keypoints, persistence
-from jaxfilters.trackers.articulated.tracker import LOST, SEARCHING, TRACKING
+from jaxfilters.trackers.articulated.state import LOST, SEARCHING, TRACKING
 
 KEY = jax.random.key(0)
 
@@ -109,7 +109,24 @@ def test_a_hand_that_was_gone_is_found_again(keypoints):
     assert np.all(track.status[2:25] == TRACKING)
     assert np.all(track.status[25:35] == LOST)
     assert np.all(track.status[38:] == TRACKING)
-    assert all(np.all(np.isfinite(leaf)) for leaf in (track.mean, track.std, track.points))
+    searching = track.status == SEARCHING
+    for leaf in (track.mean, track.std, track.points, track.points_std, track.weight):
+        found = np.isfinite(leaf).reshape(len(leaf), -1)
+        assert np.all(found[~searching])
+        assert not np.any(found[searching])
+    assert not np.any(track.num_hypotheses[searching])
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("config", [ArticulatedConfig(hypotheses=2), ArticulatedConfig(variant="unconstrained")])
+def test_no_more_hypotheses_are_followed_than_were_asked_for(keypoints, config):
+    sequence, _, _ = keypoints
+    y = sequence.y.copy()
+    y[:, 12:] = np.nan  # wrist and bases of the fingers: the depth of their plane is ambiguous
+    track = follow(replace(sequence, y=y), config)
+    most = 2 if config.variant == "recommended" else 1
+    assert np.max(track.num_hypotheses) == most
+    assert np.max(follow(replace(sequence, y=y)).num_hypotheses) > 2
 
 
 @pytest.mark.system

@@ -12,6 +12,7 @@ from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.trackers.hand_depth import filtering
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
 from jaxfilters.trackers.hand_depth.config import HandDepthConfig
+from jaxfilters.trackers.hand_depth.recording import with_nan_for_nothing
 from jaxfilters.trackers.hand_depth.tracker import DOUBTFUL, LOST, SEARCHING, TRACKING
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.tracker import CHUNK
@@ -49,6 +50,21 @@ def joint_errors_mm(track, joints):
 @pytest.fixture(scope="module")
 def track(tracker, sequence):
     return follow(tracker, sequence[0])
+
+
+def test_images_of_another_size_than_the_cameras_are_refused(tracker, sequence):
+    depth = sequence[0]
+    shape = r"\(424, 512\) rows and columns"
+    with pytest.raises(ValueError, match=f"frame: expected the camera's {shape}; got \\(212, 256\\)"):
+        hand_depth.track([depth[0, ::2, ::2]], np.zeros(1), kinect_v2())
+    state = tracker.init(jax.random.key(0), depth[0])
+    with pytest.raises(ValueError, match=f"frames: expected {shape} each; got \\(212, 256\\)"):
+        tracker.step(state, depth[:CHUNK, ::2, ::2], np.arange(CHUNK, dtype=np.float32) / 30)
+
+
+def test_nothing_was_read_where_a_frame_is_zero_or_infinite():
+    frame = np.array([[0.5, 0.0], [np.inf, -1.0]])
+    np.testing.assert_array_equal(with_nan_for_nothing(frame), np.array([[0.5, np.nan], [np.nan, np.nan]], np.float32))
 
 
 @pytest.mark.system
