@@ -99,8 +99,8 @@ ON_RECORDINGS = (
     ),
     *(
         Row(
-            "hand from key points",
-            f"{name}, key points of a network, size unknown",
+            "hand from keypoints",
+            f"{name}, keypoints of a network, size unknown",
             "joints from the palm",
             "projection back from the estimated depth",
             "articulated",
@@ -124,7 +124,7 @@ ON_RECORDINGS = (
     *(
         Row(
             "head before two cameras",
-            _ICT,
+            f"{_ICT}, heads turned by less than 40 degrees",
             quantity,
             "optical flow, triangulated, with the true shape",
             "head-real",
@@ -137,16 +137,16 @@ ON_RECORDINGS = (
         Row(
             "face before one camera",
             _ICT,
-            f"{quantity}, {detector}",
+            f"{quantity}, in frames with a face by {detector}",
             simplest,
             "head-mono",
             f"{metric}_modelled_rendered{suffix}",
             f"{prefix}_{metric}_modelled_rendered{suffix}",
         )
         for quantity, detector, metric, suffix, prefix, simplest in (
-            ("yaw", "cascades", "yaw_rms_deg", "", "pnp", _PNP),
-            ("pitch", "cascades", "pitch_rms_deg", "", "pnp", _PNP),
-            ("distance", "cascades", "z_error_mm", "", "pnp", _PNP),
+            ("yaw", "OpenCV's cascades", "yaw_rms_deg", "", "pnp", _PNP),
+            ("pitch", "OpenCV's cascades", "pitch_rms_deg", "", "pnp", _PNP),
+            ("distance", "OpenCV's cascades", "z_error_mm", "", "pnp", _PNP),
             ("yaw", "MediaPipe's mesh", "yaw_rms_deg", "_mediapipe", "mesh", _MEAN_MESH),
             ("pitch", "MediaPipe's mesh", "pitch_rms_deg", "_mediapipe", "mesh", _MEAN_MESH),
             ("distance", "MediaPipe's mesh", "z_error_mm", "_mediapipe", "pnp", _PNP),
