@@ -29,7 +29,7 @@ class Tracker(NamedTuple):
     with the random key in it: it is saved and restored as it is."""
     step: Callable[..., tuple[Any, Any]]
     """`(state, frames, times_s) -> (state, track)` for a chunk of frames: pytrees whose leaves have the frame axis
-    first. Row i of the track depends on frames 0 to i alone."""
+    first. Row i of the track depends on frames 0 to i, and on what the tracker was built with, alone."""
 
 
 class HandTrack(NamedTuple):
@@ -42,9 +42,10 @@ class HandTrack(NamedTuple):
     joints: Float[Array | np.ndarray, "b 21 3"]
     """Metres: wrist, thumb 1-4, index, middle, ring, little, base to tip."""
     effective_sample_size: Float[Array | np.ndarray, " b"]
-    """Effective number of particles, from 1 to their number; 0 where the hand was not observed."""
+    """Effective number of particles, from 1 to their number; 0 where too little was read to compare the hand with, NaN
+    while it is searched for."""
     log_evidence: Float[Array | np.ndarray, " b"]
-    """log p(frame | earlier frames), up to the constant of the likelihood."""
+    """log p(frame | earlier frames), up to the constant of the likelihood; 0 and NaN as `effective_sample_size`."""
     status: Int[Array | np.ndarray, " b"]
     """Index into `STATUS_NAMES`."""
 

@@ -111,6 +111,8 @@ def hand_model(sequence: FeatureSequence, config: ArticulatedConfig) -> Articula
 def build(sequence: FeatureSequence, config: ArticulatedConfig | None = None) -> Tracker:
     """A tracker of the hand in a recording of features; limits are table 1 for two fingers, anatomy for five.
 
+    What keypoints do not say of themselves, their noise and how large a hand is in the image, follows from all frames.
+
     Raises:
         ValueError: the start does not fit the layout, or see `hand_model`.
     """

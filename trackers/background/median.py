@@ -116,6 +116,7 @@ class MedianBackground:
             "noise": found.noise.copy(),
             "counts": counts,
             "reflection": np.array(found.reflection),
+            "samples": np.array(self._samples, np.uint8),
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -126,6 +127,7 @@ class MedianBackground:
         self._difference.reflection = float(state["reflection"])
         frames, self._sure, covered, restarts = map(float, state["counts"])
         self._frames, self._covered, self.restarts = int(frames), int(covered), int(restarts)
+        self._samples = list(state["samples"])
 
     def _in_same_light(self, image: np.ndarray) -> np.ndarray:
         """Exposure and lamps change within a frame, the background by a level in ten frames."""

@@ -11,9 +11,6 @@ from typing import Any
 
 from jaxfilters.trackers.io.errors import InputError
 
-LOCAL = "local"
-"""Address that starts a cluster of this machine alone."""
-
 
 def run_on_cluster(options: argparse.Namespace) -> None:
     """Run the command of `options` on every share of the cluster at `options.ray`, and wait for all of them.

@@ -49,3 +49,16 @@ def test_a_person_who_fills_a_third_of_the_image_is_no_other_room():
     for _ in range(3 * LOST_AFTER):
         background.apply(close)
     assert background.restarts == 0
+
+
+def test_a_background_that_was_saved_while_it_settled_goes_on_as_if_it_had_not_been():
+    """Noise of two levels makes every image another sample."""
+    whole, first, at = MedianBackground(), MedianBackground(), np.random.default_rng(1)
+    images = [np.clip(ROOM + at.integers(-2, 3, ROOM.shape), 0, 255).astype(np.uint8) for _ in range(6 * SAMPLES)]
+    for image in images[: 2 * SAMPLES]:
+        whole.apply(image)
+        first.apply(image)
+    second = MedianBackground()
+    second.restore(first.state())
+    for image in images[2 * SAMPLES :]:
+        np.testing.assert_array_equal(second.apply(image), whole.apply(image))
