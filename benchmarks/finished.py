@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 
@@ -54,7 +54,11 @@ class Finished:
         """As `arrays`, of numbers with their names."""
         kept = self.arrays(name, lambda: _as_arrays(measure()))
         rows = zip(kept["name"], kept["value"], kept["unit"], kept["better"], strict=True)
-        return {str(key): Metric(float(value), str(unit), cast(Direction, str(of))) for key, value, unit, of in rows}
+        return {str(key): Metric(float(value), str(unit), _better(str(of))) for key, value, unit, of in rows}
+
+
+def _better(text: str) -> Direction | float:
+    return cast(Direction, text) if text in get_args(Direction) else float(text)
 
 
 def _as_arrays(metrics: dict[str, Metric]) -> dict[str, np.ndarray]:
@@ -63,7 +67,7 @@ def _as_arrays(metrics: dict[str, Metric]) -> dict[str, np.ndarray]:
         "name": np.array(list(metrics), str),
         "value": np.array([metric.value for metric in of], float),
         "unit": np.array([metric.unit for metric in of], str),
-        "better": np.array([metric.better for metric in of], str),
+        "better": np.array([str(metric.better) for metric in of], str),
     }
 
 

@@ -81,7 +81,10 @@ def _bound(path, name, entry):
 def _row(name, bound, metric):
     if metric is None:
         return Row(name, bound, math.nan, math.nan, "missing")
-    sign = 1 if metric.better == "lower" else -1
+    better = metric.better
+    if not isinstance(better, str):
+        better = "lower" if bound.value >= better else "higher"  # The limit is on that side of the right value.
+    sign = 1 if better == "lower" else -1
     limit = bound.value + sign * bound.tolerance * abs(bound.value)
     return Row(name, bound, limit, metric.value, "ok" if sign * metric.value <= sign * limit else "worse")
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Direction = Literal["lower", "higher"]
+WITHIN_TWO_SIGMA = 0.954
+"""Share of a normal distribution within two standard deviations of its mean."""
 
 
 @dataclass(frozen=True)
@@ -14,15 +16,20 @@ class Metric:
     value: float
     unit: str
     """As in "ms", "mm", "frames/s"; empty for ratios and probabilities."""
-    better: Direction
-    """Which direction is an improvement."""
+    better: Direction | float
+    """Which direction is an improvement, or the value that is right, as for the coverage of standard deviations."""
 
 
 def table(metrics: Mapping[str, Metric]) -> str:
-    """One aligned line a metric: name, value, unit, better direction."""
+    """One aligned line a metric: name, value, unit, better direction or right value."""
     header = ("metric", "value", "unit", "better")
-    cells = [(name, f"{m.value:.4g}", m.unit, m.better) for name, m in metrics.items()]
+    cells = [(name, f"{m.value:.4g}", m.unit, shown_better(m.better)) for name, m in metrics.items()]
     return aligned([header, *cells], numbers=(1,))
+
+
+def shown_better(better: Direction | float) -> str:
+    """A direction as it is, a right value with the digits that it needs."""
+    return better if isinstance(better, str) else f"{better:g}"
 
 
 def aligned(rows: Sequence[tuple[str, ...]], *, numbers: Collection[int]) -> str:

@@ -77,11 +77,11 @@ def test_measured_results_are_those_of_the_page_of_results():
 def test_accuracy_on_recordings_is_that_of_the_page_of_results():
     rows = re.findall(r"\| (\S+ \S+) \| (\S+ \S+) \| `([\w-]+)`: `(\w+)` \|$", README, re.MULTILINE)
     assert len(rows) > 5
-    simplest = {(row.scenario, row.metric): row.metric_of_simplest for row in ON_RECORDINGS}
     for value, value_of_simplest, scenario, name in rows:
         measured = json.loads((ROOT / "docs" / "results" / f"{scenario}.json").read_text())["metrics"]
-        found = [measured[key] for key in (name, simplest[scenario, name])]
-        assert [value, value_of_simplest] == [f"{one['value']:.3g} {one['unit']}" for one in found]
+        on_page = [(row.metric, row.metric_of_simplest) for row in ON_RECORDINGS]
+        found = [[measured[key] for key in keys] for keys in on_page if keys[0] == name and set(keys) <= set(measured)]
+        assert [value, value_of_simplest] in [[f"{x['value']:.3g} {x['unit']}" for x in pair] for pair in found]
 
 
 def test_values_of_the_page_of_benchmarks_are_those_of_the_baseline():

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxfilters as jf
-from jaxfilters.benchmarks.metrics import Metric, aligned
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric, aligned
 
 SIGMAS = (1.0, 2.0, 3.0)
 INTERVAL_KEY = 0
@@ -117,14 +117,16 @@ def metrics_of(claims: Claims, scores: Scores) -> dict[str, Metric]:
     """By name, with the system and the data in it."""
     name = f"{claims.system}_{claims.data}"
     found = {
-        f"coverage2_{name}": Metric(100 * float(np.mean(scores.coverage[1])), "%", "higher"),
-        f"nees_{name}": Metric(scores.nees / len(claims.coordinates), "", "lower"),
+        f"coverage2_{name}": Metric(100 * float(np.mean(scores.coverage[1])), "%", 100 * WITHIN_TWO_SIGMA),
+        f"nees_{name}": Metric(scores.nees / len(claims.coordinates), "", 1.0),
         f"log_score_gain_{name}": Metric(scores.log_score_of_constant - scores.log_score, "nats", "higher"),
         f"effective_frames_{name}": Metric(scores.effective_frames, "", "higher"),
     }
     for i, coordinate in enumerate(claims.coordinates):
-        found[f"coverage2_{name}_{coordinate}"] = Metric(100 * float(scores.coverage[1, i]), "%", "higher")
-        found[f"sharpness_{name}_{coordinate}"] = Metric(float(scores.sharpness[i]), "", "higher")
+        found[f"coverage2_{name}_{coordinate}"] = Metric(
+            100 * float(scores.coverage[1, i]), "%", 100 * WITHIN_TWO_SIGMA
+        )
+        found[f"sharpness_{name}_{coordinate}"] = Metric(float(scores.sharpness[i]), "", 1.0)
         found[f"crps_{name}_{coordinate}"] = Metric(float(scores.crps[i]), coordinate.rpartition("_")[2], "lower")
     return found
 

@@ -8,7 +8,7 @@ import cv2
 import jax
 import numpy as np
 
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.scenarios._head_runs import (
     AXES,
     AXIS_UNITS,
@@ -104,7 +104,7 @@ def evaluated(prefix: str, runs: dict[str, list[HeadRun]], schedule: Schedule) -
                 metrics[f"{prefix}{phase}_{what}_{name}"] = Metric(float(value), unit, "lower")
             covered = np.mean([coverage(one, frames) for one in runs[name]], axis=0)
             for axis, value in zip(AXES, covered, strict=True):
-                metrics[f"{prefix}{phase}_coverage_2sigma_{axis}_{name}"] = Metric(float(value), "", "higher")
+                metrics[f"{prefix}{phase}_coverage_2sigma_{axis}_{name}"] = Metric(float(value), "", WITHIN_TWO_SIGMA)
         for paper in ("", "paper_"):
             if f"{paper}deformable" in of_tracker:
                 ratios = of_tracker[f"{paper}deformable"] / of_tracker[f"{paper}rigid"]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.benchmarks.scenarios._mono_real import NUM_FRAMES, PEOPLE, QUICK_NUM_FRAMES, filmed, modelled_face
 from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
@@ -204,7 +204,7 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
         }
     within = np.concatenate([np.abs(run.errors) <= 2 * run.std for run in runs])
     metrics |= {
-        f"coverage2_{axis}_{name}": Metric(100 * float(np.mean(within[:, i])), "%", "higher")
+        f"coverage2_{axis}_{name}": Metric(100 * float(np.mean(within[:, i])), "%", 100 * WITHIN_TWO_SIGMA)
         for axis, i in AXES.items()
     }
     lost = float(np.mean([run.lost_share for run in runs]))

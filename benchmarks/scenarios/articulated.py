@@ -15,7 +15,7 @@ import cv2
 import jax
 import numpy as np
 
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Direction, Metric
 from jaxfilters.benchmarks.recordings import VARIABLE
 from jaxfilters.benchmarks.scenarios import _articulated_paper as paper
 from jaxfilters.benchmarks.timing import interleaved
@@ -27,6 +27,8 @@ NUM_SEEDS, QUICK_NUM_SEEDS = 50, 6
 NUM_HELD_SEEDS, QUICK_NUM_HELD_SEEDS = 20, 2
 HELD_FRAMES, QUICK_HELD_FRAMES = 500, 60
 ROUNDS, QUICK_ROUNDS = 15, 3
+RIGHT: dict[str, Direction | float] = {"coverage": WITHIN_TWO_SIGMA, "nees": 6.0}
+"""Values of consistent filters, of six lengths."""
 COLORS = {"literal": (40, 120, 230), "recommended": (200, 110, 30)}
 """Blue, green, red."""
 
@@ -56,13 +58,12 @@ def paper_metrics(seeds: range) -> dict[str, Metric]:
             _say(f"  {mode:14} shape {shape}: " + "  ".join(f"{name} {value:.3g}" for name, value in found.items()))
             for name, value in found.items():
                 unit = "px" if name.endswith("_px") else "deg" if name.endswith("_deg") else ""
-                metrics[f"{name}_{mode}_shape{shape}"] = Metric(
-                    value, unit, "higher" if name.startswith("coverage") else "lower"
-                )
+                better = RIGHT.get(name.partition("_")[0], "lower")
+                metrics[f"{name}_{mode}_shape{shape}"] = Metric(value, unit, better)
         difference = abs(final[mode, 2] - final[mode, 1])
         metrics[f"r13_difference_px_{mode}"] = Metric(difference, "px", "higher")
-    metrics["nees_lengths_band_low"] = Metric(low, "", "higher")
-    metrics["nees_lengths_band_high"] = Metric(high, "", "lower")
+    metrics["nees_lengths_band_low"] = Metric(low, "", 6.0)
+    metrics["nees_lengths_band_high"] = Metric(high, "", 6.0)
     return metrics
 
 
@@ -95,9 +96,9 @@ def drawn_metrics(seeds: range) -> dict[str, Metric]:
         nees = paper.nees(errors, covariances)
         found = {
             "diverged_share": Metric(float(paper.diverged(runs).mean()), "", "lower"),
-            "coverage_2sigma": Metric(paper.coverage(errors, covariances), "", "higher"),
-            "nees_lengths_mean": Metric(float(np.mean(nees)), "", "lower"),
-            "nees_lengths_median": Metric(float(np.median(nees)), "", "lower"),
+            "coverage_2sigma": Metric(paper.coverage(errors, covariances), "", WITHIN_TWO_SIGMA),
+            "nees_lengths_mean": Metric(float(np.mean(nees)), "", 6.0),
+            "nees_lengths_median": Metric(float(np.median(nees)), "", 5.35),
         }
         _say(f"  drawn starts, shape {shape}: " + "  ".join(f"{name} {found[name].value:.3g}" for name in found))
         metrics |= {f"drawn_{name}_recommended_shape{shape}": metric for name, metric in found.items()}
@@ -113,10 +114,10 @@ def held_metrics(seeds: range, num_frames: int, out: Path | None) -> dict[str, M
         early = min(20, num_frames // 3)
         deviations = np.sqrt(np.diagonal(runs.length_covariances, axis1=-2, axis2=-1)).mean(axis=(0, 2))
         metrics[f"held_nees_lengths_{mode}"] = Metric(
-            float(np.mean(paper.nees(runs.length_errors[:, -1], runs.length_covariances[:, -1]))), "", "lower"
+            float(np.mean(paper.nees(runs.length_errors[:, -1], runs.length_covariances[:, -1]))), "", 6.0
         )
         metrics[f"held_coverage_2sigma_{mode}"] = Metric(
-            paper.coverage(runs.length_errors[:, -1], runs.length_covariances[:, -1]), "", "higher"
+            paper.coverage(runs.length_errors[:, -1], runs.length_covariances[:, -1]), "", WITHIN_TWO_SIGMA
         )
         metrics[f"held_std_kept_{mode}"] = Metric(float(deviations[-1] / deviations[early]), "", "higher")
         _say(

@@ -29,7 +29,7 @@ import jax
 import numpy as np
 
 from jaxfilters.benchmarks.finished import Finished
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._mono_detected import people_metrics
 from jaxfilters.benchmarks.scenarios._mono_floor import modelled_rotation_metrics, modelled_size_metrics, size_errors
@@ -171,7 +171,7 @@ def errors_of(name: str, runs: list[MonoRun]) -> dict[str, Metric]:
             f"error_{name}_{axis}_median": Metric(float(errors.median[i]), unit, "lower"),
             f"error_{name}_{axis}_worst": Metric(float(errors.worst[i]), unit, "lower"),
             f"ratio_to_thesis_{name}_{axis}": Metric(mean / thesis, "", "lower"),
-            f"coverage_{name}_{axis}": Metric(100 * float(inside[i]), "%", "higher"),
+            f"coverage_{name}_{axis}": Metric(100 * float(inside[i]), "%", 100 * WITHIN_TWO_SIGMA),
         }
     landmark = over_users(runs, lambda run: np.nanmean(run.landmark_mm[run.is_tracked]))
     lost = over_users(runs, lambda run: np.mean(~run.is_tracked))

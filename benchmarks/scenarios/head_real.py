@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios import _simplest as simplest
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS
@@ -200,7 +200,7 @@ def yaw_metrics(found: Modelled) -> dict[str, Metric]:
         landmark = float(np.sqrt(np.mean(found.landmark_mm[rows] ** 2)))
         metrics[f"ict_error_landmark_{name}"] = Metric(landmark, "mm", "lower")
         within = np.abs(found.errors[rows]) <= 2 * found.deviations[rows]
-        metrics[f"ict_coverage_{name}"] = Metric(100 * float(within.mean()), "%", "higher")
+        metrics[f"ict_coverage_{name}"] = Metric(100 * float(within.mean()), "%", 100 * WITHIN_TWO_SIGMA)
     return metrics
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.scenarios._head_deformation import Schedule, deformation_metrics
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS, HeadRun, coverage, follow, lost_share, rmse
 from jaxfilters.benchmarks.scenarios._head_speed import speed_metrics
@@ -107,7 +107,7 @@ def table_metrics(kind: str, runs: Runs) -> dict[str, Metric]:
         if suffix in TABLED:
             metrics |= _by_axis(f"ratio_to_paper_adaptive_{kind}", suffix, ratios.mean(axis=0))
             metrics |= _by_axis(f"worst_ratio_to_paper_adaptive_{kind}", suffix, ratios.max(axis=0))
-            metrics |= _by_axis(f"coverage_2sigma_{kind}", suffix, covered, better="higher")
+            metrics |= _by_axis(f"coverage_2sigma_{kind}", suffix, covered, better=WITHIN_TWO_SIGMA)
         metrics[f"lost_share_{kind}{suffix}"] = Metric(float(lost.mean()), "", "lower")
         metrics[f"lost_runs_{kind}{suffix}"] = Metric(float((lost > 0).mean()), "", "lower")
     return metrics | _by_axis(f"adaptive_to_fixed5_{kind}", "_paper", means["_paper"] / means["_paper_fixed5"])

@@ -12,7 +12,11 @@ from jaxfilters.benchmarks.scenarios._mono_runs import MonoRun, as_arrays, from_
 from jaxfilters.trackers.head.mono.state import MonoTrack
 from jaxfilters.trackers.io.errors import InputError
 
-METRICS = {"error": Metric(1 / 3, "mm", "lower"), "speed": Metric(float("inf"), "frames/s", "higher")}
+METRICS = {
+    "error": Metric(1 / 3, "mm", "lower"),
+    "speed": Metric(float("inf"), "frames/s", "higher"),
+    "coverage": Metric(0.9, "", 0.954),
+}
 
 
 class Measuring:
