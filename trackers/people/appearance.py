@@ -5,7 +5,7 @@ Clothes are colour histograms of the upper and the lower half of silhouettes.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters._full_precision import einsum
 from jaxfilters.gaussian.belief import Gaussian
@@ -138,17 +138,34 @@ def identity_switch_correction(
 
 
 def _exchanged(people: People, evidence: Array) -> tuple[People, Array]:
-    """The pair with the strongest evidence, if it is enough, with each other's identity, clothes and height."""
+    """The pair with the strongest evidence, if it is enough, with each other's identity, clothes and height.
+
+    What hardly changes is of the person from before the meeting. All else follows the body in the image within seconds
+    and stays with it: place, width (arms, stride, the side that shows), detectability and the evidence of existence.
+    """
     slots = len(evidence)
     i, j = jnp.unravel_index(jnp.argmax(evidence), evidence.shape)
     enough = evidence[i, j] > DECIDED
     order = jnp.arange(slots).at[i].set(jnp.where(enough, j, i)).at[j].set(jnp.where(enough, i, j))
-    height = jnp.arange(STATE) == HEIGHT
-    belief = people.belief
-    mean = jnp.where(height, belief.mean[order], belief.mean)
     swapped = people._replace(
         identity=people.identity[order],
         appearance=people.appearance[order],
-        belief=Gaussian(mean, belief.covariance),
+        belief=_with_height_of(order, people.belief),
     )
-    return swapped, enough & ((jnp.arange(slots) == i) | (jnp.arange(slots) == j))
+    return swapped, order != jnp.arange(slots)
+
+
+def _with_height_of(order: Int[Array, " slots"], belief: Gaussian) -> Gaussian:
+    """Beliefs whose height, with its variance, is that of another slot where `order` says so.
+
+    A height that was measured on another body does not correlate with the errors of a slot's place. With covariances of
+    zero, the covariance matrix consists of two positive semidefinite blocks.
+    """
+    is_height = jnp.arange(STATE) == HEIGHT
+    variance, one_height = is_height[:, None] & is_height, is_height[:, None] ^ is_height
+    taken = (order != jnp.arange(len(order)))[:, None, None]
+    covariance = jnp.where(variance, belief.covariance[order], belief.covariance)
+    return Gaussian(
+        jnp.where(is_height, belief.mean[order], belief.mean),
+        jnp.where(taken & one_height, 0.0, covariance),
+    )

@@ -25,6 +25,7 @@ from jaxfilters.trackers.people.demo_room import DemoRoom, demo_room
 from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.drawing import write_plan
 from jaxfilters.trackers.people.files import by_frame, write_coco, write_mot
+from jaxfilters.trackers.people.identity import identity_of
 from jaxfilters.trackers.people.options import DEFAULT_BACKGROUND
 from jaxfilters.trackers.people.recorded import Sighting
 from jaxfilters.trackers.people.run import PeopleStream
@@ -44,6 +45,8 @@ class Setup(NamedTuple):
     """The synthetic room, with its truth; None for real cameras."""
     detected: list[DetectedForeground]
     """Foreground from the boxes of a detector, one a camera; empty without a detector."""
+    contents: dict[str, Any]
+    """Hashes of the files of cameras, scene and detections, by name; empty for the synthetic room."""
 
 
 def track(options: argparse.Namespace) -> str:
@@ -107,9 +110,12 @@ def _identity(setup: Setup, options: argparse.Namespace) -> dict[str, Any]:
     return {
         "input": [source.name for source in setup.sources],
         "image_sizes": [list(source.image_size) for source in setup.sources],
+        # With --fps, the time stamps of a video do not count, even where its rate is the same.
+        "fps": options.fps,
+        "rates": [None if is_live(source) else source.fps for source in setup.sources],
         "seed": options.seed,
         "background": _foreground_of(setup, options),
-        "detections": [str(path) for path in options.detections],
+        **setup.contents,
         "version": version("jaxfilters"),
         **{f"config.{name}": value for name, value in json.loads(json.dumps(asdict(setup.scene.config))).items()},
     }
@@ -125,11 +131,13 @@ def _foreground_of(setup: Setup, options: argparse.Namespace) -> str:
 def _setup(options: argparse.Namespace) -> Setup:
     config = as_input_error(partial(config_from_args, PeopleConfig(), options))
     if not options.sources:
-        if options.camera or options.scene or options.detections:
-            raise InputError("--camera, --scene, --detections: of no use without a video, as for the synthetic room.")
+        if options.camera or options.scene or options.detections or options.fps is not None:
+            raise InputError(
+                "--camera, --scene, --detections, --fps: of no use without a video, as for the synthetic room."
+            )
         room = demo_room(options.seed or 0)
         scene = people_scene(room.cameras, room.floor, furniture=room.furniture, config=config)
-        return Setup(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room, [])
+        return Setup(scene, [Undistortion(camera.shape) for camera in room.cameras], _demo_sources(room), room, [], {})
     if not options.scene:
         raise InputError("--scene: missing; a scene.json with the floor on which people walk, in metres.")
     if len(options.camera) != len(options.sources):
@@ -151,11 +159,12 @@ def _setup(options: argparse.Namespace) -> Setup:
     furniture = furniture_of(described, cameras)
     scene = as_input_error(lambda: people_scene(cameras, described.floor, furniture=furniture, config=config))
     undistortions = [file.undistortion for file in files]
+    boxes = [read_detections(path) for path in options.detections]
     detected = [
-        DetectedForeground(read_detections(path), undistortion, spread_px=config.spread_px)
-        for path, undistortion in zip(options.detections, undistortions, strict=False)
+        DetectedForeground(one, undistortion, spread_px=config.spread_px)
+        for one, undistortion in zip(boxes, undistortions, strict=False)
     ]
-    return Setup(scene, undistortions, sources, None, detected)
+    return Setup(scene, undistortions, sources, None, detected, identity_of(files, described, boxes))
 
 
 class _DemoSource:

@@ -58,7 +58,8 @@ class PeopleConfig:
     memory_s: float = 5.0
     """For how long a person who was lost is recognised, seconds."""
     hidden_s: float = 3.0
-    """For how long a person who is hidden is believed to be there, seconds."""
+    """For how long a person who is hidden is believed to be there, seconds; a longer gap between images ends all
+    tracks."""
 
     def __post_init__(self) -> None:
         for name in [

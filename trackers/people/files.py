@@ -1,7 +1,6 @@
 """Tracks of people in the formats of others: MOT-challenge text and COCO annotations."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Array
 from jaxfilters.models.person.ellipsoid import VISIBLE, Outline, outline
 from jaxfilters.trackers.io.errors import OutputError
 from jaxfilters.trackers.io.undistortion import Undistortion
-from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.recorded import NO_IMAGE, Sighting
 from jaxfilters.trackers.people.silhouettes import body_of, observed_place
 from jaxfilters.trackers.people.state import PeopleScene
 
@@ -20,43 +19,41 @@ OUTLINE_POINTS = 64
 """Of an outline, from which the box in the video follows."""
 
 
-def write_mot(
-    path: Path, scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]], camera: int = 0
-) -> None:
+def write_mot(path: Path, scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]]) -> None:
     """MOT-challenge text: `frame,id,left,top,width,height,confidence,x,y,z`, counted from 1, floor points in metres.
 
-    Boxes are of the ellipsoid in one camera, in pixels of its video.
+    Boxes are of the ellipsoid in the first camera, in pixels of its video, and frames are the images of this camera:
+    there are no lines of the moments at which only others had an image.
 
     Raises:
         OutputError: it cannot be written.
     """
     lines = [
-        f"{sighting.frame + 1},{identity + 1},{left:.2f},{top:.2f},{width:.2f},{height:.2f},"
+        f"{sighting.image + 1},{identity + 1},{left:.2f},{top:.2f},{width:.2f},{height:.2f},"
         f"{np.clip(sighting.score, 0, 1):.3f},{sighting.mean[0]:.3f},{sighting.mean[1]:.3f},0\n"
-        for identity, sighting, (left, top, width, height) in _boxes(scene, undistortion, tracks, camera)
+        for identity, sighting, (left, top, width, height) in _boxes(scene, undistortion, tracks)
     ]
     _write_text(path, "".join(lines))
 
 
-def write_coco(
-    path: Path, scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]], camera: int = 0
-) -> None:
-    """COCO annotations with `track_id`, `floor_xy_m` and `score`; images are frames from 0, boxes as of `write_mot`.
+def write_coco(path: Path, scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]]) -> None:
+    """COCO annotations with `track_id`, `floor_xy_m` and `score`; images count from 0, boxes are as of `write_mot`.
+
+    All images up to the last one with a box are listed: a reader may count them.
 
     Raises:
         OutputError: it cannot be written.
     """
-    rows, cols = scene.cameras[camera].shape
-    found = _boxes(scene, undistortion, tracks, camera)
+    rows, cols = scene.cameras[0].shape
+    found = _boxes(scene, undistortion, tracks)
+    images = 1 + max((sighting.image for _, sighting, _ in found), default=-1)
     document = {
-        "images": [
-            {"id": i, "width": cols, "height": rows} for i in sorted({sighting.frame for _, sighting, _ in found})
-        ],
+        "images": [{"id": i, "width": cols, "height": rows} for i in range(images)],
         "categories": [{"id": 1, "name": "person"}],
         "annotations": [
             {
                 "id": number,
-                "image_id": sighting.frame,
+                "image_id": sighting.image,
                 "category_id": 1,
                 "track_id": identity,
                 "bbox": [round(float(edge), 2) for edge in box],
@@ -72,16 +69,16 @@ def write_coco(
 
 
 def _boxes(
-    scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]], camera: int
+    scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]]
 ) -> list[tuple[int, Sighting, np.ndarray]]:
-    """By frame: identity, sighting, and left, top, width and height in the video of a camera, of all who are in it."""
-    everyone = by_frame(tracks)
+    """By image: identity, sighting, and left, top, width and height of all who are in the video of the first camera."""
+    everyone = [(identity, sighting) for identity, sighting in by_frame(tracks) if sighting.image != NO_IMAGE]
     if not everyone:
         return []
     # One compilation for each power of two.
     length = 1 << (len(everyone) - 1).bit_length()
     means = np.stack([sighting.mean for _, sighting in everyone] + [everyone[0][1].mean] * (length - len(everyone)))
-    shown = jax.device_get(_outlines(scene, jnp.asarray(means, jnp.float32), camera))
+    shown = jax.device_get(_outlines(scene, jnp.asarray(means, jnp.float32)))
     turns = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     circle = np.stack([np.cos(turns), np.sin(turns)])
     found = []
@@ -93,10 +90,10 @@ def _boxes(
     return found
 
 
-@partial(jax.jit, static_argnums=2)
-def _outlines(scene: PeopleScene, means: Array, camera: int) -> Outline:
+@jax.jit
+def _outlines(scene: PeopleScene, means: Array) -> Outline:
     def one(mean):
-        return outline(scene.cameras[camera].P, body_of(observed_place(scene, mean)))
+        return outline(scene.cameras[0].P, body_of(observed_place(scene, mean)))
 
     return jax.vmap(one)(means)
 

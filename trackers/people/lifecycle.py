@@ -228,10 +228,27 @@ def _reduced_contrast(scene, camera, furniture, places, active, frame):
     return contrast(reduced, jax.lax.fori_loop(0, jnp.sum(active), cover, free))
 
 
+def after_gap(config: PeopleConfig, people: People, dt: Float[Array, ""]) -> People:
+    """Modes when nothing has come for `dt` seconds: across more than `hidden_s`, nobody is followed.
+
+    Otherwise the image at the end of the gap would count whoever stands near as a person of before the gap.
+    """
+    return people._replace(mode=_ended(people.mode, is_active(people.mode) & (dt > config.hidden_s)))
+
+
+def is_active(mode: Int32[Array, " slots"]) -> Bool[Array, " slots"]:
+    """Who is followed: a person, or a candidate who may be a mistake."""
+    return (mode == TENTATIVE) | (mode == TRACKED)
+
+
+def _ended(mode: Int32[Array, " slots"], gone: Bool[Array, " slots"]) -> Int32[Array, " slots"]:
+    """Modes where those who are `gone` are remembered if they were tracked, and forgotten if they were not."""
+    return jnp.where(gone, jnp.where(mode == TRACKED, DORMANT, FREE), mode)
+
+
 def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""], looked: Bool[Array, ""]) -> People:
     """Log odds and modes after a frame that `looked` at the scene."""
-    config = scene.config
-    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    config, active = scene.config, is_active(people.mode)
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
     # A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
@@ -249,7 +266,7 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     away = _is_away(scene, people.belief)
     gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | lost | away)
     gone |= (people.mode == TENTATIVE) & (unseen > 0.5)
-    mode = jnp.where(gone, jnp.where(people.mode == TRACKED, DORMANT, FREE), people.mode)
+    mode = _ended(people.mode, gone)
     mode = jnp.where((mode == DORMANT) & (unseen > config.memory_s + config.hidden_s), FREE, mode)
     mode = jnp.where((mode == TENTATIVE) & (log_odds > config.confirmed), TRACKED, mode)
     return people._replace(log_odds=log_odds, unseen_s=unseen, mode=mode)
@@ -271,10 +288,14 @@ def _is_away(scene: PeopleScene, belief: Gaussian) -> Bool[Array, " slots"]:
 
 
 def seniority(people: People) -> Float[Array, " slots"]:
-    """Higher for who is the less likely to be a mistake: the tracked by identity, then the tentative by log odds."""
-    return jnp.where(
-        people.mode == TRACKED, 1e4 - people.identity, people.log_odds - 1e-3 * jnp.arange(len(people.mode))
-    )
+    """Higher for who is the less likely to be a mistake: the tracked by identity, then the tentative by log odds.
+
+    The tracked are counted by integers: a float32 does not distinguish large identities.
+    """
+    tracked, identity = people.mode == TRACKED, people.identity
+    juniors = jnp.sum(tracked & (identity > identity[:, None]), axis=1)
+    tentative = people.log_odds - 1e-3 * jnp.arange(len(identity))
+    return jnp.where(tracked, MOST_LOG_ODDS + 1.0 + juniors, tentative)
 
 
 def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[Array, " slots"]) -> People:

@@ -17,9 +17,12 @@ from jaxfilters.trackers.people.lifecycle import HIDDEN_SHARE
 from jaxfilters.trackers.people.state import STATE, TENTATIVE, TRACKED, People, PeopleConfig, Report
 from jaxfilters.trackers.people.tracker import motion
 
+NO_IMAGE = -1
+"""In place of the number of an image, where a camera had none."""
+
 
 class Sighting(NamedTuple):
-    """One person in one frame."""
+    """One person in one frame, which is one moment for all cameras."""
 
     frame: int
     time_s: float
@@ -32,6 +35,8 @@ class Sighting(NamedTuple):
     """Where the tracker kept this person: another one after a change of identities."""
     mode: str
     """`tentative`, `tracked`, `hidden` (occluded) or `no_depth` (not measurable along the line of sight)."""
+    image: int = NO_IMAGE
+    """Of the first camera: the number of its image, from 0; it has none in some frames if another camera is faster."""
 
 
 MODES = ("tentative", "tracked", "hidden", "no_depth")
@@ -46,14 +51,22 @@ class Recorder:
         self.unconfirmed: dict[int, list[Sighting]] = {}
         """By slot."""
 
-    def add(self, frame: int, time_s: float, people: People, report: Report) -> list[tuple[int, Sighting]]:
-        """The sightings of a frame and, for the newly confirmed, of the frames before; NumPy leaves."""
+    def add(self, frame: int, image: int, time_s: float, people: People, report: Report) -> list[tuple[int, Sighting]]:
+        """The sightings of a frame and, for the newly confirmed, of the frames before.
+
+        Args:
+            frame: Its number.
+            image: Number of the image of the first camera; `NO_IMAGE` without one.
+            time_s: Seconds since the first frame.
+            people: After the frame, NumPy leaves.
+            report: Of the frame, NumPy leaves.
+        """
         added: list[tuple[int, Sighting]] = []
         for slot, (mode, identity) in enumerate(zip(people.mode, people.identity, strict=True)):
             if mode not in (TENTATIVE, TRACKED):
                 self.unconfirmed.pop(slot, None)
                 continue
-            sighting = _sighting(frame, time_s, slot, people, report)
+            sighting = _sighting(frame, image, time_s, slot, people, report)
             if mode == TENTATIVE:
                 # A slot that was given up and taken again within one frame holds another person.
                 if people.log_odds[slot] == 0:
@@ -78,7 +91,7 @@ def as_arrays(sightings: Sequence[tuple[int, Sighting]]) -> dict[str, np.ndarray
     modes = [MODES.index(mode) for mode in arrays.pop("mode")]
     n = len(modes)
     return {
-        **{name: np.asarray(arrays[name], np.int64) for name in ("key", "frame", "slot")},
+        **{name: np.asarray(arrays[name], np.int64) for name in ("key", "frame", "slot", "image")},
         **{name: np.asarray(arrays[name], np.float64) for name in ("time_s", "score")},
         "mean": np.reshape(np.asarray(arrays["mean"], np.float64), (n, STATE)),
         "covariance": np.reshape(np.asarray(arrays["covariance"], np.float64), (n, STATE, STATE)),
@@ -99,13 +112,14 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Sighting]]:
                 float(arrays["score"][i]),
                 int(arrays["slot"][i]),
                 MODES[int(arrays["mode"][i])],
+                int(arrays["image"][i]),
             ),
         )
         for i in range(len(arrays["key"]))
     ]
 
 
-def _sighting(frame, time_s, slot, people, report) -> Sighting:
+def _sighting(frame, image, time_s, slot, people, report) -> Sighting:
     mode = "tentative" if people.mode[slot] == TENTATIVE else "tracked"
     if mode == "tracked" and report.share_seen[slot] < HIDDEN_SHARE:
         mode = "hidden"
@@ -119,6 +133,7 @@ def _sighting(frame, time_s, slot, people, report) -> Sighting:
         float(report.score[slot]),
         slot,
         mode,
+        image,
     )
 
 

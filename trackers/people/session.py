@@ -15,7 +15,7 @@ from jaxfilters.trackers.background.median import MedianBackground, evenly
 from jaxfilters.trackers.background.registration import Registration, intrinsics
 from jaxfilters.trackers.people.config import PeopleConfig
 from jaxfilters.trackers.people.detected import DetectedForeground, combined
-from jaxfilters.trackers.people.recorded import Recorder, Sighting, as_arrays, from_arrays, smoothed
+from jaxfilters.trackers.people.recorded import NO_IMAGE, Recorder, Sighting, as_arrays, from_arrays, smoothed
 from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
@@ -24,7 +24,7 @@ from jaxfilters.trackers.tracker import checked_times
 PRIMING_IMAGES = 40
 """Images from which the empty room is estimated before a recording is tracked."""
 REFERENCE_EVERY = 500
-"""Frames after which the corners of a camera that is registered are taken from its background again."""
+"""Images of a camera that is registered after which its corners are taken from its background again."""
 REPORTED_PX = 2.0
 """Motion of a corner of the image from which on a camera is reported to have turned."""
 KEPT_BEYOND = 1.4
@@ -97,6 +97,8 @@ class PeopleTracks:
         self.scene, self.recorder = scene, Recorder()
         self.frames, self.people = 0, start(scene)
         self.time_s = 0.0
+        self.images = np.zeros(len(scene.cameras), np.int64)
+        """(cameras,) how many images each camera has delivered."""
 
     def step(self, observed: tuple[CameraFrame, ...], time_s: float) -> PeopleEstimate:
         """The estimate after the next frame.
@@ -110,7 +112,10 @@ class PeopleTracks:
         self.people, report = jax.block_until_ready(step(self.scene, self.people, observed, dt))
         seconds, self.time_s = time.perf_counter() - began, time_s
         people, reported = jax.device_get((self.people, report))
-        added = self.recorder.add(self.frames, time_s, people, reported)
+        present = np.array([bool(frame.present) for frame in observed])
+        image = int(self.images[0]) if present[0] else NO_IMAGE
+        added = self.recorder.add(self.frames, image, time_s, people, reported)
+        self.images += present
         self.frames += 1
         return PeopleEstimate(self.frames - 1, time_s, people, reported, added, seconds)
 
@@ -124,13 +129,14 @@ class PeopleTracks:
         return {
             "people": self.people,
             "clock": np.array([self.frames, self.time_s]),
+            "images": self.images.copy(),
             "unconfirmed": as_arrays(unconfirmed),
         }
 
     def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
         """Continue from what `state` gave, with the tracks up to then."""
         self.people, (frames, self.time_s) = state["people"], map(float, state["clock"])
-        self.frames, self.recorder = int(frames), Recorder()
+        self.frames, self.recorder, self.images = int(frames), Recorder(), np.array(state["images"])
         for slot, one in from_arrays(state["unconfirmed"]):
             self.recorder.unconfirmed.setdefault(slot, []).append(one)
         for identity, one in tracks:
@@ -193,7 +199,11 @@ class PeopleSession:
         Args:
             images: (rows, cols, 3) uint8 of every camera, without lens distortion; `None` where it has nothing new.
             time_s: Seconds since the first images, growing.
+
+        Raises:
+            ValueError: if there is not one entry for each camera, or an image has another shape.
         """
+        _check_images(images, self.tracks.scene)
         observed = tuple(self._observed(i, image) for i, image in enumerate(images))
         self._estimate = self.tracks.step(observed, time_s)
         self._outlines = _on_host(outlines(self.tracks.scene, self._estimate.people))
@@ -259,7 +269,7 @@ class PeopleSession:
         if image is None:
             last = self._images[camera]
             return CameraFrame(np.zeros(last.shape[:2], np.uint8), last, np.bool_(False))
-        if self._registrations and self.tracks.frames % REFERENCE_EVERY == REFERENCE_EVERY - 1:
+        if self._registrations and self.tracks.images[camera] % REFERENCE_EVERY == REFERENCE_EVERY - 1:
             self._renew_reference(camera)
         boxes = self._detected[camera].apply(image) if self._detected else None
         image, blank = self._registrations[camera].straightened(image) if self._registrations else (image, None)
@@ -293,6 +303,13 @@ class PeopleSession:
             v = np.clip(np.round([low[1], high[1]]), 0, shape[0]).astype(int)
             mask[v[0] : v[1], u[0] : u[1]] = 255
         return mask
+
+
+def _check_images(images: Sequence[np.ndarray | None], scene: PeopleScene) -> None:
+    _check_count("images", images, len(scene.cameras))
+    for number, (camera, image) in enumerate(zip(scene.cameras, images, strict=True)):
+        if image is not None and image.shape != (expected := (*camera.shape, 3)):
+            raise ValueError(f"images: camera {number} must deliver the shape {expected}; got {image.shape}.")
 
 
 def _check_count(name: str, given: str | Sequence, cameras: int) -> None:

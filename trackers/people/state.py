@@ -106,14 +106,14 @@ class People(NamedTuple):
     """Everybody, one slot each."""
 
     belief: Gaussian
-    """Mean (slots, 6) and covariance (slots, 6, 6)."""
+    """Mean (slots, STATE) and covariance (slots, STATE, STATE)."""
     mode: Int32[Array, " slots"]
     identity: Int32[Array, " slots"]
     """-1 where there is none yet."""
     log_odds: Float[Array, " slots"]
     """Of being a person."""
     unseen_s: Float[Array, " slots"]
-    """Seconds since there was anything to see."""
+    """Seconds since an image showed anything of them."""
     appearance: Float[Array, "slots 48"]
     meetings: Meetings
     next_identity: Int32[Array, ""]
@@ -132,8 +132,6 @@ class Report(NamedTuple):
     """Metres."""
     sd_radial: Float[Array, " slots"]
     """Metres, along the line of sight of the nearest camera."""
-    sd_lateral: Float[Array, " slots"]
-    """Metres, at right angles to it on the floor."""
     height: Float[Array, " slots"]
     """Metres."""
     score: Float[Array, " slots"]

@@ -35,6 +35,8 @@ class TimedPeopleTrack(NamedTuple):
     """(rows,)."""
     slot: np.ndarray
     """(rows,) where the tracker kept this person."""
+    image: np.ndarray
+    """(rows,) number of the image of the first camera, from 0; -1 in frames in which it has none."""
     status: np.ndarray
     """(rows,) int64: places in `STATUS`."""
 

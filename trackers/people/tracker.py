@@ -33,7 +33,6 @@ from jaxfilters.trackers.people.state import (
     HEIGHT,
     PLACE,
     STATE,
-    TENTATIVE,
     TRACKED,
     WIDTH,
     CameraFrame,
@@ -45,8 +44,6 @@ from jaxfilters.trackers.people.state import (
     nobody,
 )
 
-MOST_DT_S = 1.0
-"""A longer gap is treated as one of this length: nobody is followed across it anyway."""
 NO_DEPTH = 0.05
 """Standard deviation along the line of sight, in distances from the camera, from which on depth is not measured: the
 pair of a desk that hides the feet and a border that hides the head gives as much, either alone gives less."""
@@ -118,10 +115,11 @@ def step(
         scene: What is known of the place.
         people: State after the last time.
         frames: What the cameras deliver, in their order.
-        dt: Seconds since the last time.
+        dt: Seconds since the last time; a negative value counts as 0.
     """
-    dt = jnp.clip(jnp.asarray(dt, float), 0.0, MOST_DT_S)
-    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    dt = jnp.maximum(jnp.asarray(dt, float), 0.0)
+    people = lifecycle.after_gap(scene.config, people, dt)
+    active = lifecycle.is_active(people.mode)
     F, Q = motion(scene.config, dt)
     predicted = chosen(active, jax.vmap(joseph.predict, in_axes=(0, None, None))(people.belief, F, Q), people.belief)
     tracked = people.mode == TRACKED
@@ -136,7 +134,7 @@ def step(
     looked = jnp.any(jnp.stack([jnp.asarray(frame.present) for frame in frames]))
     people = lifecycle.existence(scene, people, fit, dt, looked)
     places = jnp.concatenate([_observed_places(scene, people), fit.stride], axis=1)
-    active = (people.mode == TENTATIVE) | (people.mode == TRACKED)
+    active = lifecycle.is_active(people.mode)
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
     people = identity_switch_correction(people, histograms, good, dt)
@@ -158,14 +156,13 @@ def _observed_places(scene: PeopleScene, people: People) -> Array:
 
 def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
     covariance = people.belief.covariance[:, :2, :2]
-    variance = einsum("kai,kij,kaj->ka", fit.axes[:, :2, :2], covariance, fit.axes[:, :2, :2])
-    radial, lateral = jnp.sqrt(jnp.maximum(variance, 0.0)).T
+    sight = fit.axes[:, 0, :2]
+    radial = jnp.sqrt(jnp.maximum(einsum("ki,kij,kj->k", sight, covariance, sight), 0.0))
     return Report(
         people.identity,
         people.mode,
         people.belief.mean[:, :2],
         radial,
-        lateral,
         people.belief.mean[:, HEIGHT],
         fit.score,
         fit.share_seen,

@@ -14,10 +14,8 @@ from jaxfilters.models.person.ellipsoid import (
     INSIDE,
     VISIBLE,
     Ellipsoid,
-    conic_to_ellipse,
-    dual_quadric,
+    Outline,
     near_depth,
-    outline_coefficients,
     pixel_grid,
     soft_ellipse_mask,
     standing,
@@ -46,6 +44,36 @@ def camera(x64):
 @pytest.fixture
 def person(x64):
     return standing(jnp.array([-0.6, 1.2]), jnp.array(1.65), jnp.array(0.40))
+
+
+def conic_to_ellipse(dual_conic):
+    """Parameters of the ellipse of a dual conic of any scale; NaN where it is no ellipse."""
+    C = dual_conic / dual_conic[2, 2]
+    center = C[:2, 2]
+    shape = jnp.outer(center, center) - C[:2, :2]
+    return ellipse_of(Outline(center, shape, jnp.zeros(()), jnp.asarray(VISIBLE)))
+
+
+def dual_quadric(body):
+    """`Q*` (4, 4), all planes tangent to the ellipsoid: `T diag(r^2, -1) T^T`."""
+    T = jnp.eye(4).at[:3, 3].set(body.center)
+    return T @ jnp.diag(jnp.append(body.semi_axes**2, -1.0)) @ T.T
+
+
+def outline_coefficients(P, body):
+    """(K1 .. K6) of `K1 u^2 + K2 v^2 + K3 u v + K4 u + K5 v + K6`, not negative inside the outline ([4] and appendix).
+
+    The paper's body has equal horizontal semi-axes; the scale is its own, `Ra^2 Rb^2` times the discriminant.
+    """
+    Ra2, Rb2 = body.semi_axes[0] ** 2, body.semi_axes[2] ** 2
+    D = jnp.linalg.inv(jnp.concatenate([P, jnp.array([[0.0, 0.0, 0.0, 1.0]], P.dtype)]))
+    weights = jnp.stack([Rb2, Rb2, Ra2])
+    directions, away = D[:3, :3], D[:3, 3] - body.center
+    a = directions.T @ (weights[:, None] * directions)
+    b = directions.T @ (weights * away)
+    c = away @ (weights * away) - Ra2 * Rb2
+    K = jnp.outer(b, b) - a * c
+    return jnp.stack([K[0, 0], K[1, 1], 2 * K[0, 1], 2 * K[0, 2], 2 * K[1, 2], K[2, 2]])
 
 
 def sphere(center, radius):

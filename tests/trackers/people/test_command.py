@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.io.cameras import write_camera
 from jaxfilters.trackers.people.demo_room import demo_room
@@ -108,6 +109,29 @@ def test_tracks_of_another_run_are_not_overwritten(recording, results, capsys):
 
 
 @pytest.mark.system
+def test_a_run_is_not_continued_with_another_camera_floor_or_rate(recording, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
+    folder, room = recording
+    for name in ("camera.json", "scene.json"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    places = ["--camera", str(tmp_path / "camera.json"), "--scene", str(tmp_path / "scene.json")]
+    command = ["track", "people", str(folder / "room.mp4"), *places, "--out", str(tmp_path / "run"), "--no-video"]
+    assert main([*command, "--seconds", "0.3"]) == 0
+    assert main([*command, "--resume", "--fps", "7"]) == 2
+    assert "cannot be resumed: fps was None and is 7.0, rates was [10.0] and is [7.0]." in capsys.readouterr().err
+    (tmp_path / "scene.json").write_text(json.dumps({"floor": (0.9 * room.floor).tolist()}))
+    assert main([*command, "--resume"]) == 2
+    assert "cannot be resumed: floor was" in capsys.readouterr().err
+    (tmp_path / "scene.json").write_bytes((folder / "scene.json").read_bytes())
+    moved = np.asarray(room.cameras[0].P, float) @ [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    write_camera(tmp_path / "camera.json", room.cameras[0].shape[::-1], P=moved)
+    assert main([*command, "--resume"]) == 2
+    assert "cannot be resumed: cameras was" in capsys.readouterr().err
+    write_camera(tmp_path / "camera.json", room.cameras[0].shape[::-1], P=np.asarray(room.cameras[0].P, float))
+    assert main([*command, "--resume", "--seconds", "0.5"]) == 0
+
+
+@pytest.mark.system
 def test_wrong_input_is_named(recording, tmp_path, capsys):
     folder, _ = recording
     video, out = str(folder / "room.mp4"), ["--out", str(tmp_path / "out")]
@@ -118,6 +142,8 @@ def test_wrong_input_is_named(recording, tmp_path, capsys):
     assert "--camera" in capsys.readouterr().err
     assert main(["track", "people", *scene, *out]) == 2
     assert "synthetic room" in capsys.readouterr().err
+    assert main(["track", "people", "--fps", "5", *out]) == 2
+    assert "--fps: of no use without a video" in capsys.readouterr().err
     write_camera(tmp_path / "small.json", (64, 48), P=np.eye(3, 4))
     assert main(["track", "people", video, "--camera", str(tmp_path / "small.json"), *scene, *out]) == 2
     assert "480x360" in capsys.readouterr().err

@@ -58,6 +58,23 @@ def test_whoever_wears_the_other_s_clothes_is_the_other():
     assert not is_meeting(people.meetings).any()
 
 
+def test_a_height_changes_hands_with_its_variance_and_without_its_correlation_to_the_place():
+    """Short of the exchange, nothing of a covariance changes."""
+    rng = np.random.default_rng(0)
+    factors = rng.standard_normal((3, STATE, STATE))
+    before = (factors @ factors.swapaxes(1, 2)).astype(np.float32)
+    people = three(apart=0.9 * CLOSE_M)
+    people = people._replace(belief=Gaussian(people.belief.mean, jnp.asarray(before)))
+    kept = settle(people, jnp.stack([RED, BLUE, GREY]), CLEARLY, DT).belief.covariance
+    np.testing.assert_array_equal(kept, before)
+    after = np.asarray(settle(people, jnp.stack([BLUE, RED, GREY]), CLEARLY, DT).belief.covariance)
+    expected = before.copy()
+    expected[:2, HEIGHT], expected[:2, :, HEIGHT] = 0.0, 0.0
+    expected[:2, HEIGHT, HEIGHT] = before[[1, 0], HEIGHT, HEIGHT]
+    np.testing.assert_array_equal(after, expected)
+    assert np.linalg.eigvalsh(after.astype(float)).min() > 0
+
+
 def test_it_is_put_right_once():
     assert met_and_parted([BLUE, RED, GREY], frames=9).identity.tolist() == [11, 10, 12]
 

@@ -96,6 +96,18 @@ def test_somebody_hidden_is_believed_in_for_a_while_then_remembered_then_forgott
     assert evaluated(scene, people, hidden, frames=81).mode[0] == FREE
 
 
+@pytest.mark.parametrize(
+    ("gap_s", "modes"),
+    [(2.9, [TRACKED, TENTATIVE]), (3.1, [DORMANT, FREE]), (7.9, [DORMANT, FREE]), (8.1, [FREE, FREE])],
+)
+def test_nobody_is_followed_across_a_gap_though_an_image_shows_somebody_at_its_end(scene, gap_s, modes):
+    """Seconds as for people who are hidden: 3, and 5 more remembered."""
+    people, dt = people_of(TRACKED, TENTATIVE, log_odds=[8.0, 2.0, 0, 0]), jnp.asarray(gap_s)
+    after = judge(scene, lifecycle.after_gap(CONFIG, people, dt), fit_of(1.0), dt, jnp.asarray(True))
+    assert after.mode[:2].tolist() == modes
+    np.testing.assert_allclose(after.unseen_s[0], 0.0 if modes[0] == TRACKED else gap_s, rtol=1e-6)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("neighbour", [False, True], ids=["alone", "beside somebody"])
 def test_whoever_shows_a_little_over_a_wall_is_followed_for_as_long_as_it_shows(camera, draw, floor, neighbour):
@@ -175,6 +187,14 @@ def test_time_that_stands_still_changes_nothing_of_the_hidden(scene):
 def test_the_tracked_are_senior_by_identity_and_to_all_who_are_not():
     people = people_of(TRACKED, TENTATIVE, TRACKED, TENTATIVE, identity=[7, -1, 3, -1], log_odds=[1.0, 3.0, 0.0, 3.0])
     assert np.argsort(-np.asarray(lifecycle.seniority(people))).tolist() == [2, 0, 1, 3]
+
+
+@pytest.mark.parametrize("first", [9_999, 10_500, 2**24, 2**31 - 3])
+def test_seniority_does_not_end_with_many_identities(first):
+    """Identities that a float32 does not distinguish, and one who is tentative with all the evidence there can be."""
+    identity = [first + 1, -1, first, first + 2]
+    people = people_of(TRACKED, TENTATIVE, TRACKED, TRACKED, identity=identity, log_odds=[0.0, 8.0, 0.0, 0.0])
+    assert np.argsort(-np.asarray(lifecycle.seniority(people))).tolist() == [2, 0, 3, 1]
 
 
 def test_new_identities_differ_and_are_never_used_again():

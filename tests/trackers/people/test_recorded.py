@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.trackers.people.recorded import Recorder, Sighting, smoothed, spreads
+from jaxfilters.trackers.people.recorded import NO_IMAGE, Recorder, Sighting, smoothed, spreads
 from jaxfilters.trackers.people.state import DORMANT, FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
+from jaxfilters.trackers.people.table import as_rows, from_rows
 from jaxfilters.trackers.people.tracker import motion
 
 CONFIG = PeopleConfig(capacity=2)
@@ -24,20 +25,29 @@ def _frame(mode, identity, x=0.0, share=1.0, has_depth=True):
         log_odds=jnp.array([1.0, 0.0]),
     )
     n = np.zeros(2)
-    report = Report(people.identity, people.mode, mean[:, :2], n, n, n, n, n + share, n, np.array([has_depth, True]), n)
+    report = Report(people.identity, people.mode, mean[:, :2], n, n, n, n + share, n, np.array([has_depth, True]), n)
     return jax.tree.map(np.asarray, people), report
 
 
 def test_frames_before_the_confirmation_follow_with_the_identity():
     recorder = Recorder()
-    assert recorder.add(0, 0.0, *_frame(TENTATIVE, -1, 1.0)) == []
-    assert recorder.add(1, 0.1, *_frame(TENTATIVE, -1, 2.0)) == []
-    added = recorder.add(2, 0.2, *_frame(TRACKED, 5, 3.0))
+    assert recorder.add(0, 0, 0.0, *_frame(TENTATIVE, -1, 1.0)) == []
+    assert recorder.add(1, 1, 0.1, *_frame(TENTATIVE, -1, 2.0)) == []
+    added = recorder.add(2, 2, 0.2, *_frame(TRACKED, 5, 3.0))
     assert [(identity, sighting.frame, sighting.mean[0], sighting.mode) for identity, sighting in added] == [
         (5, 0, 1.0, "tentative"),
         (5, 1, 2.0, "tentative"),
         (5, 2, 3.0, "tracked"),
     ]
+
+
+def test_sightings_are_saved_with_the_image_that_they_belong_to():
+    recorder = Recorder()
+    for frame, image in enumerate([0, NO_IMAGE, 1]):
+        recorder.add(frame, image, 0.1 * frame, *_frame(TRACKED, 5))
+    rows = as_rows([(5, sighting) for sighting in recorder.tracks[5]])
+    assert rows.image.tolist() == [0, NO_IMAGE, 1]
+    assert [(sighting.frame, sighting.image) for _, sighting in from_rows(rows)] == [(0, 0), (1, NO_IMAGE), (2, 1)]
 
 
 def test_a_person_who_comes_back_stands_once_in_each_frame():
@@ -46,18 +56,18 @@ def test_a_person_who_comes_back_stands_once_in_each_frame():
     for i in range(3):
         people, report = _frame(TRACKED, 5, 1.0)
         people = people._replace(mode=np.array([TRACKED, TENTATIVE]), log_odds=np.array([1.0, i]))
-        recorder.add(i, 0.1 * i, people, report)
+        recorder.add(i, i, 0.1 * i, people, report)
     people, report = _frame(DORMANT, -1, 2.0)
-    added = recorder.add(3, 0.3, people._replace(mode=np.array([FREE, TRACKED]), identity=np.array([-1, 5])), report)
+    added = recorder.add(3, 3, 0.3, people._replace(mode=np.array([FREE, TRACKED]), identity=np.array([-1, 5])), report)
     assert [(identity, sighting.frame) for identity, sighting in added] == [(5, 3)]
     assert [sighting.frame for sighting in recorder.tracks[5]] == [0, 1, 2, 3]
 
 
 def test_whoever_is_given_up_leaves_nothing():
     recorder = Recorder()
-    recorder.add(0, 0.0, *_frame(TENTATIVE, -1))
-    recorder.add(1, 0.1, *_frame(FREE, -1))
-    assert [sighting.frame for _, sighting in recorder.add(2, 0.2, *_frame(TRACKED, 0))] == [2]
+    recorder.add(0, 0, 0.0, *_frame(TENTATIVE, -1))
+    recorder.add(1, 1, 0.1, *_frame(FREE, -1))
+    assert [sighting.frame for _, sighting in recorder.add(2, 2, 0.2, *_frame(TRACKED, 0))] == [2]
 
 
 @pytest.mark.parametrize(
@@ -65,7 +75,7 @@ def test_whoever_is_given_up_leaves_nothing():
     [(0.05, True, "hidden"), (0.15, True, "tracked"), (0.9, False, "no_depth"), (0.9, True, "tracked")],
 )
 def test_what_cannot_be_measured_is_said(share, depth, mode):
-    ((_, sighting),) = Recorder().add(0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
+    ((_, sighting),) = Recorder().add(0, 0, 0.0, *_frame(TRACKED, 0, 0.0, share, depth))
     assert sighting.mode == mode
 
 

@@ -14,6 +14,7 @@ from jaxfilters.trackers.people.demo_room import demo_room
 from jaxfilters.trackers.people.detected import DetectedForeground
 from jaxfilters.trackers.people.recorded import as_arrays, from_arrays
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, PeopleConfig, Report
+from jaxfilters.trackers.people.table import as_rows, from_rows
 from jaxfilters.trackers.people.tracker import people_scene
 
 NO_BOXES = DetectedForeground({}, Undistortion((120, 160)))
@@ -24,9 +25,9 @@ def scene(camera, floor):
     return people_scene([camera], floor, config=PeopleConfig(capacity=2, cell_m=2.0))
 
 
-def shown(number):
+def shown(number, *, present=True):
     """Frames that can be told from others."""
-    return (CameraFrame(np.full((2, 2), number, np.uint8), np.zeros((2, 2, 3), np.uint8), np.bool_(True)),)
+    return (CameraFrame(np.full((2, 2), number, np.uint8), np.zeros((2, 2, 3), np.uint8), np.bool_(present)),)
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def given(monkeypatch):
             log_odds=people.log_odds + 1,
         )
         n = jnp.ones(len(people.mode))
-        return people, Report(people.identity, people.mode, people.belief.mean[:, :2], n, n, n, n, n, n, n > 0, n)
+        return people, Report(people.identity, people.mode, people.belief.mean[:, :2], n, n, n, n, n, n > 0, n)
 
     monkeypatch.setattr(session, "step", step)
     return steps
@@ -61,6 +62,49 @@ def test_frames_come_in_turn_with_the_seconds_between_them(scene, given):
     assert [len(now.added) for now in found] == [0, 0, 3, 1]
     assert [observed.frame for observed in people.recorder.tracks[4]] == [0, 1, 2, 3]
     assert all(now.seconds > 0 and isinstance(now.people.mode, np.ndarray) for now in found)
+
+
+@pytest.mark.parametrize("interrupted_after", [0, 1, 4])
+def test_images_of_the_first_camera_are_counted_also_in_a_run_that_was_interrupted(scene, given, interrupted_after):
+    """At half the rate of a second camera: moments 0, 2 and 4 have its images 0, 1 and 2."""
+    people = session.PeopleTracks(scene)
+    for i in range(6):
+        if i == interrupted_after:
+            state, tracks = people.state(), from_rows(as_rows([(4, one) for one in people.recorder.tracks.get(4, [])]))
+            people = session.PeopleTracks(scene)
+            people.restore(state, tracks)
+        people.step(shown(i, present=i % 2 == 0), 0.1 * i)
+    assert [(one.frame, one.image) for one in people.recorder.tracks[4]] == list(enumerate([0, -1, 1, -1, 2, -1]))
+
+
+def test_the_reference_of_a_slower_camera_is_renewed_after_so_many_of_its_own_images(scene, given, monkeypatch):
+    """A camera at half the rate has no image at any odd moment."""
+    monkeypatch.setattr(session, "REFERENCE_EVERY", 2)
+    monkeypatch.setattr(MedianBackground, "apply", lambda self, image, keep: image[..., 0] / 255)
+    one, renewed = session.PeopleSession(scene), []
+    monkeypatch.setattr(one, "_renew_reference", lambda camera: renewed.append((camera, one.tracks.frames)))
+    for i in range(8):
+        one.process([np.zeros((120, 160, 3), np.uint8) if i % 2 == 0 else None], 0.1 * i)
+    assert renewed == [(0, 2), (0, 6)]
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (
+            [np.zeros((60, 80, 3), np.uint8)],
+            r"images: camera 0 must deliver the shape \(120, 160, 3\); got \(60, 80, 3\)",
+        ),
+        (
+            [np.zeros((120, 160), np.uint8)],
+            r"images: camera 0 must deliver the shape \(120, 160, 3\); got \(120, 160\)",
+        ),
+        ([None, None], "images: expected one for each of 1 cameras; got 2"),
+    ],
+)
+def test_images_that_do_not_fit_are_named(scene, images, message):
+    with pytest.raises(ValueError, match=message):
+        session.PeopleSession(scene).process(images, 0.0)
 
 
 @pytest.mark.system

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.synthetic.room import room_image
 from jaxfilters.models.synthetic.walkers import Walker
 from jaxfilters.trackers.people.demo_room import CLOTHES, SIZES_M, demo_room
-from jaxfilters.trackers.people.state import FREE, TRACKED, CameraFrame, PeopleConfig
+from jaxfilters.trackers.people.state import DORMANT, FREE, TRACKED, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
 
 SLOTS = 2
@@ -59,13 +60,14 @@ def test_who_walks_in_is_found_confirmed_and_followed(room, followed):
     who = first.identity[np.argmin(np.linalg.norm(first.xy - room.routes.xy[25, 0], axis=-1))]
     errors = []
     for i in range(25, FRAMES):
-        report = followed[i][1]
+        people, report = followed[i]
         (slot,) = np.flatnonzero((report.mode == TRACKED) & (report.identity == who))
         errors.append(np.linalg.norm(report.xy[slot] - room.routes.xy[i, 0]))
     assert max(errors) < 0.5
     assert np.mean(errors) < 0.4
     assert report.height[slot] == pytest.approx(SIZES_M[0][0], abs=0.15)
-    assert 0 < report.sd_lateral[slot] < report.sd_radial[slot] < 0.5
+    variances = np.linalg.eigvalsh(people.belief.covariance[slot, :2, :2])
+    assert 0 < np.sqrt(variances[0]) < report.sd_radial[slot] < 0.5
 
 
 @pytest.mark.system
@@ -97,19 +99,21 @@ def test_nobody_stays_nobody(scene, frames):
 
 
 @pytest.mark.system
-def test_without_a_camera_people_go_on_as_they_went_and_are_less_certain(scene, frames, followed):
+@pytest.mark.parametrize("dt", [0.1, 2.0])
+def test_without_a_camera_people_go_on_as_they_went_and_are_less_certain(scene, frames, followed, dt):
     """What the image of an absent camera holds does not matter."""
     people, _ = followed[-1]
     absent = (frames[-1][0]._replace(present=np.bool_(False)),)
-    after, report = step(scene, people, absent, DT)
-    moved = people.belief.mean[:, :2] + 0.1 * people.belief.mean[:, 2:4]
+    after, report = step(scene, people, absent, np.float32(dt))
+    moved = people.belief.mean[:, :2] + dt * people.belief.mean[:, 2:4]
     np.testing.assert_allclose(after.belief.mean[:, :2], moved, rtol=1e-6)
+    np.testing.assert_allclose(after.unseen_s - people.unseen_s, dt, rtol=1e-6)
     assert np.all(np.diagonal(after.belief.covariance, axis1=1, axis2=2)[:, :2] > 0)
     assert np.all(after.belief.covariance[:, 0, 0] > people.belief.covariance[:, 0, 0])
     np.testing.assert_array_equal(after.identity, people.identity)
     np.testing.assert_array_equal(after.log_odds, people.log_odds)
     black = (absent[0]._replace(foreground=np.zeros_like(absent[0].foreground)),)
-    same, _ = step(scene, people, black, DT)
+    same, _ = step(scene, people, black, np.float32(dt))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True))
     assert np.isfinite(report.nis).all()
 
@@ -120,6 +124,33 @@ def test_whoever_is_unseen_for_long_is_no_longer_followed(scene, frames, followe
     for _ in range(4):
         people, report = step(scene, people, absent, np.float32(1.0))
     assert not np.any(report.mode == TRACKED)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("gap_s", "mode"), [(2.5, TRACKED), (3.5, DORMANT)])
+def test_people_who_stand_are_lost_by_a_gap_that_is_longer_than_hidden_people_are_believed_in(
+    scene, frames, followed, gap_s, mode
+):
+    """The image at the end of the gap shows them at their places."""
+    people = followed[-1][0]
+    standing = Gaussian(people.belief.mean.at[:, 2:4].set(0.0), people.belief.covariance)
+    _, report = step(scene, people._replace(belief=standing), frames[-1], np.float32(gap_s))
+    assert np.all(report.mode == mode)
+
+
+@pytest.mark.system
+def test_after_an_hour_without_images_everybody_is_somebody_else(scene, frames, followed):
+    """Nobody is taken for a person of before the hour, though the image shows both at the same places."""
+    people, report = followed[-1]
+    before = set(report.identity.tolist())
+    people, report = step(scene, people, frames[-1], np.float32(3600.0))
+    assert not np.any(report.mode == TRACKED)
+    assert np.all(report.identity == -1)
+    for _ in range(12):
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((people, report)))
+        people, report = step(scene, people, frames[-1], DT)
+    assert np.all(report.mode == TRACKED)
+    assert min(report.identity) > max(before)
 
 
 @pytest.mark.system
