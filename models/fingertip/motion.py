@@ -39,17 +39,8 @@ def velocity_driven(dt: float | Float[Array, ""] = 1.0) -> Motion:
 
     Oka and Sato 2006, equations 4 and 5.
     """
-    return Motion(_constant_velocity(dt), jnp.asarray(np.eye(STATE, 2, -2), dtype=float))
-
-
-def acceleration_driven(dt: float | Float[Array, ""] = 1.0) -> Motion:
-    """White acceleration, constant within a frame: G = (dt^2 / 2, dt)."""
-    dt = jnp.asarray(dt, dtype=float)
-    return Motion(_constant_velocity(dt), jnp.concatenate([0.5 * dt * dt * jnp.eye(2), dt * jnp.eye(2)]))
-
-
-def _constant_velocity(dt):
-    return constant_velocity(0.0, dims=2).discretize(dt).F
+    F = constant_velocity(0.0, dims=2).discretize(dt).F
+    return Motion(F, jnp.asarray(np.eye(STATE, 2, -2), dtype=float))
 
 
 def new_belief(

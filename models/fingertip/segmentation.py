@@ -1,4 +1,4 @@
-"""Hand masks from grey images in which skin is brightest, from depth, and from what differs from a background."""
+"""Hand masks from grey images in which skin is brightest, and from depth."""
 
 import cv2
 import numpy as np
@@ -50,22 +50,6 @@ def smoothed(image: np.ndarray) -> UInt8[np.ndarray, "rows cols"]:
         got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"image must be a uint8 array (rows, cols) with pixels; got {got}.")
     return cv2.GaussianBlur(image, (0, 0), SMOOTHING)
-
-
-def foreground_mask(probability: np.ndarray, *, least: float = 0.5) -> Bool[np.ndarray, "rows cols"]:
-    """Where a background model sees something before it, without specks and with small gaps closed.
-
-    Args:
-        probability: (rows, cols) of foreground, from 0 to 1, as the background models of the trackers give it.
-        least: Probability from which on a pixel counts.
-
-    Raises:
-        ValueError: a probability that is not (rows, cols) of floats.
-    """
-    check_floats("probability", probability)
-    square = np.ones((3, 3), np.uint8)
-    opened = cv2.morphologyEx((probability >= least).astype(np.uint8), cv2.MORPH_OPEN, square)
-    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, square).view(bool)
 
 
 def fit_desk(depth: np.ndarray) -> Float[np.ndarray, "rows cols"]:

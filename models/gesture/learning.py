@@ -32,6 +32,21 @@ NUM_FOLDS, FEWEST_SCORES = 3, 20
 """Parts of the strokes that are left out in turn to calibrate, and recognised strokes that this takes."""
 
 
+class Settings(NamedTuple):
+    """How models of strokes are fitted; `None` is what suits the kind and the number of strokes."""
+
+    num_states: int | None = None
+    """States of each model."""
+    num_variants: int | None = None
+    """Of each symbol; `None` is `num_variants_of(labels)`, and at most `MOST_VARIANTS_APART` of models that are trained
+    discriminatively."""
+    min_variance: float | None = None
+    """Floor of the variances of features."""
+
+
+USUAL = Settings()
+
+
 class LeftOut(NamedTuple):
     """Strokes of one person by models that were fitted to those of the others."""
 
@@ -62,14 +77,7 @@ def num_variants_of(labels: Sequence[str]) -> int:
     return int(np.clip(np.median(counts) // EXAMPLES_PER_VARIANT, 1, MOST_VARIANTS))
 
 
-def learn_strokes(
-    strokes: Sequence[Drawn],
-    labels: Sequence[str],
-    *,
-    num_states: int | None = None,
-    num_variants: int | None = None,
-    min_variance: float | None = None,
-) -> Symbols:
+def learn_strokes(strokes: Sequence[Drawn], labels: Sequence[str], settings: Settings = USUAL) -> Symbols:
     """Models of strokes of any kind, by `coded.learn_paths` where they are paths of fingertips.
 
     Others are fitted by `symbols.learn` and, where there are many, trained discriminatively by
@@ -78,15 +86,13 @@ def learn_strokes(
     Args:
         strokes: In two dimensions or in three.
         labels: The symbol of each.
-        num_states: States of each model; `None` is as many as suit the kind of strokes.
-        num_variants: Of each symbol; `None` is `num_variants_of(labels)`, and at most
-            `MOST_VARIANTS_APART` of models that are trained discriminatively.
-        min_variance: Floor of the variances of features; `None` is what suits the kind of strokes.
+        settings: States, variants and floor of variances.
 
     Raises:
         ValueError: If there is no stroke, `labels` has another length, or a stroke has no sample or one that is not
             finite.
     """
+    num_states, num_variants, min_variance = settings
     if is_path(strokes):
         paths = [(np.asarray(pieces[0]), np.full(len(pieces[0]), fingers, int)) for pieces, fingers in strokes]
         return learn_paths(
@@ -125,8 +131,7 @@ def leave_one_out(
     *,
     most: int | None = None,
     left_out: Sequence[str] | None = None,
-    num_states: int | None = None,
-    num_variants: int | None = None,
+    settings: Settings = USUAL,
 ) -> list[LeftOut]:
     """Each person in turn, recognised from the strokes of all the others.
 
@@ -136,8 +141,7 @@ def leave_one_out(
         people: Who drew each.
         most: Examples of a symbol that are used of one person, drawn at random but always the same; `None` is all.
         left_out: Who is left out; `None` is everybody.
-        num_states: As of `learn_strokes`.
-        num_variants: As of `learn_strokes`.
+        settings: As of `learn_strokes`.
 
     Raises:
         ValueError: If there are fewer than two people.
@@ -149,7 +153,7 @@ def leave_one_out(
     found = []
     for person in everybody if left_out is None else left_out:
         shown = shown_of_others(named, drawn_by, person, most)
-        scores = _scores(strokes, named, shown, np.flatnonzero(drawn_by == person), num_states, num_variants)
+        scores = _scores(strokes, named, shown, np.flatnonzero(drawn_by == person), settings)
         found.append(LeftOut(person, scores))
     return found
 
@@ -177,9 +181,7 @@ def cross_calibrated(
     strokes: Sequence[Drawn],
     labels: Sequence[str],
     people: Sequence[str],
-    *,
-    num_states: int | None = None,
-    num_variants: int | None = None,
+    settings: Settings = USUAL,
 ) -> Symbols:
     """`calibrated` by `cross_scores` of the strokes that the symbols were fitted to; as they are if these are too few.
 
@@ -187,17 +189,11 @@ def cross_calibrated(
     """
     if len(strokes) < FEWEST_SCORES:
         return symbols
-    found = cross_scores(strokes, labels, people, num_states=num_states, num_variants=num_variants)
-    return calibrated(symbols, found)
+    return calibrated(symbols, cross_scores(strokes, labels, people, settings))
 
 
 def cross_scores(
-    strokes: Sequence[Drawn],
-    labels: Sequence[str],
-    people: Sequence[str],
-    *,
-    num_states: int | None = None,
-    num_variants: int | None = None,
+    strokes: Sequence[Drawn], labels: Sequence[str], people: Sequence[str], settings: Settings = USUAL
 ) -> Scores:
     """All strokes by models of others, in `NUM_FOLDS` parts: of people where there are two or more, else of strokes.
 
@@ -211,7 +207,7 @@ def cross_scores(
             parts[named == name] = np.arange(np.sum(named == name))
     fold = parts % min(NUM_FOLDS, parts.max() + 1)
     scores = [
-        _scores(strokes, named, np.flatnonzero(fold != i), np.flatnonzero(fold == i), num_states, num_variants)
+        _scores(strokes, named, np.flatnonzero(fold != i), np.flatnonzero(fold == i), settings)
         for i in np.unique(fold)
         if np.any(fold != i)
     ]
@@ -264,13 +260,11 @@ def _scores(
     labels: np.ndarray,
     shown: np.ndarray,
     own: np.ndarray,
-    num_states: int | None,
-    num_variants: int | None,
+    settings: Settings,
 ) -> Scores:
     """Of the strokes `own` by models of the strokes `shown`; a symbol that is not among these has `-inf`."""
     dimensions = next(np.shape(piece)[1] for pieces, _ in strokes for piece in pieces)
-    training = [strokes[i] for i in shown]
-    symbols = learn_strokes(training, labels[shown].tolist(), num_states=num_states, num_variants=num_variants)
+    symbols = learn_strokes([strokes[i] for i in shown], labels[shown].tolist(), settings)
     found = recognise_all(symbols, to_judge([strokes[i] for i in own], dimensions))
     everything = np.unique(labels)
     log_likelihood = np.full((len(everything), len(own)), -np.inf)

@@ -116,6 +116,13 @@ def pose_features(template: PoseTemplate, points: Float[np.ndarray, "t j d"]) ->
     return np.concatenate(flat, axis=1).astype(np.float32)
 
 
+def num_features(template: PoseTemplate) -> int:
+    """Of `pose_features` of a frame."""
+    num_points, d = template.shape.shape
+    # Places, speeds of points, velocity of the body in two frames, rotation.
+    return num_points * d + len(template.moving) * d + 2 * d + d * d
+
+
 def resampled(
     points: Float[np.ndarray, "t j d"], rate_hz: float, speed: float = 1.0
 ) -> tuple[Float[np.ndarray, "n j d"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

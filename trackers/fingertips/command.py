@@ -31,7 +31,7 @@ from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
-from jaxfilters.trackers.io.video_input import FrameSet
+from jaxfilters.trackers.io.video_input import FrameSet, is_live
 
 
 def track(options: argparse.Namespace) -> str:
@@ -76,7 +76,7 @@ def track(options: argparse.Namespace) -> str:
             *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
             *(TIP_TABLE, _identity(source, run_config, options), total),
         )
-        with closing(StreamRun(options, spec)) as run:
+        with closing(StreamRun(_limited(source, options), spec)) as run:
             return _tracked(source, user, session, stream, run, run_config, options)
 
 
@@ -147,14 +147,20 @@ def _identity(source: Any, config: RunConfig, options: argparse.Namespace) -> di
 
 
 def _moments(source: Any, seconds: float | None) -> Iterator[FrameSet]:
-    """Those with an image; a live camera may have none when the time is over."""
+    """Those with an image; a live camera may have none when the time is over. Its clock began some time before."""
     first = None
     for time_s, image in source.images():
         first = time_s if first is None else first
         if image is not None:
-            yield FrameSet(time_s - first, (image,))
+            yield FrameSet(time_s - first if is_live(source) else time_s, (image,))
         if seconds and time_s - first >= seconds:
             return
+
+
+def _limited(source: Any, options: argparse.Namespace) -> argparse.Namespace:
+    """The options with `seconds` on the clock of the source, whose first frame need not be at 0."""
+    seconds = options.seconds and getattr(source, "began_s", 0.0) + options.seconds
+    return argparse.Namespace(**vars(options) | {"seconds": seconds})
 
 
 def _report(

@@ -11,12 +11,15 @@ import numpy as np
 
 from jaxfilters.models.gesture.codes import STILL
 from jaxfilters.trackers.fingertips.events import SYMBOL, Event, HandFrame, Recogniser, Stroke
-from jaxfilters.trackers.fingertips.state import SYMBOLIC
+from jaxfilters.trackers.fingertips.state import SYMBOLIC, rescaled
 
 
 @dataclass(frozen=True)
 class DrawingConfig:
-    """Constants; pixels are those of a 640x480 image."""
+    """Constants; pixels are those of a 640x480 image, frames last 1/30 s. `scaled` converts both.
+
+    All numbers of frames are durations: how long a hand moves or rests does not depend on the camera.
+    """
 
     resting_frames: int = 12
     """A rest that ends a stroke; shorter ones are corners."""
@@ -29,6 +32,12 @@ class DrawingConfig:
     between the two for half as long."""
     most_frames: int = 600
     """After which a stroke is ended, so that none goes on for ever."""
+
+
+def scaled(config: DrawingConfig, *, height: float, fps: float) -> DrawingConfig:
+    """The same for images of another height in pixels, and another number of frames a second."""
+    durations = ("resting_frames", "least_frames", "folding_frames", "most_frames")
+    return rescaled(config, pixels=("least_size",), durations=durations, height=height, fps=fps)
 
 
 class Drawing(NamedTuple):
@@ -94,7 +103,8 @@ def finished(config: DrawingConfig, state: Drawing) -> Stroke | None:
 
 def _unfolded(config: DrawingConfig, moving: np.ndarray) -> np.ndarray:
     """The frames that move, without a short movement at their beginning after which the finger rests."""
-    pauses = np.flatnonzero(np.diff(moving) > config.folding_frames // 2)
+    # Neighbouring frames are no pause, however long a frame is.
+    pauses = np.flatnonzero(np.diff(moving) > max(config.folding_frames // 2, 1))
     if not len(pauses) or moving[pauses[0]] - moving[0] >= config.folding_frames:
         return moving
     return moving[pauses[0] + 1 :]

@@ -14,7 +14,7 @@ from jaxfilters.trackers.fingertips.keypoint_input import HandKeypoints, drawn_k
 from jaxfilters.trackers.fingertips.rgbd_input import RgbdImage, RgbdVideo
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.video_input import LiveCamera, open_video
+from jaxfilters.trackers.io.video_input import DEFAULT_FPS, LiveCamera, open_video, spread
 
 DEMO_FPS, DEMO_SHAPE = 30.0, (480, 640)
 
@@ -50,16 +50,16 @@ class DepthVideo:
     """A depth recording as a source of images, which are metres."""
 
     def __init__(self, path: str, fps: float | None):
-        self._depth = open_depth(path, fps=fps or DEMO_FPS)
+        self._depth = open_depth(path, fps=fps)
         steps = np.diff(self._depth.times_s)
         self.name, self.frames = self._depth.name, len(self._depth)
-        self.fps = fps or (float(1 / np.median(steps)) if len(steps) else DEMO_FPS)
+        self.fps = float(1 / np.median(steps)) if len(steps) else fps or DEFAULT_FPS
         rows, cols = self._depth[0].shape
         self.image_size = (cols, rows)
 
     def sample(self, most: int) -> list[np.ndarray]:
-        """Every n-th image."""
-        return [self._depth[i] for i in range(0, self.frames, max(1, self.frames // most))][:most]
+        """At most so many images, spread over the recording."""
+        return [self._depth[i] for i in spread(range(self.frames), most)]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
         """From the first to the last."""
@@ -124,6 +124,8 @@ def open_hands(
     if place is None:
         if mask != "infrared":
             raise InputError(f"--mask {mask}: of no use without a video; the synthetic hand is an infrared image.")
+        if fps is not None:
+            raise InputError("--fps: of no use without a recording; the synthetic hand has its own.")
         return DemoHand(seed)
     if mask == "depth":
         if place.isdecimal():

@@ -1,7 +1,6 @@
 """Hands as a detector's keypoints instead of images: what `track fingertips --keypoints` reads."""
 
 from collections.abc import Iterator
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,12 +20,11 @@ from jaxfilters.models.fingertip.keypoints import (
     thumb_side,
 )
 from jaxfilters.models.fingertip.observation import HandObservation
+from jaxfilters.trackers.articulated.recording import looks_normalized
 from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.keypoints import looks_normalized, read_hands
-from jaxfilters.trackers.io.video_input import LiveCamera, VideoSource, open_video
+from jaxfilters.trackers.io.keypoints import read_hands
+from jaxfilters.trackers.io.video_input import DEFAULT_FPS, LiveCamera, VideoSource, open_video, spread
 
-FPS = 30.0
-"""Frames per second where neither the recording nor the user says."""
 _THUMB, _INDEX = 0, 1
 _BONE, _BACKGROUND = (150, 150, 150), 40
 
@@ -42,10 +40,21 @@ class HandKeypoints(NamedTuple):
 
 
 class KeypointSource:
-    """A recording of keypoints as a source of frames, over a video's images where there is one."""
+    """A recording of keypoints as a source of frames, over a video's images where there is one.
+
+    A frame lies over the image with its number, both counted from 0. Its time is that of the file, which need not begin
+    at 0.
+    """
 
     def __init__(self, path: Path, video: VideoSource | None, fps: float | None, image_size: tuple[int, int] | None):
         """Read the keypoints.
+
+        Args:
+            path: Of the file or folder.
+            video: What the keypoints were detected in.
+            fps: Frames per second, in place of the times that the file has; `None` is these, and for frames without
+                times the rate of the video, or else 30.
+            image_size: Columns and rows of the images, where there is no video.
 
         Raises:
             InputError: keypoints that cannot be used, a live camera, or an image of unknown size.
@@ -54,42 +63,47 @@ class KeypointSource:
             raise InputError(f"{path}: no such file or folder.")
         if isinstance(video, LiveCamera):
             raise InputError(f"--keypoints {path}: of a recording only, not of a live camera.")
-        found = read_hands(path, fps or (video.fps if video else FPS))
+        found = read_hands(path, fps or (video.fps if video else DEFAULT_FPS))
         size = video.image_size if video else image_size
         if size is None:
             raise InputError(f"--keypoints {path}: give the video, or the size of its images with --image-size.")
-        self.name, self.image_size, self.frames, self._video = str(path), size, len(found.times_s), video
+        self.name, self.image_size, self.frames, self._video = str(path), size, len(found.frames), video
         scale = np.asarray(size, float) if looks_normalized(found.points) else np.ones(2)
         self._points, self._confidence = found.points * scale, found.confidence
-        self._times_s = found.times_s - found.times_s[0]
+        self._numbers, self._times_s = found.frames, found.frames / fps if fps else found.times_s
+        self.began_s = float(self._times_s[0])
         steps = np.diff(self._times_s)
         if len(steps) and not (np.isfinite(steps).all() and steps.min() > 0):
             raise InputError(f"{path}: times must increase from frame to frame.")
-        self.fps = float(1 / np.median(steps)) if len(steps) else FPS
-        self._images = 0
+        self.fps = float(1 / np.median(steps)) if len(steps) else fps or DEFAULT_FPS
+        self._length: int | None = None
 
     def sample(self, most: int) -> list[HandKeypoints]:
-        """Frames spread over the recording, without the video's images."""
-        every = max(1, self.frames // most)
+        """At most so many frames, spread over the recording, without the video's images."""
         blank = self._blank()
-        return [self._frame(i, blank) for i in range(0, self.frames, every)]
+        return [self._frame(i, blank) for i in spread(range(self.frames), most)]
 
     def images(self) -> Iterator[tuple[float, HandKeypoints]]:
         """From the first to the last."""
-        blank = self._blank()
+        blank, picture, done = self._blank(), None, 0
         pictures = self._video.images() if self._video else iter(())
-        for i, (time_s, picture) in enumerate(zip_longest(self._times_s, pictures)):
-            self._images += picture is not None
-            image = None if picture is None else picture[1]
-            if time_s is not None:
-                yield float(time_s), self._frame(i, blank if image is None else image)
+        for i, (time_s, number) in enumerate(zip(self._times_s, self._numbers, strict=True)):
+            while done <= number and (following := next(pictures, None)) is not None:
+                done, picture = done + 1, following[1]
+            yield float(time_s), self._frame(i, picture if picture is not None and done == number + 1 else blank)
+        self._length = done + sum(1 for _ in pictures)
 
     def trouble(self) -> str | None:
-        """What went wrong with the video, or that it is of another length."""
+        """What went wrong with the video, or that it was read to its end and is of another length."""
         if self._video is None:
             return None
-        other = f"{self._video.name}: {self._images} images beside {self.frames} frames of keypoints"
-        return self._video.trouble() or (other if self._images not in (0, self.frames) else None)
+        if (trouble := self._video.trouble()) or self._length is None:
+            return trouble
+        first, last = int(self._numbers[0]), int(self._numbers[-1])
+        # Keypoints of every n-th image end up to n - 1 images before the video.
+        step = int(np.diff(self._numbers).min(initial=last + 1))
+        other = f"{self._video.name}: {self._length} images beside frames {first} to {last} of keypoints"
+        return None if last < self._length <= last + step else other
 
     def _frame(self, i: int, picture: np.ndarray) -> HandKeypoints:
         return HandKeypoints(self._points[i], self._confidence[i], picture)

@@ -33,7 +33,8 @@ def carried(config: FingertipConfig, state: HandState, observed: HandObservation
     """Predictions of fingers that go where their palm goes, more or less; a palm that jumps is a mistake."""
     moved = observed.palm - state.palm
     velocity = moved / config.frame
-    variance = (config.carried_sd / config.measurement_sd) ** 2 + config.drive
+    # More frames in the same time say no more of how a finger moves beside its palm.
+    variance = (config.carried_sd / config.measurement_sd) ** 2 / config.frame + config.drive
     visible = observed.is_hand & (state.unseen == 0) & (jnp.sum(moved * moved) < config.gate**2)
     hint = jax.vmap(motion.correct_velocity, in_axes=(0, None, None, None))
     return hint(state.tracks.belief, jnp.where(visible, velocity, 0.0), variance, visible)

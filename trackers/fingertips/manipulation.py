@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfilters.trackers.fingertips.events import MOVE, PINCH, RESIZE, ROTATE, Event, HandFrame
-from jaxfilters.trackers.fingertips.state import ABSENT, MANIPULATION
+from jaxfilters.trackers.fingertips.state import ABSENT, MANIPULATION, rescaled
 
 
 @dataclass(frozen=True)
 class HandlingConfig:
-    """Constants; pixels are those of a 640x480 image."""
+    """Constants; pixels are those of a 640x480 image, frames last 1/30 s. `scaled` converts both."""
 
     closed: float = 38.0
     """Thumb and forefinger nearer than this are a pinch, pixels."""
@@ -31,8 +31,15 @@ class HandlingConfig:
     resting: float = 0.3
     """Share of these within which a quantity rests."""
     resting_frames: int = 15
+    """For which a quantity rests that has ended."""
     unseen_frames: int = 60
     """A pinch hides the thumb for so long at most: closed fingers have one outline, and one tip or none."""
+
+
+def scaled(config: HandlingConfig, *, height: float, fps: float) -> HandlingConfig:
+    """The same for images of another height in pixels, and another number of frames a second."""
+    pixels, durations = ("closed", "opened", "moved"), ("resting_frames", "unseen_frames")
+    return rescaled(config, pixels=pixels, durations=durations, height=height, fps=fps)
 
 
 class Activity(NamedTuple):

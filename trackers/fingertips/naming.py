@@ -11,7 +11,7 @@ from jaxfilters.models.fingertip.thumb import base_angle
 from jaxfilters.trackers.fingertips.state import CONFIRMED, Fingers, FingertipConfig, HandState, Tracks
 
 UPDATE_SHARE = 0.02
-"""Of what a frame shows in the place that belongs to a name: a hand changes its posture slowly."""
+"""Of what a frame of 1/30 s shows in the place that belongs to a name: a hand changes its posture slowly."""
 MOST, KEPT = 16.0, 8.0
 """Squared deviations of a fingertip from the place of a name that count at most, and what another name costs beside."""
 _GATE = 1000.0
@@ -67,7 +67,7 @@ def by_place(
     named = jnp.zeros_like(found).at[order].set(found)
     identity = jnp.where(jnp.any(ready), jnp.where(there, named, -1), tracks.identity).astype(jnp.int32)
     shows = (identity[:, None] == names) & (there & (tracks.missed == 0) & observed.is_hand)[:, None]
-    share = UPDATE_SHARE * shows
+    share = min(UPDATE_SHARE * config.frame, 1.0) * shows
     turn, longer = _turn(angle[:, None], fingers.angle), length[:, None] - fingers.length
     return identity, Fingers(
         fingers.angle + jnp.sum(share * turn, axis=0), fingers.length + jnp.sum(share * longer, axis=0)

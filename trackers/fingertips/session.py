@@ -1,6 +1,5 @@
 """Observations of hands in, fingertips and what they do out, in pieces of any length; a stream that never stops."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.fingertip.thumb import ThumbAngles
 from jaxfilters.models.gesture import codes
+from jaxfilters.trackers.fingertips import drawing, manipulation
 from jaxfilters.trackers.fingertips.drawing import (
     NOTHING_DRAWN,
     Drawing,
@@ -68,13 +68,9 @@ class FingertipSession:
         self._angles, self._method, self._recogniser = angles, method, recogniser
         self._sides = jnp.asarray(handedness * np.array([1.0, -1.0] * num_hands, np.float32)[:num_hands], float)
         self._state = start_hands(self.config, angles, num_hands, method=method)
-        zoom, slow = height / 480.0, 30.0 / fps
-        self._still = STILL_PX * zoom * slow
-        usual = HandlingConfig()
-        self._handling_config = replace(
-            usual, closed=zoom * usual.closed, opened=zoom * usual.opened, moved=zoom * usual.moved
-        )
-        self._drawing_config = replace(DrawingConfig(), least_size=zoom * DrawingConfig().least_size)
+        self._still = STILL_PX * (height / 480.0) * (30.0 / fps)
+        self._handling_config = manipulation.scaled(HandlingConfig(), height=height, fps=fps)
+        self._drawing_config = drawing.scaled(DrawingConfig(), height=height, fps=fps)
         self._handling: list[Handling] = [IDLE] * num_hands
         self._drawing: list[Drawing] = [NOTHING_DRAWN] * num_hands
         self._last: list[tuple[np.ndarray, np.ndarray]] | None = None

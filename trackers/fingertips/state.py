@@ -1,9 +1,9 @@
 """The options of the fingertip tracker, its state between two frames, and its report of each tip."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,11 @@ NEVER = 10**6
 
 @dataclass(frozen=True)
 class FingertipConfig:
-    """Constants of the tracker; Python values that are read when it is compiled. Pixels are those of a 640x480 image.
+    """Constants of the tracker; Python values that are read when it is compiled.
+
+    Pixels are those of a 640x480 image, and durations are in frames of 1/30 s; `scaled` converts both. Numbers of
+    detections are not converted: errors of detection differ from image to image, so that it takes as many images to
+    confirm something at any frame rate.
 
     The defaults are for the modern method; `tracker.PUBLISHED_CONFIG` has the published ones.
 
@@ -46,11 +50,11 @@ class FingertipConfig:
     """Of a finger that was observed once, pixels a frame."""
     lost: float = 75.0
     """Uncertainty U of a prediction from which on a finger is gone (theta): after six misses while the palm is visible;
-    of predictions without the palm, 300 is after four."""
+    of predictions without the palm, 300 is after four. Greater in frames longer than 1/30 s, as the gates are wider."""
     min_hits: int = 3
-    """Detections in a row that make a fingertip."""
+    """Detections in a row that make a fingertip; a number of images at any frame rate."""
     gate: float = 40.0
-    """Farthest from its prediction that a fingertip is looked for, pixels."""
+    """Farthest from its prediction that a fingertip is looked for, pixels; farther in frames longer than 1/30 s."""
     tentative_gate: float = 80.0
     """The same of what was observed once or twice."""
     surprise: float = 13.8
@@ -58,19 +62,19 @@ class FingertipConfig:
     apart: float = 16.0
     """Nearer to a fingertip than this, pixels, nothing new begins."""
     carried_sd: float = 4.0
-    """Of a fingertip's velocity beside the palm's, pixels a frame."""
+    """Of a fingertip's velocity beside the palm's, mean over a frame of 1/30 s, pixels a frame."""
     disorder: float = 4.0
     """Cost of the best matching in order, by that of the best in any, from which on the order is in doubt."""
     disordered_frames: int = 3
-    """Frames of doubt after which fingers are matched in any order."""
+    """Frames of doubt after which fingers are matched in any order; a number of images at any frame rate."""
     empty_frames: int = 15
-    """Frames without a tip after which the hand is forgotten."""
+    """Frames of 1/30 s without a tip after which the hand is forgotten."""
     angle_sd: float = math.radians(10.0)
     """Of the direction of a fingertip from the palm, around that of its name, radians."""
     length_sd: float = 0.5
     """Of its distance from the palm, palm radii."""
     axis_frames: int = 10
-    """Frames for which the arm's last axis stands in for one that is not visible."""
+    """Frames of 1/30 s for which the arm's last axis stands in for one that is not visible."""
     posture: Posture = POSTURE
 
     def __post_init__(self) -> None:
@@ -90,11 +94,40 @@ class FingertipConfig:
         return self.frame * (self.drive_sd / self.measurement_sd) ** 2
 
 
+Config = TypeVar("Config")
+
+
+def rescaled(config: Config, *, pixels: Sequence[str], durations: Sequence[str], height: float, fps: float) -> Config:
+    """A dataclass of constants for images of another height in pixels, and another number of frames a second.
+
+    Args:
+        config: Constants for images of 480 rows and 30 frames a second.
+        pixels: Names of its lengths.
+        durations: Names of its numbers of frames that are durations; they stay whole, and at least one frame.
+        height: Rows of the images.
+        fps: Frames a second.
+    """
+    lengths = {name: getattr(config, name) * height / 480.0 for name in pixels}
+    # Counters of frames stop at `NEVER`.
+    frames = {name: max(round(min(getattr(config, name) * fps / 30.0, NEVER - 1)), 1) for name in durations}
+    return replace(config, **lengths, **frames)  # type: ignore[type-var]
+
+
 def scaled(config: FingertipConfig, *, height: float = 480.0, fps: float = 30.0) -> FingertipConfig:
     """The same for images of another height in pixels, and another number of frames a second."""
     in_pixels = ("measurement_sd", "drive_sd", "max_speed", "gate", "tentative_gate", "apart", "carried_sd")
+    found = rescaled(config, pixels=in_pixels, durations=("empty_frames", "axis_frames"), height=height, fps=fps)
+    longer = 30.0 / fps
+    # In a longer frame a finger gets farther from its prediction; the errors of detection stay in a shorter one.
+    wider = max(1.0, longer)
+    posture = config.posture
     return replace(
-        config, frame=config.frame * 30.0 / fps, **{name: getattr(config, name) * height / 480.0 for name in in_pixels}
+        found,
+        frame=config.frame * longer,
+        gate=wider * found.gate,
+        tentative_gate=wider * found.tentative_gate,
+        lost=wider**2 * config.lost,
+        posture=posture._replace(correlation=posture.correlation**longer, exchange=min(longer * posture.exchange, 0.5)),
     )
 
 
@@ -195,7 +228,7 @@ class Method(NamedTuple):
     hint: Callable[..., Gaussian]
     """`(config, state, observed) -> beliefs`, with what else than tips tells where fingers are in this frame."""
     side: Callable[..., tuple[Array, Array]]
-    """`(state, observed, side) -> (turned, side_odds)`: whether the thumb is on the side other than `side`."""
+    """`(config, state, observed, side) -> (turned, side_odds)`: whether the thumb is on the side other than `side`."""
     associate: Callable[..., tuple[Array, Array]]
     """`(config, state, beliefs, observed) -> (tip of every slot or -1, whether the order was in doubt)`."""
     may_begin: Callable[..., Array]

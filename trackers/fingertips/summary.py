@@ -30,7 +30,7 @@ def draw_summary(
     Args:
         track: Rows of all fingertips.
         frames: Number of frames, with fingertips or without.
-        seconds: Time of the last frame.
+        seconds: From the first frame to the last.
         events: What began and ended.
         image_size: Columns and rows of the images, pixels.
     """
@@ -69,7 +69,7 @@ def write_summary(
     Raises:
         OutputError: the image cannot be written.
     """
-    if not cv2.imwrite(str(path), draw_summary(track, tally.frames, tally.time_s, events, image_size)):
+    if not cv2.imwrite(str(path), draw_summary(track, tally.frames, tally.last_s - tally.first_s, events, image_size)):
         raise OutputError(f"cannot write {path} (is the disk full?).")
 
 
@@ -128,7 +128,7 @@ def _shades(events: Sequence[Event], times_s: np.ndarray) -> list[Shade]:
             places = np.clip([event.quantities["first_frame"], event.quantities["last_frame"]], 0, len(times_s) - 1)
             shades.append(Shade(float(times_s[places[0]]), float(times_s[places[1]]), _DRAWN))
         elif event.phase == "begin":
-            began[event.hand, event.name] = event.time_s
+            began[event.hand, event.name] = float(times_s[event.frame])
         elif (event.hand, event.name) in began:
-            shades.append(Shade(began.pop((event.hand, event.name)), event.time_s, _HANDLED))
+            shades.append(Shade(began.pop((event.hand, event.name)), float(times_s[event.frame]), _HANDLED))
     return shades

@@ -15,8 +15,9 @@ class Tally(NamedTuple):
     """What was counted so far."""
 
     frames: int = 0
-    time_s: float = 0.0
-    """Of the last frame, seconds."""
+    first_s: float = 0.0
+    """Time of the first frame, seconds."""
+    last_s: float = 0.0
     frames_by_fingertip: dict[str, int] = {}  # noqa: RUF012 - never changed in place
     frames_by_count: dict[str, int] = {}  # noqa: RUF012
     num_errors: int = 0
@@ -34,6 +35,7 @@ class Tally(NamedTuple):
         errors = _errors(report, truth)
         return Tally(
             self.frames + 1,
+            self.first_s if self.frames else time_s,
             time_s,
             dict(names),
             dict(Counter(self.frames_by_count) + Counter({str(count): 1})),

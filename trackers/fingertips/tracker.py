@@ -201,7 +201,7 @@ def _sided(
     method: Method,
 ) -> HandState:
     """With the side of the thumb; where that is another one than before, no finger has a name, nor is one the thumb."""
-    turned, odds = method.side(state, observed, side)
+    turned, odds = method.side(config, state, observed, side)
     new = no_tracks(config, method.thumb.start(config, angles))
     forgotten = state.tracks._replace(identity=new.identity, thumb=new.thumb, is_thumb=new.is_thumb)
     tracks, fingers = jax.tree.map(

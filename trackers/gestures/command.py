@@ -1,7 +1,6 @@
 """`jaxfilters fit gestures` and `jaxfilters recognise`: symbols estimated from strokes, and strokes recognised."""
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from jaxfilters.models.gesture.calibration import calibration_error
 from jaxfilters.models.gesture.coded import codes_of, recognise_each
 from jaxfilters.models.gesture.learning import (
     Evaluated,
-    LeftOut,
+    Settings,
     accuracy,
     calibrated,
     cross_calibrated,
@@ -25,15 +24,16 @@ from jaxfilters.models.gesture.stroke import Drawn, to_judge
 from jaxfilters.models.gesture.symbols import Recognition, extended, recognise_all
 from jaxfilters.models.synthetic.strokes import drawn, tracked
 from jaxfilters.trackers.app.progress import warn
-from jaxfilters.trackers.gestures.options import TRIALS, WRITERS
+from jaxfilters.trackers.gestures.options import SHOWN_SEED, TRIALS, WRITERS
 from jaxfilters.trackers.gestures.streaming import fit_streams, recognise_streams
-from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
+from jaxfilters.trackers.gestures.table import table_lines, write_table
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE, SymbolsFile, read_symbols, write_symbols
 from jaxfilters.trackers.io.strokes import StrokeSet, read_strokes, usable
 
 COLUMNS = ("stroke", "symbol", "confidence", "lead_nats", "label")
 """Of a table: the symbol is empty where a stroke is rejected; the label is what the data call it."""
-_MOST_ROWS, _MOST_WARNINGS = 40, 5
+_MOST_WARNINGS = 5
 _SHOWN_TRIALS = 2
 MARGINS = (-0.4, -0.2, 0.0, 0.2, 0.4)
 """Nats a point, for the table of people left out."""
@@ -52,6 +52,8 @@ def fit_gestures(options: argparse.Namespace) -> str:
         return fit_streams(options)
     if options.held_out == "sequence":
         raise InputError("--held-out sequence goes with --stream.")
+    if options.add and options.states:
+        raise InputError("--states: of no use with --add, where all models have as many states.")
     with jax.enable_x64(True):
         examples, source = _examples(options)
         # The generator draws every shape in one way.
@@ -64,27 +66,18 @@ def fit_gestures(options: argparse.Namespace) -> str:
                 f"--add: {options.add} has models of {_features(before.dimensions)}, DATA are for models of "
                 f"{_features(examples.dimensions)}."
             )
+        # What is added has states and a floor of variances like what is there.
         states = before.symbols.models.log_initial.shape[-1] if before else options.states
-        floor = before.min_variance if before else None
-        trained = as_input_error(
-            lambda: learn_strokes(
-                examples.strokes,
-                examples.labels,
-                num_states=states,
-                num_variants=num_variants,
-                min_variance=floor,
-            )
-        )
+        settings = Settings(states, num_variants, before.min_variance if before else None)
+        drawings = (examples.strokes, examples.labels, examples.people)
+        trained = as_input_error(lambda: learn_strokes(*drawings[:2], settings))
         lines = []
         if options.held_out:
-            found = _held_out(examples, options.states, num_variants)
+            found = as_input_error(lambda: leave_one_out(*drawings, settings=settings))
             trained = as_input_error(lambda: calibrated(trained, together([one.scores for one in found])))
             lines = _of_held_out(evaluated(found))
         elif options.data:
-            drawings = (examples.strokes, examples.labels, examples.people)
-            trained = as_input_error(
-                lambda: cross_calibrated(trained, *drawings, num_states=states, num_variants=num_variants)
-            )
+            trained = as_input_error(lambda: cross_calibrated(trained, *drawings, settings))
         parameters = {"strokes": len(examples.strokes), "people": len(set(examples.people))}
         symbols = as_input_error(lambda: extended(before.symbols, trained)) if before else trained
         source = f"{before.source}; {source}" if before else source
@@ -110,21 +103,14 @@ def recognise(options: argparse.Namespace) -> str:
     file = read_symbols(path)
     if options.data is None and file.dimensions == 3:
         raise InputError(f"{path} is of strokes in space: DATA must hold some.")
-    strokes = _to_recognise(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, options.seed)
-    found = as_input_error(lambda: _evaluated(file, strokes, options.margin))
+    seed = SHOWN_SEED if options.seed is None else options.seed
+    strokes = _to_recognise(options.data) if options.data else _drawn(1, _SHOWN_TRIALS, seed)
+    found = as_input_error(lambda: _evaluated(file, strokes, options.margin or 0.0))
     rows = [_row(file.symbols.names, strokes, found, i) for i in range(len(strokes.strokes))]
     if options.out:
-        _write(options.out, rows)
-    widths = [max(len(row[k]) for row in [COLUMNS, *rows[:_MOST_ROWS]]) for k in range(len(COLUMNS))]
-    lines = [
-        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip()
-        for row in [COLUMNS, *rows[:_MOST_ROWS]]
-    ]
-    if len(rows) > _MOST_ROWS:
-        lines.append(f"... and {len(rows) - _MOST_ROWS} more")
-    return "\n".join(
-        [*lines, _summary(strokes, file.symbols.names, found), *([f"table in {options.out}"] if options.out else [])]
-    )
+        write_table(options.out, COLUMNS, rows)
+    lines = [*table_lines(COLUMNS, rows), _summary(strokes, file.symbols.names, found)]
+    return "\n".join([*lines, *([f"table in {options.out}"] if options.out else [])])
 
 
 def _model(path: Path) -> Path:
@@ -204,23 +190,6 @@ def _summary(strokes: StrokeSet, names: tuple[str, ...], found: Recognition) -> 
     right = (best == labels)[labelled] & np.isfinite(np.asarray(found.lead))[labelled]
     share = f"{100 * right.mean():.2f} % right if none is rejected"
     return f"{summary}; of {labelled.sum()} with a label {share}; {_of_accepted(right, accepted[labelled])}"
-
-
-def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as content:
-            csv.writer(content).writerows([COLUMNS, *rows])
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}.") from None
-
-
-def _held_out(examples: StrokeSet, states: int | None, num_variants: int | None) -> list[LeftOut]:
-    return as_input_error(
-        lambda: leave_one_out(
-            examples.strokes, examples.labels, examples.people, num_states=states, num_variants=num_variants
-        )
-    )
 
 
 def _of_held_out(found: list[Evaluated]) -> list[str]:

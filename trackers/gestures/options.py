@@ -9,6 +9,8 @@ from jaxfilters.trackers.app.argument_types import finite_number, positive_integ
 WRITERS, TRIALS = 6, 30
 """Of the generator, and how often each draws every shape with one finger and with two: what the model that comes with
 the package was made with."""
+SHOWN_SEED = 1
+"""Of the symbols that `recognise` draws where it has no data."""
 _DATA = (
     "strokes: .csv with a row for each point (columns stroke,label,time,x,y and perhaps z, person, fingers), folder "
     "with a folder of such files for each symbol, .npz with points, length, label and perhaps person, or file of "
@@ -52,7 +54,11 @@ def add_fit_gestures(what: Any, seed: Callable[[str], int]) -> None:
         help="to draw each symbol (default: one for 40 examples, at most 20, or 8 if trained by gradient)",
     )
     gestures.add_argument(
-        "--seed", type=seed, default=0, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="SEED",
+        help="of symbols drawn at random, and of the training with --stream (default: %(default)s)",
     )
 
 
@@ -60,7 +66,7 @@ def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
     """Add the command to the parser's `commands`; `seed` reads random seeds."""
     recognise = commands.add_parser("recognise", help="say which symbols strokes are")
     recognise.add_argument(
-        "model", type=Path, metavar="MODEL.npz", help="of `fit gestures`; `default` is the package's"
+        "model", type=Path, metavar="MODEL.npz", help="of `fit gestures`; `default` is the package's, of strokes"
     )
     recognise.add_argument("data", nargs="?", type=Path, metavar="DATA", help=_DATA)
     recognise.add_argument("--out", type=Path, metavar="FILE.csv", help="write a row for each stroke there")
@@ -70,11 +76,10 @@ def add_recognise(commands: Any, seed: Callable[[str], int]) -> None:
     recognise.add_argument(
         "--margin",
         type=finite_number,
-        default=0.0,
         metavar="NATS",
         help="a point by which a symbol has to beat what all of them are made of, beside its own margin, which `fit "
-        "gestures` measures (default: %(default)s)",
+        "gestures` measures (default: 0)",
     )
     recognise.add_argument(
-        "--seed", type=seed, default=1, metavar="SEED", help="of symbols drawn at random (default: %(default)s)"
+        "--seed", type=seed, metavar="SEED", help=f"of symbols drawn at random (default: {SHOWN_SEED})"
     )

@@ -1,8 +1,6 @@
 """`jaxfilters fit gestures --stream` and `recognise --stream`: gestures in streams of points, such as hands' joints."""
 
 import argparse
-import csv
-from pathlib import Path
 
 import jax
 
@@ -17,11 +15,11 @@ from jaxfilters.models.gesture.streams import (
     leave_streams_out,
     spot,
 )
-from jaxfilters.trackers.io.errors import InputError, OutputError, as_input_error
+from jaxfilters.trackers.gestures.table import table_lines, write_table
+from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_streams import StreamSet, read_stream_model, read_streams, write_stream_model
 
 COLUMNS = ("stream", "gesture", "first_frame", "last_frame", "start_s", "end_s", "reported_s", "confidence")
-_MOST_ROWS = 40
 
 
 def fit_streams(options: argparse.Namespace) -> str:
@@ -33,8 +31,9 @@ def fit_streams(options: argparse.Namespace) -> str:
     """
     if options.data is None:
         raise InputError("--stream: expected DATA, a file or folder of streams.")
-    if options.add or options.held_out == "person":
-        raise InputError("--stream: goes with --held-out sequence, and without --add.")
+    _refuse(options, "add", "states", "ways")
+    if options.held_out == "person":
+        raise InputError("--held-out person: of no use with --stream; expected --held-out sequence.")
     data = read_streams(options.data)
     lines = [_of_data(data, options.data.name)]
     if options.held_out:
@@ -53,6 +52,12 @@ def recognise_streams(options: argparse.Namespace) -> str:
     """
     if options.data is None:
         raise InputError("--stream: expected DATA, a file or folder of streams.")
+    _refuse(options, "margin", "seed")
+    if str(options.model) == "default":
+        raise InputError(
+            "default: the package has no model of gestures in streams; make one with "
+            "`jaxfilters fit gestures --stream DATA --out MODEL.npz`, from streams with annotated gestures."
+        )
     model, data = read_stream_model(options.model), read_streams(options.data)
     rows, scores = [], []
     for stream in data.streams:
@@ -63,21 +68,25 @@ def recognise_streams(options: argparse.Namespace) -> str:
             rows.append((stream.name, model.names[label], str(first), str(last), *times, f"{one.confidence:.3f}"))
         if stream.segments:
             scores.append(scored([one.segment for one in found], _in_names_of(model, data, stream)))
-    widths = [max(len(row[k]) for row in [COLUMNS, *rows[:_MOST_ROWS]]) for k in range(len(COLUMNS))]
-    shown = [
-        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip()
-        for row in [COLUMNS, *rows[:_MOST_ROWS]]
-    ]
-    if len(rows) > _MOST_ROWS:
-        shown.append(f"... and {len(rows) - _MOST_ROWS} more")
     summary = [f"{len(rows)} gestures in {len(data.streams)} streams"]
     if scores:
         annotated = [stream for stream in data.streams if stream.segments]
         summary.append(_said(total(scores), _minutes(annotated)))
     if options.out:
-        _write(options.out, rows)
+        write_table(options.out, COLUMNS, rows)
         summary.append(f"table in {options.out}")
-    return "\n".join([*shown, *summary])
+    return "\n".join([*table_lines(COLUMNS, rows), *summary])
+
+
+def _refuse(options: argparse.Namespace, *names: str) -> None:
+    """Refuse options that are for strokes.
+
+    Raises:
+        InputError: one of them is given.
+    """
+    given = [f"--{name}" for name in names if getattr(options, name) is not None]
+    if given:
+        raise InputError(f"{', '.join(given)}: of no use with --stream, only for strokes.")
 
 
 def _of_data(data: StreamSet, source: str) -> str:
@@ -116,12 +125,3 @@ def _latency() -> str:
 
 def _minutes(streams: list[Stream]) -> float:
     return sum(len(stream.points) / stream.rate_hz for stream in streams) / 60
-
-
-def _write(path: Path, rows: list[tuple[str, ...]]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as content:
-            csv.writer(content).writerows([COLUMNS, *rows])
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}.") from None

@@ -8,30 +8,32 @@ import numpy as np
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
+from jaxfilters.trackers.io.frame_numbers import frames_of, times_of
 from jaxfilters.trackers.io.images import check_num_pixels, read_image
 from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
 from jaxfilters.trackers.io.json_files import check_intrinsics, read_json, refuse_unknown
 from jaxfilters.trackers.io.npz import ArrayStream, names_in_npz, read_npz
+from jaxfilters.trackers.io.video_input import DEFAULT_FPS
 
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "K", "depth_scale", "timestamps_us", "fps"}
-_SHORTEST_STEP_US = 1000
-"""Numeric file names that step by less are frame numbers, not microseconds: no depth camera runs at 1 kHz."""
 
 
-def open_depth(path: str | Path, *, fps: float = 30.0) -> DepthSequence:
+def open_depth(path: str | Path, *, fps: float | None = None) -> DepthSequence:
     """Open a folder of 16-bit PNGs with `camera.json`, or an `.npz` with `depth_mm` and `K`.
 
     Frames stay on disk until they are asked for; times and shapes are checked at once.
 
     Args:
         path: the folder or file.
-        fps: frames per second where the recording carries no times.
+        fps: frames per second, in place of the times and the rate that the recording has; frames that the names of
+            images number keep their gaps. `None` is what the recording says, and 30 where it says nothing.
 
     Raises:
         InputError: missing or wrong intrinsics, shapes, types or times, or an unreadable file.
     """
     path = Path(path)
-    check_rate(fps)
+    if fps is not None:
+        check_rate(fps)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
     if path.is_dir():
@@ -54,7 +56,7 @@ def _metres(raw: np.ndarray, units_per_metre: float) -> np.ndarray:
     return np.where(raw > 0, raw.astype(np.float32) / np.float32(units_per_metre), np.float32(np.nan))
 
 
-def _open_folder(folder: Path, fps: float) -> DepthSequence:
+def _open_folder(folder: Path, fps: float | None) -> DepthSequence:
     files = sorted(folder.glob("*.png"), key=_frame_order)
     if not files:
         raise InputError(f"{folder}: no PNG images in it.")
@@ -93,17 +95,18 @@ def _matrix(settings: dict[str, Any], folder: Path) -> Any:
     return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
 
 
-def _folder_times(files: list[Path], settings: dict[str, Any], fps: float, folder: Path) -> np.ndarray:
+def _folder_times(files: list[Path], settings: dict[str, Any], fps: float | None, folder: Path) -> np.ndarray:
+    numbers = np.arange(len(files), dtype=np.float64)
+    if all(file.stem.isdecimal() for file in files):
+        numbers = np.asarray([int(file.stem) for file in files], np.float64)
+    if fps is not None:
+        return frames_of(numbers) / fps
     if "timestamps_us" in settings:
         return _from_microseconds(settings["timestamps_us"], len(files), f"{folder / 'camera.json'}: timestamps_us")
-    fps = settings.get("fps", fps)
-    if not isinstance(fps, int | float) or not 1 / LARGEST <= fps <= LARGEST:
-        raise InputError(f"{folder / 'camera.json'}: fps must be positive; got {shown(fps)}.")
-    if not all(file.stem.isdecimal() for file in files):
-        return np.arange(len(files)) / fps
-    numbers = np.asarray([int(file.stem) for file in files], np.float64)
-    in_microseconds = len(files) > 1 and np.median(np.diff(numbers)) >= _SHORTEST_STEP_US
-    return numbers * 1e-6 if in_microseconds else numbers / fps
+    rate = settings.get("fps", DEFAULT_FPS)
+    if not isinstance(rate, int | float) or not 1 / LARGEST <= rate <= LARGEST:
+        raise InputError(f"{folder / 'camera.json'}: fps must be positive; got {shown(rate)}.")
+    return times_of(numbers, float(rate))
 
 
 def _from_microseconds(times: Any, frames: int, name: str) -> np.ndarray:
@@ -125,7 +128,7 @@ def _read_png(file: Path, shape: tuple[int, int] | None) -> np.ndarray:
     return image
 
 
-def _open_npz(file: Path, fps: float) -> DepthSequence:
+def _open_npz(file: Path, fps: float | None) -> DepthSequence:
     wanted = "expected depth_mm (T, H, W) uint16 and K (3, 3)"
     if missing := {"depth_mm", "K"} - set(names_in_npz(file, wanted)):
         raise InputError(f"{file}: {sorted(missing)} missing; {wanted}.")
@@ -139,7 +142,9 @@ def _open_npz(file: Path, fps: float) -> DepthSequence:
     if not rows * cols:
         raise InputError(f"{file}: depth_mm must be (T, H, W) uint16; got {shape}, without pixels.")
     check_num_pixels(cols, rows, f"{file}: depth_mm")
-    times_s = _from_microseconds(small["t_us"], frames, f"{file}: t_us") if "t_us" in small else np.arange(frames) / fps
+    times_s = np.arange(frames) / (fps or DEFAULT_FPS)
+    if fps is None and "t_us" in small:
+        times_s = _from_microseconds(small["t_us"], frames, f"{file}: t_us")
     joints = small.get("joints_mm")
     if joints is not None and (joints.dtype.kind not in "fiu" or too_large(joints).any()):
         raise InputError(f"{file}: joints_mm must be finite numbers or NaN; got {joints.dtype}.")

@@ -15,20 +15,20 @@ A model holds the arrays of `StreamModel` and a `header` in JSON. `jaxfilters fi
 """
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.hmm import Segment, SemiMarkovModel
-from jaxfilters.models.gesture.frame_classifier import DILATIONS, FrameClassifier
-from jaxfilters.models.gesture.poses import RATE_HZ, PoseTemplate
+from jaxfilters.models.gesture.frame_classifier import DILATIONS, KERNEL, FrameClassifier
+from jaxfilters.models.gesture.poses import RATE_HZ, PoseTemplate, num_features
 from jaxfilters.models.gesture.streams import Stream, StreamModel
 from jaxfilters.trackers.io.checkpoint import write_npz
-from jaxfilters.trackers.io.errors import InputError, OutputError
+from jaxfilters.trackers.io.errors import InputError, OutputError, shown
+from jaxfilters.trackers.io.input_files import too_large
 from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters gestures in streams", 1
@@ -37,6 +37,10 @@ _WANTED_MODEL = "expected an .npz of `jaxfilters fit gestures --stream`"
 _ARRAYS = ("points", "delta_1e5", "length", "annotations", "seq_id", "gesture", "fps", "names")
 _UNIT = 1e-5
 _CHAIN = ("log_initial", "log_transition", "log_end", "log_stay")
+_ROUNDING = 1e-3
+"""By which probabilities of a model may miss what they sum to."""
+_NUM_LEAVES = 2 + 2 * len(DILATIONS) + 2
+"""Arrays of a classifier: mean and deviation of the features, two of each layer, two of the readout."""
 _TEMPLATE = ("shape", "weights", "moving", "size", "speed", "bending")
 
 
@@ -160,46 +164,88 @@ def read_stream_model(path: Path) -> StreamModel:
     arrays = read_npz(path, _WANTED_MODEL)
     header = read_header(arrays, path, _WANTED_MODEL, FORMAT, VERSION)
     names = header.get("names")
-    num_leaves = 2 + 2 * len(DILATIONS) + 2
-    needed = [f"template_{name}" for name in _TEMPLATE] + [f"classifier_{i}" for i in range(num_leaves)] + [*_CHAIN]
+    needed = [*(f"template_{name}" for name in _TEMPLATE), *(f"classifier_{i}" for i in range(_NUM_LEAVES)), *_CHAIN]
     if missing := [name for name in needed if name not in arrays]:
         raise InputError(f"{path}: without {', '.join(missing)}; {_WANTED_MODEL}.")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise InputError(f"{path}: names must be of one gesture or more.")
-    leaves = [jnp.asarray(arrays[f"classifier_{i}"], float) for i in range(num_leaves)]
+    template = _template(arrays, path)
+    _check_classifier(arrays, num_features(template), len(names) + 1, path)
+    _check_durations(arrays, len(names) + 1, path)
+    leaves = [jnp.asarray(arrays[f"classifier_{i}"], float) for i in range(_NUM_LEAVES)]
     middle = leaves[2:-2]
     layers = tuple(zip(middle[::2], middle[1::2], strict=True))
     classifier = FrameClassifier(leaves[0], leaves[1], layers, (leaves[-2], leaves[-1]))
     log_initial, log_transition, log_end, log_stay = (jnp.asarray(arrays[name], float) for name in _CHAIN)
     durations = SemiMarkovModel(log_initial, log_transition, log_end, log_stay)
-    model = StreamModel(tuple(names), _template(arrays), classifier, durations)
-    _check_model(model, path)
-    return model
+    return StreamModel(tuple(names), template, classifier, durations)
 
 
-def _template(arrays: dict[str, np.ndarray]) -> PoseTemplate:
-    shape, weights, moving = (np.asarray(arrays[f"template_{name}"]) for name in _TEMPLATE[:3])
-    size, speed, bending = (float(np.asarray(arrays[f"template_{name}"]).reshape(-1)[0]) for name in _TEMPLATE[3:])
-    return PoseTemplate(shape, weights, moving.astype(int), size, speed, bending)
+def _template(arrays: dict[str, np.ndarray], path: Path) -> PoseTemplate:
+    shape = arrays["template_shape"].shape
+    if len(shape) != 2 or not shape[0] or shape[1] not in (2, 3):
+        raise InputError(f"{path}: template_shape must be numbers (J, 2 or 3), J points; got {shape}.")
+    _check(arrays, "template_shape", shape, path)
+    weights = _check(arrays, "template_weights", shape[:1], path)
+    if np.any(weights < 0) or abs(weights.sum() - 1) > _ROUNDING:
+        raise InputError(f"{path}: template_weights must not be negative and sum to 1; got {shown(weights.tolist())}.")
+    moving = arrays["template_moving"]
+    is_whole = moving.ndim == 1 and moving.size > 0 and moving.dtype.kind in "iu"
+    if not is_whole or moving.min() < 0 or moving.max() >= shape[0]:
+        raise InputError(
+            f"{path}: template_moving must be (m,) integers from 0 to {shape[0] - 1}, places of points; "
+            f"got {shown(moving.tolist())}."
+        )
+    scale = {name: float(_check(arrays, f"template_{name}", (), path)) for name in _TEMPLATE[3:]}
+    if wrong := [name for name, value in scale.items() if value <= 0]:
+        raise InputError(f"{path}: template_{wrong[0]} must be above 0; got {scale[wrong[0]]}.")
+    return PoseTemplate(arrays["template_shape"], weights, moving.astype(int), **scale)
 
 
-def _check_model(model: StreamModel, path: Path) -> None:
-    num_classes, shape = len(model.names) + 1, model.template.shape.shape
-    num_features = model.classifier.mean.shape
-    expected: Sequence[tuple[Any, Any]] = [
-        (model.classifier.sd.shape, num_features),
-        (model.classifier.layers[0][0].shape[1:2], num_features),
-        (model.classifier.readout[0].shape[1:], (num_classes,)),
-        (model.classifier.readout[1].shape, (num_classes,)),
-        (model.durations.log_initial.shape, (num_classes,)),
-        (model.durations.log_transition.shape, (num_classes, num_classes)),
-        (model.durations.log_stay.shape, model.durations.log_end.shape),
-        (model.durations.log_end.shape[:1], (num_classes,)),
-        (model.template.weights.shape, shape[:1]),
-        (len(shape), 2),
-    ]
-    if wrong := [pair for pair in expected if pair[0] != pair[1]]:
-        raise InputError(f"{path}: arrays do not fit each other: {wrong[0][0]} for {wrong[0][1]}; {_WANTED_MODEL}.")
-    numbers = [*jax.tree.leaves(model.classifier), model.template.shape, model.template.weights]
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in numbers):
-        raise InputError(f"{path}: the parameters of the network must be finite.")
+def _check_classifier(arrays: dict[str, np.ndarray], num_inputs: int, num_classes: int, path: Path) -> None:
+    """That the layers follow each other, from the features of the template to the classes."""
+    width = (arrays["classifier_2"].shape or (0,))[-1]
+    layers = [((KERNEL, num_inputs if i == 0 else width, width), (width,)) for i in range(len(DILATIONS))]
+    shapes = [(num_inputs,), (num_inputs,), *(shape for layer in layers for shape in layer)]
+    for i, shape in enumerate([*shapes, (width, num_classes), (num_classes,)]):
+        _check(arrays, f"classifier_{i}", shape, path)
+    if np.any(arrays["classifier_1"] <= 0):
+        raise InputError(
+            f"{path}: classifier_1 must be standard deviations above 0; got {arrays['classifier_1'].min()}."
+        )
+
+
+def _check_durations(arrays: dict[str, np.ndarray], num_classes: int, path: Path) -> None:
+    ages = (num_classes, *arrays["log_end"].shape[1:2])
+    if len(ages) < 2 or not ages[1]:
+        raise InputError(f"{path}: log_end must be ({num_classes}, D), of D frames; got {arrays['log_end'].shape}.")
+    for name, shape in zip(_CHAIN, ((num_classes,), (num_classes,) * 2, ages, ages), strict=True):
+        _check(arrays, name, shape, path, logs=True)
+    sums = {name: np.exp(arrays[name]).sum(axis=-1) for name in ("log_initial", "log_transition")}
+    sums["log_end, log_stay"] = np.exp(arrays["log_end"]) + np.exp(arrays["log_stay"])
+    for name, found in sums.items():
+        if np.any(abs(found - 1) > _ROUNDING):
+            off = float(np.ravel(found)[np.argmax(abs(np.ravel(found) - 1))])
+            raise InputError(
+                f"{path}: {name} must be logarithms of probabilities that sum to 1; got a sum of {off:.4g}."
+            )
+
+
+def _check(
+    arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...], path: Path, *, logs: bool = False
+) -> np.ndarray:
+    """An array of this shape whose numbers are finite, or logarithms of probabilities.
+
+    Raises:
+        InputError: it is not, with the name of the array.
+    """
+    values = arrays[name]
+    if values.shape != shape or values.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {name} must be numbers {shape}; got {values.shape} {values.dtype}.")
+    # The logarithm of what is impossible is -inf.
+    usable = (~np.isnan(values) & ~too_large(values)) | (np.isneginf(values) if logs else np.zeros(shape, bool))
+    if not np.all(usable) or (logs and np.any(values > _ROUNDING)):
+        wrong = values[~usable] if not np.all(usable) else values[values > _ROUNDING]
+        what = "logarithms of probabilities" if logs else "finite"
+        raise InputError(f"{path}: {name} must be {what}; got {wrong.ravel()[0]}.")
+    return values

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfilters.trackers.articulated.recording import NUM_KEYPOINTS
-from jaxfilters.trackers.articulated.recording import looks_normalized as looks_normalized
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.frame_numbers import frames_of, times_of
 from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large

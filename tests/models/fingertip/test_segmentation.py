@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import jax
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from jaxfilters.models.fingertip.segmentation import (
     bright_mask,
     depth_mask,
     fit_desk,
-    foreground_mask,
     otsu_threshold,
     smoothed,
 )
@@ -75,16 +73,6 @@ def test_a_hand_is_what_stands_on_the_desk_and_not_far_above():
     assert overlap(depth_mask(depth, fit_desk(depth)), hand()) > 0.95
 
 
-def test_foreground_is_cleaned_of_specks():
-    rng = np.random.default_rng(2)
-    probability = np.where(hand(), 0.9, 0.1)
-    probability[rng.uniform(size=probability.shape) < 0.01] = 1.0
-    probability[rng.uniform(size=probability.shape) < 0.01] = 0.0
-    mask = foreground_mask(probability.astype(np.float32))
-    assert overlap(mask, hand()) > 0.97
-    assert cv2.connectedComponents(mask.view(np.uint8))[0] - 1 < 8  # hundreds before
-
-
 @pytest.mark.parametrize("image", [np.zeros((4, 5)), np.zeros((4, 5, 3), np.uint8), np.zeros((0, 5), np.uint8)])
 def test_other_images_are_refused(image):
     for function in (otsu_threshold, lambda image: bright_mask(image, 100.0)):
@@ -104,5 +92,3 @@ def test_other_arguments_are_refused_by_name():
         depth_mask(depth, depth[1:])
     with pytest.raises(ValueError, match="desk must be an array"):
         depth_mask(depth, depth[0])
-    with pytest.raises(ValueError, match="probability"):
-        foreground_mask(np.ones((20, 30), np.uint8))

@@ -20,7 +20,7 @@ def asked(monkeypatch):
     """What was to be judged by models of what, in place of the models."""
     found = []
 
-    def scores(strokes, labels, shown, own, num_states, num_variants):
+    def scores(strokes, labels, shown, own, settings):
         found.append((shown, own))
         truth = np.searchsorted(np.unique(labels), labels[own])
         return Scores(np.where(np.arange(2)[:, None] == truth, 0.0, -9.0), np.full(len(own), 0.5), truth)
@@ -64,7 +64,7 @@ def test_few_strokes_also_stand_for_slanted_ones(dimensions):
     turn = np.eye(dimensions)
     turn[:2, :2] = [[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]
     slanted = to_judge([([piece @ turn.T for piece in strokes[0][0]], 1)], dimensions)
-    few = learning.learn_strokes(strokes, ["i"] * 6, min_variance=0.01)
+    few = learning.learn_strokes(strokes, ["i"] * 6, learning.Settings(min_variance=0.01))
     alone = learn(stacked(strokes), ["i"] * 6, num_states=learning.FEW_STATES, min_variance=0.01)
     assert recognise_all(few, slanted).log_likelihood[0, 0] > recognise_all(alone, slanted).log_likelihood[0, 0] + 0.5
 

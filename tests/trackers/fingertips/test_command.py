@@ -14,7 +14,7 @@ from jaxfilters.trackers.app import stream
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.fingertips.command import recogniser_of
 from jaxfilters.trackers.fingertips.events import ROTATE, SYMBOL, Event, Stroke
-from jaxfilters.trackers.fingertips.input import LiveHands, shown
+from jaxfilters.trackers.fingertips.input import DepthVideo, LiveHands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures, in_words
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.fingertips.table import TIP_TABLE, tip_rows
@@ -157,9 +157,24 @@ def test_wrong_input_is_named(recording, tmp_path, capsys):
     assert "none.mp4" in capsys.readouterr().err
     assert main(["track", "fingertips", "--mask", "depth", *out]) == 2
     assert "--mask depth" in capsys.readouterr().err
+    assert main(["track", "fingertips", "--fps", "60", *out]) == 2
+    assert "--fps: of no use without a recording" in capsys.readouterr().err
     (tmp_path / "model.npz").write_bytes(b"nothing")
     assert main(["track", "fingertips", str(recording[0]), "--gestures", str(tmp_path / "model.npz"), *out]) == 2
     assert "model.npz" in capsys.readouterr().err
+
+
+def test_a_depth_recording_is_sampled_to_its_end_and_its_rate_can_be_given(tmp_path):
+    depth = np.full((119, 2, 2), 500, np.uint16) + np.arange(119, dtype=np.uint16)[:, None, None]
+    times_us = np.rint(np.arange(119) * 1e6 / 30).astype(np.int64)
+    np.savez(tmp_path / "depth.npz", depth_mm=depth, K=[[9.0, 0, 1], [0, 9, 1], [0, 0, 1]], t_us=times_us)
+    source = DepthVideo(str(tmp_path / "depth.npz"), None)
+    depths = [round(1000 * float(image[0, 0])) for image in source.sample(60)]
+    assert (len(depths), depths[0], depths[-1], max(np.diff(depths))) == (60, 500, 618, 2)
+    assert source.fps == pytest.approx(30, rel=1e-4)
+    faster = DepthVideo(str(tmp_path / "depth.npz"), 60.0)
+    assert faster.fps == pytest.approx(60)
+    np.testing.assert_allclose([time for time, _ in faster.images()], np.arange(119) / 60)
 
 
 class Camera:

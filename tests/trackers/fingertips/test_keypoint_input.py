@@ -4,12 +4,14 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.fingertips.keypoint_input import KeypointSource, hands_of
 from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.video_input import open_video
 from tests.models.fingertip.test_keypoints import skeleton
 
 SIZE = (640, 480)
@@ -54,6 +56,65 @@ def test_hands_of_a_frame_are_read_from_every_form(tmp_path, form):
     np.testing.assert_allclose(observed[1].tips[0, :, 1], [two[1][8], two[0][8]], rtol=1e-4)
     only = hands_of(source.sample(3)[1], 1)
     np.testing.assert_allclose(only.tips[0, 0, 1], two[0][8], rtol=1e-4)
+
+
+def video_of(folder, count):
+    """A folder of images, each of which is as bright as its number says."""
+    folder.mkdir()
+    for i in range(count):
+        cv2.imwrite(str(folder / f"{i:03d}.png"), np.full((8, 12, 3), i, np.uint8))
+    return open_video(str(folder), fps=30.0)
+
+
+def table(path, numbers, times=None):
+    """A table with a hand a row, which moves a little."""
+    names = [f"{letter}{i}" for letter in "xy" for i in range(21)]
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["frame", *names, *([] if times is None else ["time_s"])])
+        for i, number in enumerate(numbers):
+            rows.writerow([number, *(skeleton() + 0.1 * i).T.ravel(), *([] if times is None else [times[i]])])
+    return path
+
+
+def over(source):
+    """Time and image of every frame, 40 for none, and whether it has keypoints."""
+    return [(round(t, 6), int(one.picture[0, 0, 0]), bool(one.confidence.any())) for t, one in source.images()]
+
+
+def test_frames_lie_over_the_images_with_their_numbers_at_the_times_of_the_file(tmp_path):
+    """Every second image from the third on; one has no keypoints, the last one is behind the end of the video."""
+    numbers, video = (3, 5, 9, 11), video_of(tmp_path / "video", 11)
+    source = KeypointSource(table(tmp_path / "a.csv", numbers), video, None, None)
+    at = [round(number / 30, 6) for number in (3, 5, 7, 9, 11)]
+    assert over(source) == list(zip(at, (3, 5, 7, 9, 40), (True, True, False, True, True), strict=True))
+    assert source.fps == pytest.approx(15)
+    assert "11 images beside frames 3 to 11" in source.trouble()
+    source = KeypointSource(table(tmp_path / "b.csv", numbers[:3], [7.0, 7.5, 8.5]), video, None, None)
+    assert over(source) == [(7.0, 3, True), (7.5, 5, True), (8.0, 7, False), (8.5, 9, True)]
+    assert source.trouble() is None
+    # The option goes before the times of the file.
+    source = KeypointSource(table(tmp_path / "b.csv", numbers[:3], [7.0, 7.5, 8.5]), video, 10.0, None)
+    assert (source.fps, [time for time, *_ in over(source)]) == (pytest.approx(5), [0.3, 0.5, 0.7, 0.9])
+
+
+def test_samples_reach_from_the_first_to_the_last_frame(tmp_path):
+    source = KeypointSource(table(tmp_path / "a.csv", range(119)), None, None, SIZE)
+    x = [float(frame.points[0, 0, 0] - skeleton()[0, 0]) for frame in source.sample(60)]
+    assert len(x) == 60
+    np.testing.assert_allclose([x[0], x[-1]], [0, 11.8], atol=1e-6)
+    assert max(np.diff(x)) < 0.21
+
+
+@pytest.mark.system
+def test_a_run_over_a_table_that_begins_later_has_its_times(tmp_path):
+    path, out = table(tmp_path / "a.csv", range(90, 120)), tmp_path / "out"
+    options = ["--image-size", "640x480", "--seconds", "0.5", "--no-video", "--out", str(out)]
+    assert main(["track", "fingertips", "--keypoints", str(path), *options]) == 0
+    with (out / "track.csv").open() as file:
+        times = {(int(row["frame"]), float(row["time_s"])) for row in csv.DictReader(file)}
+    assert max(times) == (15, 3.5)
+    assert all(abs(time - 3 - frame / 30) < 1e-5 for frame, time in times)
 
 
 @pytest.mark.system

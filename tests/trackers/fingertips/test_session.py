@@ -161,3 +161,11 @@ def test_it_does_not_matter_where_a_stream_is_cut_into_pieces():
     assert late.frame == early.frame + 30
     moved = {"first_frame": early.quantities["first_frame"] + 30, "last_frame": early.quantities["last_frame"] + 30}
     assert late.quantities == early.quantities | moved
+
+
+def test_a_corner_of_a_third_of_a_second_does_not_end_a_stroke_at_60_frames_per_second():
+    first, second = np.split(circle(60), 2)
+    way = [*[first[0]] * 20, *first, *[first[-1]] * 20, *second, *[second[-1]] * 40]
+    session, _ = follow([[(palm, OPEN[1:])] for palm in way], fps=60.0)
+    (event,) = session.events
+    assert event.quantities["last_frame"] - event.quantities["first_frame"] > 65

@@ -17,6 +17,7 @@ from jaxfilters.trackers.fingertips.state import (
     CONFIRMED,
     FREE,
     MANIPULATION,
+    NEVER,
     SYMBOLIC,
     FingertipConfig,
     scaled,
@@ -274,13 +275,37 @@ def test_predictions_ahead_have_a_covariance_that_grows():
 
 
 def test_configurations_are_checked_and_scale_with_image_and_frame_rate():
+    assert scaled(CONFIG) == CONFIG
     twice = scaled(CONFIG, height=960.0, fps=60.0)
     assert (twice.gate, twice.measurement_sd, twice.frame) == (80.0, 3.0, 0.5)
     np.testing.assert_allclose(twice.drive, CONFIG.drive / 2)
+    # Durations in frames, numbers of detections as they are.
+    assert (twice.empty_frames, twice.axis_frames, twice.min_hits, twice.disordered_frames) == (30, 20, 3, 3)
+    np.testing.assert_allclose(twice.posture.correlation**2, CONFIG.posture.correlation)
+    slow = scaled(CONFIG, fps=10.0)
+    assert (slow.empty_frames, slow.axis_frames, slow.min_hits, slow.gate) == (5, 3, 3, 120.0)
+    assert (scaled(CONFIG, fps=1.0).axis_frames, scaled(CONFIG, fps=1e30).empty_frames) == (1, NEVER - 1)
     with pytest.raises(ValueError, match="gate must be positive; got 0"):
         replace(CONFIG, gate=0.0)
     with pytest.raises(ValueError, match="capacity must be at least 5"):
         replace(CONFIG, capacity=3)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("fps", [5.0, 10.0, 120.0])
+def test_a_finger_is_followed_and_given_up_after_the_same_time_at_any_frame_rate(fps):
+    """At 30 frames/s it coasts for 0.23 s while the palm is visible; a longer frame makes it less certain."""
+    config = scaled(CONFIG, fps=fps)
+    still, hidden = round(1.2 * fps), round(2 * fps)
+    _, report = tracker.run(
+        config,
+        ANGLES,
+        tracker.start(config, ANGLES),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *[shown([INDEX])] * still, *[shown([])] * hidden),
+    )
+    assert np.all(report.num_tips[2:still] == 1)
+    coasted = int(np.sum(report.num_tips[still:])) / fps
+    assert 0.15 < coasted < 0.7
 
 
 def test_a_prediction_where_the_image_shows_no_hand_is_not_reported_and_keeps_its_name():

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxfilters.models.gesture import learning
 from jaxfilters.trackers.app.cli import FAILURE, main
 from jaxfilters.trackers.gestures import command as gesture_command
 from jaxfilters.trackers.io.gesture_models import default_symbols, read_symbols
@@ -66,6 +67,27 @@ def test_symbols_are_learnt_added_and_recognised(tmp_path, capsys):
     assert [row["symbol"] for row in rows] == ["Z"] * 4 + ["L"] * 4 + ["V"] * 4 + [""] * 2
     assert all(0.5 < float(row["confidence"]) <= 1 for row in rows[:12])
     assert rows[-1] == {"stroke": "hole", "symbol": "", "confidence": "", "lead_nats": "", "label": ""}
+
+
+@pytest.mark.parametrize("more", [(), ("--held-out", "person")])
+def test_added_symbols_are_judged_by_models_like_those_that_are_added(tmp_path, capsys, monkeypatch, more):
+    """With the states and the floor of variances of the model to which they are added."""
+    asked, file, data = [], default_symbols(), written(tmp_path / "vl.csv", "VL", trials=5)
+
+    def learned(*arguments):
+        asked.append(arguments[-1])
+        return file.symbols
+
+    def stop(*arguments):
+        asked.append(arguments[-1])
+        raise ValueError("enough is known")
+
+    monkeypatch.setattr(learning, "_scores", stop)
+    monkeypatch.setattr(gesture_command, "learn_strokes", learned)
+    command = ("fit", "gestures", data, "--out", tmp_path / "m.npz", "--add", "default", "--ways", 2, *more)
+    assert run(*command) == FAILURE
+    assert "enough is known" in capsys.readouterr().err
+    assert asked == [learning.Settings(file.symbols.models.log_initial.shape[-1], 2, file.min_variance)] * 2
 
 
 @pytest.mark.system

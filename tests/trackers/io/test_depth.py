@@ -79,6 +79,22 @@ def test_times_come_from_the_json_the_names_or_the_frame_rate(tmp_path, names, s
     np.testing.assert_allclose([frame[0, 0] for frame in sequence], [0.5, 0.501, 0.502], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("names", "settings", "frames"),
+    [
+        (["a.png", "b.png", "c.png"], {"fps": 10}, [0, 1, 2]),
+        (["8.png", "9.png", "11.png"], {"fps": 10}, [8, 9, 11]),
+        (["33000.png", "66000.png", "100000.png"], {}, [0, 1, 2]),
+        (["8.png", "9.png", "11.png"], {"timestamps_us": [5, 1000, 2000]}, [8, 9, 11]),
+    ],
+)
+def test_a_given_frame_rate_goes_before_what_a_recording_says_of_its_times(tmp_path, npz_file, names, settings, frames):
+    sequence = open_depth(write_folder(tmp_path / "f", names, INTRINSICS | settings), fps=60.0)
+    np.testing.assert_allclose(sequence.times_s, np.asarray(frames) / 60)
+    times_s = open_depth(npz_file, fps=60.0).times_s
+    np.testing.assert_allclose(times_s, np.arange(len(times_s)) / 60)
+
+
 def test_matrix_and_depth_scale_of_the_json(tmp_path):
     K = [[5, 0, 2], [0, 6, 1], [0, 0, 1]]
     sequence = open_depth(write_folder(tmp_path / "f", ["0.png"], {"K": K, "depth_scale": 5000}))

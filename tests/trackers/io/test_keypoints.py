@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.articulated.recording import persistence
+from jaxfilters.trackers.articulated.recording import looks_normalized, persistence
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.features import open_features
-from jaxfilters.trackers.io.keypoints import looks_normalized, read
+from jaxfilters.trackers.io.keypoints import read
 
 FRAMES, SIZE = 5, (640, 480)
 RNG = np.random.default_rng(0)
