@@ -81,12 +81,14 @@ def _bound(path, name, entry):
 def _row(name, bound, metric):
     if metric is None:
         return Row(name, bound, math.nan, math.nan, "missing")
-    better = metric.better
-    if not isinstance(better, str):
-        better = "lower" if bound.value >= better else "higher"  # The limit is on that side of the right value.
-    sign = 1 if better == "lower" else -1
+    right = metric.better
+    sign = 1 if right == "lower" or (not isinstance(right, str) and bound.value >= right) else -1
     limit = bound.value + sign * bound.tolerance * abs(bound.value)
-    return Row(name, bound, limit, metric.value, "ok" if sign * metric.value <= sign * limit else "worse")
+    if isinstance(right, str):
+        passes = sign * metric.value <= sign * limit
+    else:
+        passes = abs(metric.value - right) <= abs(limit - right)
+    return Row(name, bound, limit, metric.value, "ok" if passes else "worse")
 
 
 def _number(value):

@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         today = datetime.now(UTC).date().isoformat()
         document = metrics.report(options.scenario, measured, environment() | {"date": today})
-        options.json.write_text(json.dumps(document, indent=2) + "\n")
+        options.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
     return _gate(bounds, measured) if options.gate else 0
 
 

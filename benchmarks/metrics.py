@@ -1,5 +1,6 @@
 """What a scenario measures, as a table for people and as JSON for comparisons."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -43,9 +44,14 @@ def report(scenario: str, metrics: Mapping[str, Metric], environment: Mapping[st
     """The JSON document of one run."""
     return {
         "scenario": scenario,
-        "metrics": {n: {"value": float(m.value), "unit": m.unit, "better": m.better} for n, m in metrics.items()},
+        "metrics": {n: {"value": _as_json(m.value), "unit": m.unit, "better": m.better} for n, m in metrics.items()},
         "environment": dict(environment),
     }
+
+
+def _as_json(value: float) -> float | str:
+    """JSON has no infinity and no NaN: they are the words that `float` reads."""
+    return float(value) if math.isfinite(value) else str(float(value))
 
 
 def _line(row: tuple[str, ...], widths: Sequence[int], numbers: Collection[int]) -> str:

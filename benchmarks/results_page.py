@@ -264,7 +264,7 @@ def _on_recordings(documents: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _valued(metric: Mapping[str, Any]) -> str:
-    return f"{metric['value']:.3g} {metric['unit']}"
+    return f"{float(metric['value']):.3g} {metric['unit']}"
 
 
 def _of_systems(metrics: Mapping[str, Mapping[str, Any]]) -> str:
@@ -308,6 +308,6 @@ def _table(metrics: Mapping[str, Mapping[str, Any]]) -> str:
     rows = ["| metric | value | unit | better |", "|---|---:|---|---|"]
     for name, metric in metrics.items():
         rows.append(
-            f"| `{name}` | {metric['value']:.4g} | {metric['unit'] or '-'} | {shown_better(metric['better'])} |"
+            f"| `{name}` | {float(metric['value']):.4g} | {metric['unit'] or '-'} | {shown_better(metric['better'])} |"
         )
     return "\n".join(rows) + "\n"

@@ -22,7 +22,7 @@ LEFT_OUT = re.compile(r"float64|first_call|cost_to|two_cores")
 def metrics(name: str) -> dict[str, float]:
     """Values of the run of a scenario, by metric."""
     document = json.loads((RESULTS / f"{name}.json").read_text())
-    return {key: metric["value"] for key, metric in document["metrics"].items()}
+    return {key: float(metric["value"]) for key, metric in document["metrics"].items()}
 
 
 def ratios() -> dict[str, float]:

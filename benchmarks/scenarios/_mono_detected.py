@@ -95,7 +95,7 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
             follow(made, f"modelled_{worn}", faces["modelled_rendered"], person)
     metrics: dict[str, Metric] = {}
     for name, of_people in runs.items():
-        metrics |= detected_metrics(name, [run for run in of_people if len(run.errors)])
+        metrics |= detected_metrics(name, of_people)
     return metrics
 
 
@@ -178,9 +178,13 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
 
     Args:
         name: Suffix of the metrics.
-        runs: Of all people.
+        runs: Of all people; who was never tracked counts as lost, and for nothing else.
     """
-    metrics: dict[str, Metric] = {}
+    lost = float(np.mean([run.lost_share for run in runs]))
+    metrics = {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
+    runs = [run for run in runs if len(run.errors)]
+    if not runs:
+        return metrics
     for prefix, errors in (("", [r.errors for r in runs]), ("pnp_", [r.pnp_errors for r in runs])):
         every = np.concatenate(errors)
         metrics |= {
@@ -207,8 +211,7 @@ def detected_metrics(name: str, runs: list[DetectedRun]) -> dict[str, Metric]:
         f"coverage2_{axis}_{name}": Metric(100 * float(np.mean(within[:, i])), "%", 100 * WITHIN_TWO_SIGMA)
         for axis, i in AXES.items()
     }
-    lost = float(np.mean([run.lost_share for run in runs]))
-    return metrics | {f"lost_share_{name}": Metric(100 * lost, "%", "lower")}
+    return metrics
 
 
 def _evaluated(

@@ -50,12 +50,14 @@ LOW_RATE_NUM_FRAMES = 24
 """Frames that are taken: even the shortest motion has nearly as many at the lowest rate."""
 HIDDEN = ((10, 20), (32, 42))
 """Frames of a motion, from and to, in which the fingers are hidden: a third of a second each."""
+MISSING_MM = 100.0
+"""Error of a frame without an estimate: that of a hand that is lost."""
 HIDDEN_MARGIN_PX = 12
 """Of the hidden rectangle about the joints of the fingers beyond the first."""
 SIX_STEPS = RegistrationConfig(widths=(0.03,) * 2 + (0.015,) * 4)
 
 Follow = Callable[[HandRecording, int], float]
-"""`(recording, seed) -> mean joint error in millimetres`, NaN where nothing was estimated."""
+"""`(recording, seed) -> mean joint error in millimetres`."""
 
 
 def real_metrics(num_particles: int, quick: bool, kept: Finished) -> dict[str, Metric]:
@@ -189,7 +191,10 @@ def registered(setup: Setup, state: TrackState, frames: Array, elapsed: Array) -
 
 
 def _joint_error(joints: np.ndarray, recording: HandRecording) -> float:
-    return float(1e3 * np.nanmean(np.linalg.norm(joints - recording.joints, axis=-1)))
+    """Mean over all joints whose truth is known, millimetres; `MISSING_MM` where there is no estimate."""
+    apart = 1e3 * np.linalg.norm(joints - recording.joints, axis=-1)
+    known = np.isfinite(recording.joints).all(axis=-1)
+    return float(np.mean(np.where(np.isfinite(apart), apart, MISSING_MM)[known]))
 
 
 def _recordings(quick: bool, every: int = 1) -> list[HandRecording]:

@@ -105,9 +105,9 @@ def mocap_metrics(path: Path, quick: bool) -> dict[str, Metric]:
     first view.
     """
     errors, deviations, observed, rates = [], [], [], []
-    for view in list(VIEWS.values())[: 1 if quick else None]:
+    for number, view in enumerate(list(VIEWS.values())[: 1 if quick else None]):
         capture = load_capture(path, 1000 if quick else 3000, view)
-        found = track_lengths(capture, seed=0)
+        found = track_lengths(capture, (0, number))
         errors.append(1e3 * np.abs(found.lengths - true_lengths(capture)))
         deviations.append(1e3 * found.std)
         observed.append(found.observed)
@@ -235,8 +235,8 @@ def first_belief(capture: Capture, layout: Layout, rng: np.random.Generator) -> 
     return Start(mean, covariance)
 
 
-def track_lengths(capture: Capture, seed: int) -> EstimatedLengths:
-    """The lengths at the end of a view, with noise and a wrong start drawn from the seed."""
+def track_lengths(capture: Capture, seed: tuple[int, int]) -> EstimatedLengths:
+    """The lengths at the end of a view, with noise and a wrong start drawn from the seed and the number of the view."""
     rng = np.random.default_rng(seed)
     hand, limits = chain_model(capture)
     start = first_belief(capture, hand.layout, rng)
@@ -246,7 +246,7 @@ def track_lengths(capture: Capture, seed: int) -> EstimatedLengths:
     frames = FeatureFrame(np.where(observed, y, 0.0).astype(np.float32), observed, np.full(y.shape, NOISE, np.float32))
     start = Start(*(jnp.asarray(part, dtype=float) for part in start))
     tracker = tracker_of(hand, limits, start, ArticulatedConfig(hypotheses=4))
-    state = tracker.init(jax.random.key(seed), jax.tree.map(lambda leaf: leaf[0], frames))
+    state = tracker.init(jax.random.key(seed[0]), jax.tree.map(lambda leaf: leaf[0], frames))
     times = EVERY / RATE * np.arange(len(y))
     jax.block_until_ready(tracker.step(state, frames, times))
     begin = time.perf_counter()

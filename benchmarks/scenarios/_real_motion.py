@@ -1,7 +1,8 @@
 """Real hands from one view: detections of networks on two sets of depth images, and motion capture through a camera.
 
 Only (u, v) of a network is used. The noise is what the tracker takes for keypoints, motion and the hand at ease are its
-own: nothing but the meaning of the markers is from these recordings.
+own. Constants of the tracker were chosen on the first 350 frames of these recordings, which are part of the figures;
+the meaning of the markers is from all of them. `docs/accuracy/articulated.md` lists what.
 
 `backprojection` puts every detection at the true depth of the root, frame by frame: it is given where the hand is, and
 with that how large it is, which no other variant knows. `backprojection_estimated_depth` is the same at the depth that

@@ -42,7 +42,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
         "error_smoothed_mm": Metric(float(smoothed), "mm", "lower"),
         "error_filtered_nominal_mm": Metric(float(nominal), "mm", "lower"),
         "reduction_smoothed_percent": Metric(float(100 * (1 - smoothed / raw)), "%", "higher"),
-        "jitter_ratio": Metric(float(jitter), "", "lower"),
+        "jitter_ratio": Metric(float(jitter), "", 1.0),
     }
 
 

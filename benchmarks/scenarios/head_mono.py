@@ -108,7 +108,7 @@ def contenders_for(user: int, seed: int, quick: bool) -> dict[str, Contender]:
     if quick:
         return best
     many = _of_many(seed)
-    apart = eyes_apart_of(_identity(FIRST_USER + user)) + np.random.default_rng(seed + user).normal(0, EYES_STD_MM)
+    apart = eyes_apart_of(_identity(FIRST_USER + user)) + np.random.default_rng([seed, user, 1]).normal(0, EYES_STD_MM)
     strangers = {"b": Contender(many, USUAL), "b_eyes": Contender(many, replace(USUAL, eyes_apart_mm=apart))}
     if user >= NUM_USERS:
         return strangers

@@ -7,6 +7,7 @@ paper's, with `_halving` the paper's with finer last steps. In E1 the height is 
 """
 
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -96,7 +97,7 @@ class Rooms:
 
     def simulate_moving(self, seeds: range, name: str, truth: np.ndarray, look: Look, **options) -> Runs:
         """The same of people (runs, frames, people, 2) who move."""
-        number = int.from_bytes(name.encode(), "little") % 2**31
+        number = zlib.crc32(name.encode())
         keys = [jax.random.fold_in(jax.random.key(seed), number) for seed in seeds]
         parts = [static.simulate(key, self.calibration, truth, look, **options) for key in keys]
         truth, starts, masks = (np.concatenate([part[i] for part in parts]) for i in range(3))

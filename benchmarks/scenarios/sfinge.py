@@ -132,10 +132,17 @@ def _by_neighbours_left_out(known: StreamSet, folds: int, *, warped: bool) -> li
 def _by_neighbours(
     training: list[Stream], searched: list[Stream], background: int, *, warped: bool
 ) -> list[list[Segment]]:
-    """Segments in each of the streams that are searched; all at the rate of the features."""
+    """Segments in each of the streams that are searched, in frames of the stream."""
     template = poses.fit_template([poses.resampled(stream.points, stream.rate_hz)[0] for stream in training])
     known = _neighbours(template, training, background)
-    return [_nearest(known, _features(template, stream), background, warped=warped) for stream in searched]
+    found = [_nearest(known, _features(template, stream), background, warped=warped) for stream in searched]
+    return [_at_rate(stream.rate_hz, own) for stream, own in zip(searched, found, strict=True)]
+
+
+def _at_rate(rate_hz: float, segments: list[Segment]) -> list[Segment]:
+    """Segments in frames of the features as segments in frames of a stream of another rate."""
+    scale = rate_hz / poses.RATE_HZ
+    return [one._replace(start=round(one.start * scale), end=round(one.end * scale)) for one in segments]
 
 
 def _features(template: PoseTemplate, stream: Stream) -> Float[np.ndarray, "t f"]:

@@ -22,7 +22,7 @@ from jaxfilters.benchmarks.multi_object import evaluate, floor_tracks
 from jaxfilters.benchmarks.scenarios import _simplest as simplest
 from jaxfilters.benchmarks.scenarios import fingertips
 from jaxfilters.benchmarks.scenarios._articulated_paper import LAST
-from jaxfilters.benchmarks.scenarios._head_runs import follow, rmse
+from jaxfilters.benchmarks.scenarios._head_runs import follow
 from jaxfilters.benchmarks.scenarios._mono_runs import START_FRAMES, Contender, follow_all, talking_head
 from jaxfilters.benchmarks.scenarios._poses import pose_errors
 from jaxfilters.models.fingertip.segmentation import bright_mask
@@ -118,7 +118,7 @@ def stereo_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     errors: dict[str, list[np.ndarray]] = {"": [], "_simple": []}
     for head in range(seed, seed + (1 if quick else 3)):
         made = sequence(jax.random.key(head), "slow", 30 if quick else 150, head)
-        errors[""].append(rmse(follow(made, {"": HeadConfig(learn=False)})[""]))
+        errors[""].append(_pose_rms(follow(made, {"": HeadConfig(learn=False)})[""].track.pose, made.poses[1:]))
         images = [image for _, part in made.chunks() for image in part]
         uv = np.stack([simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1)
         poses = simplest.pose_by_triangulation(np.asarray(made.shapes[0], float), uv, simplest.projections(made.rig))
@@ -133,12 +133,14 @@ def mono_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     for head in range(seed, seed + (1 if quick else 3)):
         made = talking_head(head, 60 if quick else 150)
         contender = Contender(default_face_model().model, MonoConfig(seed=head))
-        errors[""].append(follow_all(made, {"": contender}, head)[""].means)
+        run = follow_all(made, {"": contender}, head)[""]
+        errors[""].append(run.means)
         images = [image[0] for _, part in made.chunks() for image in part]
         poses = simplest.pose_by_pnp(
             np.asarray(made.shapes[0], float), simplest.flowed_points(images, made.uv[0, 0]), made.rig
         )
-        errors["_simple"].append(np.mean(np.abs(pose_errors(poses, made.poses))[first:], axis=0))
+        of_simple = np.abs(pose_errors(poses, made.poses))[first:]
+        errors["_simple"].append(np.mean(of_simple[-len(run.errors) :][run.is_tracked], axis=0))
     return _pose_metrics("head_mono", errors, MONO_PAPER)
 
 

@@ -186,7 +186,8 @@ def hypotheses(
 
     Every hypothesis is made linear at its mean; where the image of a link hardly depends on its angle, at both poses of
     the link that is most in doubt instead [30]; and where all fingers may be straight, also with the hand mirrored.
-    Those that leave a limit by more than three standard deviations are given up. Arguments as in `jaxfilters.gaussian_sum`.
+    Those that leave a limit by more than three standard deviations are given up. Arguments as in
+    `jaxfilters.gaussian_sum`.
     """
     return gaussian_sum.gaussian_sum(
         inner,

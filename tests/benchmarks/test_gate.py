@@ -32,8 +32,10 @@ def run(*, quick, seed, out):
         ("higher", 0.799, "worse"),
         (0.5, 1.201, "worse"),
         (0.5, 0.1, "ok"),
+        (0.5, -0.201, "worse"),
         (2.0, 0.799, "worse"),
         (2.0, 2.5, "ok"),
+        (2.0, 3.201, "worse"),
     ],
 )
 def test_worse_by_more_than_the_tolerance_is_worse(better, value, verdict):

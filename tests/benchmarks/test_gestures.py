@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.benchmarks.recordings import RecordingError
-from jaxfilters.benchmarks.scenarios import _drawn_symbols, _sfinge, gestures
+from jaxfilters.benchmarks.scenarios import _drawn_symbols, _sfinge, gestures, sfinge
 from jaxfilters.benchmarks.scenarios._drawn_symbols import METHODS, Scale, scored
 from jaxfilters.hmm import Segment
 from jaxfilters.models.gesture.symbols import Recognition
@@ -98,3 +98,7 @@ def test_features_of_a_hand_do_not_depend_on_where_it_is_nor_on_how_its_palm_is_
     np.testing.assert_allclose(after[:, 18:], before[:, 18:], atol=1e-3)
     # The velocity is that in the world.
     np.testing.assert_allclose(after[:, 15:18], turn.apply(before[:, 15:18]), atol=1e-4)
+
+
+def test_segments_at_the_rate_of_the_features_are_frames_of_the_stream():
+    assert sfinge._at_rate(2 * sfinge.poses.RATE_HZ, [Segment(2, 10, 33)]) == [Segment(2, 20, 66)]

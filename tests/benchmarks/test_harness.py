@@ -1,4 +1,5 @@
 import json
+import math
 import sys
 import time
 
@@ -7,7 +8,7 @@ import pytest
 
 from jaxfilters.benchmarks import scenarios
 from jaxfilters.benchmarks.harness import descriptions, main
-from jaxfilters.benchmarks.metrics import Metric, table
+from jaxfilters.benchmarks.metrics import Metric, report, table
 from jaxfilters.benchmarks.timing import interleaved
 
 SCENARIO = '''"""Two numbers, quickly.
@@ -53,6 +54,12 @@ def test_a_scenario_prints_its_table_and_writes_its_numbers(tmp_path, capsys):
     }
     assert {"python", "jax", "numpy", "cpu", "cores", "device"} <= set(document["environment"])
     assert (tmp_path / "plot.txt").exists()
+
+
+def test_numbers_that_are_not_finite_are_words_in_json():
+    document = report("a", {"gap": Metric(float("inf"), "m", "lower"), "share": Metric(float("nan"), "", 1.0)}, {})
+    found = json.loads(json.dumps(document, allow_nan=False))["metrics"]
+    assert [float(one["value"]) for one in found.values()] == pytest.approx([math.inf, math.nan], nan_ok=True)
 
 
 def test_files_of_runs_become_a_page(tmp_path, capsys):

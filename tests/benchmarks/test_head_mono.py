@@ -127,7 +127,9 @@ def test_detected_people_stand_beside_solve_pnp():
         detected([0, 0, -6, 0, 3, 0], np.ones(6), 2.0),
         detected([0, 0, 12, 0, 4, 0], np.ones(6), 7.0, mesh=[3.0, 4.0, 5.0]),
     ]
-    metrics = _mono_detected.detected_metrics("modelled", runs)
+    never = _mono_detected.DetectedRun(np.zeros((0, 6)), np.zeros((0, 6)), np.zeros((0, 6)), np.zeros(0), 1.0)
+    assert _mono_detected.detected_metrics("a", [never])["lost_share_a"].value == 100.0
+    metrics = _mono_detected.detected_metrics("modelled", [*runs, never])
     assert metrics["z_error_mm_modelled"].value == pytest.approx(9.0)
     assert metrics["z_bias_share_modelled"].value == pytest.approx(0.5)
     assert metrics["yaw_rms_deg_modelled"].value == pytest.approx(np.sqrt(12.5))
@@ -135,7 +137,7 @@ def test_detected_people_stand_beside_solve_pnp():
     assert metrics["pnp_z_error_mm_modelled"].value == pytest.approx(1.0)
     assert metrics["mesh_pitch_rms_deg_modelled"].value == pytest.approx(5.0)  # of whom there are meshes
     assert metrics["coverage2_z_modelled"].value == pytest.approx(50.0)
-    assert metrics["lost_share_modelled"].value == pytest.approx(25.0)
+    assert metrics["lost_share_modelled"].value == pytest.approx(50.0)
 
 
 def test_solve_pnp_finds_the_mean_face_where_it_is():

@@ -148,3 +148,13 @@ def test_without_recordings_there_is_nothing_to_compare(monkeypatch):
 
     monkeypatch.setattr(_real_comparison, "_recordings", missing)
     assert _real_comparison.real_metrics(16, True, Finished(None)) == {}
+
+
+def test_joints_without_an_estimate_count_as_those_of_a_lost_hand():
+    truth, camera = np.zeros((4, 21, 3)), Pinhole.from_intrinsics(100.0, (0.0, 0.0), (1, 1))
+    truth[3, 5] = np.nan
+    recording = _real_hands.HandRecording(camera, np.arange(4.0), np.zeros((4, 1, 1), np.float32), truth, 1.0)
+    joints = np.full((4, 21, 3), [0.01, 0.0, 0.0])
+    joints[:2] = np.nan
+    error = _real_comparison._joint_error(joints, recording)
+    assert error == pytest.approx((42 * _real_comparison.MISSING_MM + 41 * 10.0) / 83)

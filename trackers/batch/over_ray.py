@@ -49,7 +49,7 @@ def _wait_for_all(ray: Any, options: argparse.Namespace) -> None:
     shares = shares_of(ray.nodes())
     if not shares:
         raise InputError(f"--ray {options.ray}: its machines have no processors to offer.")
-    here = {"manifest": options.manifest.resolve(), "out": options.out.resolve(), "ray": None}
+    here = {"manifest": options.manifest.resolve(), "out": options.out.resolve(), "ray": None, "retry": False}
     words = argparse.Namespace(**vars(options) | here)
     tasks = []
     for machine, share in shares:

@@ -52,7 +52,7 @@ def test_the_size_of_the_image_is_part_of_a_recording(sequence):
 
 def test_shares_of_the_image_are_no_pixels():
     points = np.random.default_rng(0).uniform(0, 1, (3, NUM_KEYPOINTS, 2))
-    with pytest.raises(InputError, match="a: keypoints must be in pixels; got coordinates within .* multiply by"):
+    with pytest.raises(InputError, match=r"a: keypoints must be in pixels; got coordinates within .* multiply by"):
         from_keypoints(np.arange(3) / 30, points, "a")
     assert from_keypoints(np.arange(3) / 30, points * (640, 480), "a").noise_px > 1
 
