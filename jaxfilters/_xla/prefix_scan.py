@@ -32,6 +32,8 @@ def prefix_scan(
         turned = prefix_scan(operator, jax.tree.map(lambda leaf: jnp.flip(leaf, axis), elements), axis=axis)
         return jax.tree.map(lambda leaf: jnp.flip(leaf, axis), turned)
     count = jax.tree.leaves(elements)[0].shape[axis]
+    if not count:
+        return elements
     blocks = jax.tree.map(lambda leaf: _in_blocks(leaf, axis, _BLOCK if count > _BLOCK else count), elements)
     first, others = jax.tree.map(lambda leaf: leaf[0], blocks), jax.tree.map(lambda leaf: leaf[1:], blocks)
 

@@ -157,8 +157,9 @@ def sigma_coverage(
     positive("std", std)
     positive("sigmas", np.asarray(sigmas))
     limits = jnp.asarray(sigmas, dtype=float)
-    size = jnp.abs(truth - mean) / std
-    within = jnp.mean(size.reshape(-1, 1) <= limits, axis=0)
+    size = (jnp.abs(truth - mean) / std).reshape(-1, 1)
+    known = ~jnp.isnan(size)
+    within = jnp.sum(known & (size <= limits), axis=0) / jnp.sum(known)
     return within, jax.scipy.special.erf(limits / math.sqrt(2))
 
 

@@ -113,5 +113,7 @@ def logpdf(deviation: Float[Array, " n"], root: Float[Array, "n n"]) -> Float[Ar
 
 
 def _split(indices, n):
-    known = np.asarray(indices)
+    known = np.arange(n)[np.asarray(indices)]  # from the end where they are negative
+    if len(set(known.tolist())) != known.size:
+        raise ValueError(f"indices must name different components; got {list(indices)} of {n}.")
     return known, np.setdiff1d(np.arange(n), known)

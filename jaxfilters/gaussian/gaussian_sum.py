@@ -346,20 +346,23 @@ def _merged(same: Same, candidates: _Candidates) -> _Candidates:
     if getattr(found, "shape", None) != ():
         raise ValueError(f"same must return one boolean; got the shape {getattr(found, 'shape', None)}.")
     alike = jax.vmap(jax.vmap(same, (None, 0)), (0, None))(candidates.states, candidates.states)
-    siblings = candidates.parents[:, None] == candidates.parents
     index = jnp.arange(len(candidates.fates))
+    # Which parents' weights each candidate has: branches of one parent that merge count once.
+    has = candidates.parents[:, None] == index
 
     def absorb(carry: tuple, j: Array) -> tuple[tuple, None]:
-        fates, log_weights = carry
+        fates, log_weights, has = carry
         larger = (fates == KEPT) & alike[:, j] & (index < j)
         first = jnp.argmax(larger)
         merges = jnp.any(larger) & (fates[j] == KEPT)
-        adds = merges & ~siblings[first, j]
+        parent = candidates.parents[j]
+        adds = merges & ~has[first, parent]
         gained = jnp.logaddexp(log_weights[first], jnp.where(adds, log_weights[j], -jnp.inf))
         log_weights = log_weights.at[first].set(jnp.where(adds, gained, log_weights[first]))
-        return (fates.at[j].set(jnp.where(merges, MERGED, fates[j])), log_weights), None
+        has = has.at[first, parent].set(has[first, parent] | merges)
+        return (fates.at[j].set(jnp.where(merges, MERGED, fates[j])), log_weights, has), None
 
-    (fates, log_weights), _ = jax.lax.scan(absorb, (candidates.fates, candidates.log_weights), index)
+    (fates, log_weights, _), _ = jax.lax.scan(absorb, (candidates.fates, candidates.log_weights, has), index)
     return candidates._replace(fates=fates, log_weights=log_weights)
 
 

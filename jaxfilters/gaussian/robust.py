@@ -110,7 +110,10 @@ def _update(
     outlier, outlier_info = model.inner.update(inner, key, belief, observed._replace(noise=model.outlier_noise), inputs)
     log_inlier = jnp.log1p(-model.outlier_probability) + inlier_info.log_evidence
     log_outlier = jnp.log(model.outlier_probability) + outlier_info.log_evidence
-    inlier_probability = jax.nn.sigmoid(log_inlier - log_outlier)
+    # Where neither noise explains the observation, both updates are the prediction.
+    possible = jnp.isfinite(log_inlier) | jnp.isfinite(log_outlier)
+    log_odds = jnp.where(possible, log_inlier, 0.0) - jnp.where(possible, log_outlier, 0.0)
+    inlier_probability = jnp.where(possible, jax.nn.sigmoid(log_odds), 1 - model.outlier_probability)
     return _merged(inner, inlier, outlier, inlier_probability), RobustInfo(
         jnp.logaddexp(log_inlier, log_outlier), inlier_info, inlier_probability
     )

@@ -139,7 +139,9 @@ def _checked(name: str, dof: Any, above: float) -> Array | None:
     return jnp.asarray(dof, dtype=float)
 
 
-def scales(dof: Array | None, size: int, count: int, dtype: DTypeLike) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+def scales(
+    dof: Array | None, size: int | Array, count: int, dtype: DTypeLike
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Values of lambda, and their log probabilities, which sum to 1; one value, 1, for Gaussian noise.
 
     Args:
@@ -156,6 +158,12 @@ def scales(dof: Array | None, size: int, count: int, dtype: DTypeLike) -> tuple[
     # Without the constant -1, which would cost the digits of a distribution that is narrow about 1.
     log_density = -0.5 * dof * (jnp.expm1(log_scale) - log_scale)
     return jnp.exp(log_scale), jax.nn.log_softmax(log_density)
+
+
+def _num_read(observed: Observation) -> Array:
+    """Rows with a reading: the others say nothing about lambda."""
+    read = jnp.isfinite(observed.y)
+    return jnp.sum(read if observed.mask is None else read & observed.mask)
 
 
 def _at_one(dof: Array | None, count: int) -> int:
@@ -214,7 +222,7 @@ def _updated(
     """One Gaussian for the updates of all parts with all scales of the observation noise."""
     linear, count = model.inner.params, model.num_scales
     observed = observation if isinstance(observation, Observation) else Observation(observation)
-    noises, log_noises = scales(model.observation_dof, jnp.size(observed.y), count, parts.mean.dtype)
+    noises, log_noises = scales(model.observation_dof, _num_read(observed), count, parts.mean.dtype)
     moves, log_moves = scales(model.process_dof, dimension(linear.prior), count, parts.mean.dtype)
 
     def update(belief: Gaussian) -> tuple[Gaussian, KalmanInfo]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters._full_precision import dot
-from jaxfilters.math.linalg import cholesky, log_det_triangular, solve_triangular
+from jaxfilters.math.linalg import cholesky, solve_triangular
 from jaxfilters.particle.gaussian_proposals import laplace as laplace
 from jaxfilters.particle.gaussian_proposals import linearized as linearized
 
@@ -81,5 +81,8 @@ def plug_in_corrected(
     root_Q, root_N = cholesky(Q_n), cholesky(N)
     delta = dot(root_Q, noise)
     whitened = solve_triangular(root_N, delta)
-    narrower = log_det_triangular(root_Q) - log_det_triangular(root_N)
+    # A direction without noise in either has no density to correct.
+    scales = jnp.stack([jnp.diagonal(root_Q), jnp.diagonal(root_N)])
+    log_scales = jnp.log(jnp.where(jnp.any(scales > 0, axis=0), scales, 1.0))
+    narrower = jnp.sum(log_scales[0] - log_scales[1])
     return delta, 0.5 * (dot(noise, noise) - dot(whitened, whitened)) + narrower

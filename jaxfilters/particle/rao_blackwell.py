@@ -397,4 +397,8 @@ def _by_linear_observation(
 
 def _condition(belief: Gaussian, y: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
     found = arithmetic.joseph.condition(belief.covariance, C, R, y - dot(C, belief.mean))
-    return Gaussian(belief.mean + found.shift, found.covariance), found.log_density
+    # An observation that is no number makes the weights invalid; the beliefs stay those of the prediction.
+    usable = jnp.isfinite(found.log_density)
+    shift = jnp.where(usable, found.shift, 0.0)
+    covariance = jnp.where(usable, found.covariance, belief.covariance)
+    return Gaussian(belief.mean + shift, covariance), found.log_density

@@ -81,3 +81,12 @@ def test_samples_have_the_mean_and_covariance(rng, form):
     assert (abs(draws.mean(axis=1) - mean) < 4 * np.sqrt(np.diag(P) / count)).all()
     sigma = np.sqrt((np.outer(np.diag(P), np.diag(P)) + P**2) / count)
     assert (abs(np.cov(draws) - P) < 4 * sigma).all()
+
+
+def test_indices_from_the_end_are_those_from_the_beginning_and_differ(form, rng):
+    belief = form(rng.normal(size=3), rng.normal(size=(3, 3)))
+    found, expected = (belief.condition(indices, jnp.array([0.5])) for indices in ([-1], [2]))
+    assert found.mean.shape == (2,)
+    np.testing.assert_allclose(found.mean, expected.mean)
+    with pytest.raises(ValueError, match=r"indices must name different components; got \[2, -1\] of 3"):
+        belief.condition([2, -1], jnp.zeros(2))

@@ -278,3 +278,25 @@ def test_one_program_for_all_frames_and_sequences_and_a_right_gradient(x64):
 def test_impossible_banks_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         gaussian_sum.gaussian_sum(line_filter(), **arguments)
+
+
+@pytest.mark.system
+def test_branches_of_a_parent_that_merge_with_another_hypothesis_count_once(x64):
+    """Both parents branch into the same state twice: evidence and weights are those without branches."""
+    one = jnp.eye(1)
+    inner = jaxfilters.kalman(Gaussian(jnp.zeros(1), one), one, 0.0 * one, one, one)
+    means, weights = jnp.array([[0.0], [0.0], [3.0]]), jnp.array([0.3, 0.2, 0.5])
+    start = gaussian_sum.GaussianSumState(Gaussian(means, jnp.ones((3, 1, 1))), jnp.log(weights))
+    twice = lambda state, y: (jnp.stack([y, y]), jnp.ones(2, bool))
+    same = lambda a, b: jnp.all(jnp.abs(a.mean - b.mean) < 1e-9)
+    results = [
+        jaxfilters.run(
+            gaussian_sum.gaussian_sum(inner, capacity=6, start=start, same=same, **branch),
+            jax.random.key(0),
+            jnp.array([[1.5]]),
+        )
+        for branch in ({}, {"branch": twice})
+    ]
+    (plain, (_, of_plain)), (branched, (_, of_branched)) = results
+    np.testing.assert_allclose(of_branched.log_evidence, of_plain.log_evidence, rtol=1e-12)
+    np.testing.assert_allclose(branched.log_weights[:2], plain.log_weights[:2], rtol=1e-12)

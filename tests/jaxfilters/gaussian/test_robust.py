@@ -88,3 +88,17 @@ def test_what_does_not_fit_is_refused():
         robust(rooted, 0.1, jnp.eye(1))
     with pytest.raises(ValueError, match="outlier_noise"):
         robust(filter_of().params.inner, 0.1, jnp.eye(2))
+
+
+def test_a_frame_that_no_noise_explains_leaves_the_prediction():
+    """The observation of a model whose function is no number in one frame: the next frame is as after a gap."""
+    prior, noise = Gaussian(jnp.zeros(1), jnp.eye(1)), 0.1 * jnp.eye(1)
+    broken = lambda x, inputs: jnp.where(inputs > 0, x, jnp.nan)
+    inner = extended_kalman(prior, still, noise, broken, noise)
+    filter = robust(inner, outlier_probability=0.1, outlier_noise=jnp.eye(1))
+    y, inputs = jnp.array([[0.5], [0.6], [0.7]]), jnp.array([1.0, 0.0, 1.0])
+    _, (beliefs, infos) = run(filter, jax.random.key(0), y, inputs)
+    assert np.isfinite(beliefs.mean).all()
+    assert np.isneginf(infos.log_evidence[1])
+    _, (expected, _) = run(filter, jax.random.key(0), y, jnp.ones(3), mask=jnp.array([True, False, True]))
+    np.testing.assert_allclose(beliefs.mean[2], expected.mean[2], rtol=1e-5)

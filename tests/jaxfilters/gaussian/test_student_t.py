@@ -108,3 +108,14 @@ def test_an_observation_that_is_not_finite_leaves_the_prediction():
     belief, info = jf.step(filter, KEY, jf.init(filter, KEY), jnp.array([jnp.nan]))
     np.testing.assert_allclose([belief.mean[0], belief.covariance[0, 0]], [M, P + Q], rtol=1e-6)
     np.testing.assert_allclose(info.log_evidence, 0.0, atol=1e-6)
+
+
+def test_missing_rows_change_nothing_about_the_others(x64):
+    """Beside 60 rows without a reading, a reading far out in the tail has the evidence that it has alone."""
+    alone, _ = one_step(jf.student_t(line(), 4.0), 50.0)
+    wide = jf.kalman(line().params.prior, jnp.eye(1), Q * jnp.eye(1), jnp.ones((61, 1)), R * jnp.eye(61))
+    y = jnp.full(61, jnp.nan).at[0].set(50.0)
+    for observation in (y, jf.Observation(jnp.nan_to_num(y), mask=jnp.isfinite(y))):
+        filter = jf.student_t(wide, 4.0)
+        belief, info = jf.step(filter, KEY, jf.init(filter, KEY), observation)
+        np.testing.assert_allclose([belief.mean[0], belief.covariance[0, 0], info.log_evidence], alone, rtol=1e-6)

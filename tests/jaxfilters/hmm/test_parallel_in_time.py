@@ -65,3 +65,10 @@ def test_ties_give_one_of_the_paths():
     model = jf.hmm.from_probabilities([0.5, 0.5], [[0, 1], [1, 0]])
     path = jf.hmm.parallel_viterbi(model, jnp.zeros((5, 2))).states
     assert (np.abs(np.diff(path)) == 1).all()
+
+
+def test_one_frame_has_the_posterior_of_bayes_rule():
+    model = jf.hmm.from_probabilities([0.25, 0.75], [[0.9, 0.1], [0.2, 0.8]])
+    found = jf.hmm.parallel_posterior(model, jnp.log(jnp.array([[0.6, 0.2]])))
+    np.testing.assert_allclose(found.states, [[0.5, 0.5]], rtol=1e-6)
+    np.testing.assert_allclose(found.transitions, np.zeros((2, 2)))

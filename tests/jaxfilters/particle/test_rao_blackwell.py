@@ -345,3 +345,29 @@ def test_transport_is_refused(build):
             noise_dim=1,
             scheme=transport(0.5),
         )
+
+
+def test_an_observation_that_is_no_number_leaves_the_linear_beliefs_as_they_are():
+    one = jnp.ones((1, 1))
+    filter = rao_blackwell(
+        lambda key: jax.random.normal(key, (1,)),
+        Gaussian(jnp.zeros(1), one),
+        lambda x: MixedDynamics(x, 0.0 * one, one, jnp.zeros(1), one, 0.1 * one),
+        observe=lambda x: LinearObservation(x, one, one),
+        num_particles=20,
+        noise_dim=1,
+    )
+    _, (states, infos) = run(filter, jax.random.key(0), jnp.array([[0.0], [jnp.nan], [0.0]]))
+    assert np.isfinite(states.linear_mean).all()
+    assert np.isfinite(infos.log_evidence).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("direction", [0, 1])
+def test_a_direction_without_noise_needs_no_correction(direction, x64):
+    """The other direction has the correction that it has alone."""
+    noise, N, Q = np.array([0.7, -0.4]), np.diag([4.0, 4.0]), np.diag([1.0, 1.0])
+    N[direction, direction] = Q[direction, direction] = 0.0
+    other = slice(1 - direction, 2 - direction)
+    _, found = plug_in_corrected(*map(jnp.asarray, (noise, N, Q)))
+    _, alone = plug_in_corrected(*map(jnp.asarray, (noise[other], N[other, other], Q[other, other])))
+    np.testing.assert_allclose(found - 0.5 * noise[direction] ** 2, alone, rtol=1e-12)
