@@ -269,15 +269,12 @@ def propagate(belief: Gaussian, delta: Float[Array, " n"], step: MixedDynamics) 
 def init(model: RaoBlackwell, key: AnyKey) -> RaoBlackwellState:
     """Draw the ensemble from the prior."""
     prior_key, noise_key = jax.random.split(key)
-    count = model.num_particles
-    prior = model.linear_prior
-    mean = jnp.broadcast_to(prior.mean[:, None], (prior.mean.shape[0], count))
-    covariance = prior.covariance
-    if model.covariance_axis is not None:
-        covariance = jnp.broadcast_to(covariance[..., None], (*covariance.shape, count))
+    count, prior = model.num_particles, model.linear_prior
+    covariance, shared = prior.covariance, model.covariance_axis is None
+    covariance = covariance if shared else jnp.broadcast_to(covariance[..., None], (*covariance.shape, count))
     return RaoBlackwellState(
         sample_ensemble(prior_key, model.sample_prior, count),
-        mean,
+        jnp.broadcast_to(prior.mean[:, None], (prior.mean.shape[0], count)),
         covariance,
         weights.uniform(count),
         jnp.arange(count, dtype=jnp.int32),
@@ -396,9 +393,8 @@ def _by_linear_observation(
 
 
 def _condition(belief: Gaussian, y: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
-    found = arithmetic.joseph.condition(belief.covariance, C, R, y - dot(C, belief.mean))
-    # An observation that is no number makes the weights invalid; the beliefs stay those of the prediction.
-    usable = jnp.isfinite(found.log_density)
-    shift = jnp.where(usable, found.shift, 0.0)
+    innovation = y - dot(C, belief.mean)
+    usable = jnp.all(jnp.isfinite(innovation))  # Otherwise weights are invalid, and beliefs do not change.
+    found = arithmetic.joseph.condition(belief.covariance, C, R, jnp.where(usable, innovation, 0.0))
     covariance = jnp.where(usable, found.covariance, belief.covariance)
-    return Gaussian(belief.mean + shift, covariance), found.log_density
+    return Gaussian(belief.mean + found.shift, covariance), jnp.where(usable, found.log_density, jnp.nan)
