@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxfilters as jf
-from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.scenarios._real_markers import MarkedHand, Marker, marked_hand
 from jaxfilters.models.articulated.filters import Inequalities, inequalities
 from jaxfilters.models.articulated.hand import articulated_hand, with_lasting_errors
@@ -127,7 +127,7 @@ def mocap_metrics(path: Path, quick: bool) -> dict[str, Metric]:
         if some.any():
             metrics[f"dfki_length_error_mm_median{name}"] = Metric(float(np.median(error[some])), "mm", "lower")
             inside = float(np.mean(error[some] <= 2 * deviation[some]))
-            metrics[f"dfki_lengths_within_2sigma{name}"] = Metric(inside, "", "higher")
+            metrics[f"dfki_lengths_within_2sigma{name}"] = Metric(inside, "", WITHIN_TWO_SIGMA)
     return metrics
 
 
