@@ -118,7 +118,8 @@ def stereo_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     errors: dict[str, list[np.ndarray]] = {"": [], "_simple": []}
     for head in range(seed, seed + (1 if quick else 3)):
         made = sequence(jax.random.key(head), "slow", 30 if quick else 150, head)
-        errors[""].append(_pose_rms(follow(made, {"": HeadConfig(learn=False)})[""].track.pose, made.poses[1:]))
+        track = follow(made, {"": HeadConfig(learn=False)})[""].track
+        errors[""].append(_pose_rms(np.asarray(track.pose), made.poses[1:]))
         images = [image for _, part in made.chunks() for image in part]
         uv = np.stack([simplest.flowed_points([image[k] for image in images], made.uv[0, k]) for k in range(2)], axis=1)
         poses = simplest.pose_by_triangulation(np.asarray(made.shapes[0], float), uv, simplest.projections(made.rig))

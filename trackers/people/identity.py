@@ -32,7 +32,7 @@ def identity_of(
 
 def _camera(file: CameraFile) -> str:
     undistortion = file.undistortion
-    K = [] if undistortion.K is None else undistortion.K
+    K = np.zeros((0, 0)) if undistortion.K is None else undistortion.K
     return _hash(file.camera.P, K, undistortion.distortion)
 
 
