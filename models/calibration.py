@@ -5,19 +5,33 @@ in float64: it is done once for a camera. SciPy is imported by the functions tha
 than `Calibration`.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from jaxfilters.models.calibration_errors import (
+    MOST_OPEN,
+    MOST_OPEN_FLOOR,
+    Deviations,
+    camera_deviations,
+    check_determined,
+)
 from jaxfilters.models.floor_camera import canonical
 
 FEWEST_POINTS, FEWEST_FLOOR_POINTS = 6, 4
 """Of a projection matrix; of a camera over a plane with square pixels around the centre of its image."""
 FLAT = 1e-3
 """Points whose extents differ by this factor lie in a plane."""
+LEVEL = 0.05
+"""Heights that differ by this share of the extent of a floor: the plane still tells about where the camera stands."""
+MOST_OBLONG = 1.5
+"""Ratio of the sides of a pixel, as wide films squeezed into narrow images have it."""
 _COEFFICIENTS = 5
+_MOST_STEPS = 200
+"""Of a search: points that fix a camera need up to a hundred, others lead along a valley without an end."""
 _UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
@@ -34,11 +48,18 @@ class Calibration(NamedTuple):
     """The world's origin in the camera, metres."""
     rms_px: float
     """Root mean square distance of projected points and their pixels, in the image with distortion."""
+    deviations: Deviations | None = None
+    """Of cameras whose focal length was searched for; None for others."""
 
     @property
     def P(self) -> np.ndarray:
         """(3, 4): world to undistorted pixels, in canonical scale."""
         return self.K @ np.column_stack([self.R, self.t])
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) where the camera stands in the world, metres."""
+        return -self.R.T @ self.t
 
     def project(self, points_m: np.ndarray) -> np.ndarray:
         """(n, 2) pixels, in the image with distortion, of points (n, 3)."""
@@ -75,7 +96,7 @@ def calibrate_dlt(points_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray,
             would lie behind it, as those of a left-handed world.
     """
     points_m, pixels = _checked_points(points_m, pixels, FEWEST_POINTS)
-    if is_flat(points_m):
+    if _is_flat(points_m):
         raise ValueError(
             "points_m lie in one plane, or nearly: a projection matrix needs points at several heights above it "
             "(points on the floor alone need the camera's intrinsics, or those assumed by calibrate_floor)."
@@ -132,37 +153,46 @@ def refine(points_m: np.ndarray, pixels: np.ndarray, start: Calibration, *, coef
     Raises:
         ValueError: fewer equations than unknowns, wrong shapes, or points behind the camera that was found.
     """
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
     if not 0 <= coefficients <= _COEFFICIENTS:
         raise ValueError(f"coefficients must be from 0 to {_COEFFICIENTS}; got {coefficients}.")
     unknowns = 10 + coefficients
     points_m, pixels = _checked_points(points_m, pixels, (unknowns + 1) // 2)
 
-    def camera(x: np.ndarray) -> Calibration:
+    def intrinsics(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         K = np.array([[x[0], 0, x[2]], [0, x[1], x[3]], [0, 0, 1.0]])
-        turned = Rotation.from_rotvec(x[4:7]).as_matrix() @ start.R
-        # Turning about the middle of the points, not about the camera, keeps rotation and translation apart.
-        t = turned @ -middle + start.R @ middle + start.t + x[7:10]
-        return Calibration(K, np.concatenate([x[10:], start.distortion[coefficients:]]), turned, t, 0.0)
+        return K, np.concatenate([x[4:], start.distortion[coefficients:]])
 
-    middle = points_m.mean(axis=0)
-    first = np.concatenate([start.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.zeros(6), start.distortion[:coefficients]])
-    found = least_squares(lambda x: (camera(x).project(points_m) - pixels).ravel(), first, x_scale="jac", method="trf")
-    best = camera(found.x)
-    _check_in_front(points_m @ best.R[2] + best.t[2])
-    return best._replace(rms_px=_rms(best.project(points_m) - pixels))
+    first = np.concatenate([start.K[[0, 1, 0, 1], [0, 1, 2, 2]], start.distortion[:coefficients]])
+    return _nearest(points_m, pixels, start, intrinsics, first)
 
 
-def calibrate_points(points_m: np.ndarray, pixels: np.ndarray, *, coefficients: int = 0) -> Calibration:
+def calibrate_points(
+    points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[int, int], *, coefficients: int = 0
+) -> Calibration:
     """A camera from six or more points in space: direct linear transform, then `refine`.
 
+    Args:
+        points_m: (n, 3) world points in metres.
+        pixels: (n, 2) pixels in the image with distortion.
+        image_size: Columns and rows.
+        coefficients: How many of k1, k2, p1, p2, k3 are searched for.
+
     Raises:
-        ValueError: as `calibrate_dlt` and `refine`.
+        ValueError: as `calibrate_dlt` and `refine`; points that leave the focal length or the position open, as those
+            of a nearly level floor do; a principal point outside the image, or pixels that are far from square.
     """
     P, _ = calibrate_dlt(points_m, pixels)
-    return refine(points_m, pixels, _without_skew(P), coefficients=coefficients)
+    found = refine(points_m, pixels, _without_skew(P), coefficients=coefficients)
+    check_determined(*_shares(found, points_m), MOST_OPEN)
+    fx, fy = found.K[[0, 1], [0, 1]]
+    is_inside = ((found.K[:2, 2] > -0.5) & (found.K[:2, 2] < np.asarray(image_size) - 0.5)).all()
+    if not (is_inside and fx > 0 and 1 / MOST_OBLONG <= fy / fx <= MOST_OBLONG):
+        raise ValueError(
+            f"points_m and pixels fit only a camera with focal lengths of {fx:.4g} x {fy:.4g} px and its principal "
+            f"point at ({found.K[0, 2]:.4g}, {found.K[1, 2]:.4g}); expected a ratio of at most {MOST_OBLONG:g}, and a "
+            f"point in the image of {image_size[0]}x{image_size[1]}. Are the points in metres, and none exchanged?"
+        )
+    return found
 
 
 def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[int, int]) -> Calibration:
@@ -174,7 +204,7 @@ def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[
     linear in $f^2$ (Zhang 2000, equations 3 and 4).
 
     Args:
-        points_m: (n, 3) with one Z for all, or (n, 2) on the floor, metres.
+        points_m: (n, 3) at about one height, see `is_level`, or (n, 2) on the floor, metres.
         pixels: (n, 2) pixels, taken as undistorted.
         image_size: Columns and rows.
 
@@ -182,16 +212,13 @@ def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[
         ValueError: wrong shapes, too few points, points on a line or of several heights, or a view that leaves the
             focal length open, as one straight down does.
     """
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
     points_m = np.asarray(points_m, float)
     if points_m.ndim == 2 and points_m.shape[1] == 2:
         points_m = np.column_stack([points_m, np.zeros(len(points_m))])
     points_m, pixels = _checked_points(points_m, pixels, FEWEST_FLOOR_POINTS)
-    if np.ptp(points_m[:, 2]) > FLAT * np.ptp(points_m[:, :2]):
+    if not is_level(points_m):
         raise ValueError("points_m must have one height; use calibrate_points for points at several heights.")
-    if is_flat(points_m[:, :2]):
+    if _is_flat(points_m[:, :2]):
         raise ValueError("points_m lie on one line, or nearly: points to the sides of it are needed.")
     middle = (np.asarray(image_size, float) - 1) / 2
     H, _ = cv2.findHomography(points_m[:, :2], pixels - middle)
@@ -199,16 +226,12 @@ def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[
     K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
     start = calibrate_pose(points_m, pixels, K, np.zeros(_COEFFICIENTS))
 
-    def camera(x: np.ndarray) -> Calibration:
-        K = np.array([[np.exp(x[0]), 0, middle[0]], [0, np.exp(x[0]), middle[1]], [0, 0, 1]])
-        turned = Rotation.from_rotvec(x[1:4]).as_matrix() @ start.R
-        return Calibration(K, np.zeros(_COEFFICIENTS), turned, start.t + x[4:7], 0.0)
+    def intrinsics(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[np.exp(x[0]), 0, middle[0]], [0, np.exp(x[0]), middle[1]], [0, 0, 1]]), start.distortion
 
-    first = np.concatenate([[np.log(focal)], np.zeros(6)])
-    found = least_squares(lambda x: (camera(x).project(points_m) - pixels).ravel(), first, x_scale="jac")
-    best = camera(found.x)
-    _check_in_front(points_m @ best.R[2] + best.t[2])
-    return best._replace(rms_px=_rms(best.project(points_m) - pixels))
+    found = _nearest(points_m, pixels, start, intrinsics, np.log([focal]))
+    check_determined(*_shares(found, points_m), MOST_OPEN_FLOOR)
+    return found
 
 
 def calibrate_pose(points_m: np.ndarray, pixels: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> Calibration:
@@ -256,7 +279,12 @@ def distort(x: Float[np.ndarray, "n 2"], coefficients: Float[np.ndarray, " 5"]) 
     return x * radial + tangential
 
 
-def is_flat(points: np.ndarray) -> bool:
+def is_level(points_m: np.ndarray) -> bool:
+    """Whether the heights of points (n, 3) differ by little, `LEVEL`, next to their extent on the floor."""
+    return bool(np.ptp(points_m[:, 2]) <= LEVEL * np.ptp(points_m[:, :2], axis=0).max())
+
+
+def _is_flat(points: np.ndarray) -> bool:
     """Whether points (n, d) have next to no extent in some direction."""
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(extents[-1] < FLAT * extents[0])
@@ -266,6 +294,59 @@ def _without_skew(P: np.ndarray) -> Calibration:
     K, R, t = decompose(P)
     K[0, 1] = 0
     return Calibration(K, np.zeros(_COEFFICIENTS), R, t, 0.0)
+
+
+def _nearest(
+    points_m: np.ndarray,
+    pixels: np.ndarray,
+    start: Calibration,
+    intrinsics: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    first: np.ndarray,
+) -> Calibration:
+    """The camera that reprojects best, by least squares over the pose and the unknowns of `intrinsics`.
+
+    Args:
+        points_m: (n, 3) world points in metres.
+        pixels: (n, 2) pixels in the image with distortion.
+        start: The pose that the search begins with.
+        intrinsics: K and distortion, of the unknowns (k,).
+        first: (k,) unknowns that the search begins with.
+
+    Raises:
+        ValueError: points behind the camera that was found.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    middle = points_m.mean(axis=0)
+
+    def camera(x: np.ndarray) -> Calibration:
+        K, distortion = intrinsics(x[:-6])
+        turned = Rotation.from_rotvec(x[-6:-3]).as_matrix() @ start.R
+        # Turning about the middle of the points, not about the camera, keeps rotation and translation apart.
+        return Calibration(K, distortion, turned, start.R @ middle - turned @ middle + start.t + x[-3:], 0.0)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return (camera(x).project(points_m) - pixels).ravel()
+
+    start_x = np.concatenate([first, np.zeros(6)])
+    found = least_squares(errors, start_x, x_scale="jac", method="trf", max_nfev=_MOST_STEPS)
+    best = camera(found.x)
+    _check_in_front(points_m @ best.R[2] + best.t[2])
+
+    def described(x: np.ndarray) -> np.ndarray:
+        near = camera(x)
+        return np.concatenate([np.log(np.abs(near.K[[0, 1], [0, 1]])), near.position])
+
+    deviations = camera_deviations(described, found.x, found.jac, found.fun)
+    return best._replace(rms_px=_rms(found.fun.reshape(-1, 2)), deviations=deviations)
+
+
+def _shares(found: Calibration, points_m: np.ndarray) -> tuple[float, float]:
+    """Standard deviations as shares of the focal length, and of the distance to the middle of the points."""
+    assert found.deviations is not None
+    distance_m = np.linalg.norm(found.position - points_m.mean(axis=0))
+    return found.deviations.focal, float(np.linalg.norm(found.deviations.position_m) / distance_m)
 
 
 def _focal_of_homography(H: np.ndarray, size: float) -> float:

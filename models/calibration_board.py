@@ -7,11 +7,20 @@ import cv2
 import numpy as np
 
 from jaxfilters.models.calibration import Calibration, calibrate_pose
+from jaxfilters.models.calibration_errors import standard_deviations
 
 FEWEST_CORNERS = 6
 """Of a board that counts as observed."""
 FEWEST_VIEWS = 3
 """Of intrinsics that are not guessed."""
+MOST_OPEN_FOCAL = 0.02
+"""Standard deviation of a focal length that is known, as a share of it."""
+_LEAST_NOISE_PX = 0.1
+"""Standard deviation of a coordinate of a corner, at best."""
+_SAME_VIEW_PX = 1.0
+"""Root mean square distance of the corners of a board that was not moved."""
+_NUM_INTRINSICS = 9
+"""fx, fy, cx, cy, k1, k2, p1, p2, k3, in OpenCV's order."""
 _UPWARDS = np.diag([1.0, -1.0, -1.0])
 """OpenCV's boards have y down and z into the board; the world has Z up."""
 
@@ -75,19 +84,29 @@ def calibrate_intrinsics(
         image_size: Columns and rows.
 
     Raises:
-        ValueError: too few usable views.
+        ValueError: too few usable views of a board that was moved in between; views that leave the focal length open,
+            as those of boards that all face the camera do; or a lens that would map two directions to one pixel.
     """
-    usable = [view for view in views if _is_usable(view)]
+    usable = _moved([view for view in views if is_usable(view)])
     if len(usable) < FEWEST_VIEWS:
         raise ValueError(
-            f"views must show {FEWEST_CORNERS} corners or more, not in one line, in {FEWEST_VIEWS} pictures or more; "
-            f"{len(usable)} of {len(views)} do (are the squares, the sizes and the dictionary those of the board?)."
+            f"views must show {FEWEST_CORNERS} corners or more, not in one line, in {FEWEST_VIEWS} pictures or more, "
+            f"with the board moved in between; {len(usable)} of {len(views)} do (are the squares, the sizes and the "
+            "dictionary those of the board?)."
         )
-    points = [view.points_m.astype(np.float32) for view in usable]
-    pixels = [view.pixels.astype(np.float32) for view in usable]
-    guess = np.eye(3)
-    rms_px, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, image_size, guess, np.zeros(5))
-    return K, np.asarray(distortion).ravel()[:5], float(rms_px)
+    num_free = _NUM_INTRINSICS
+    rms_px, K, distortion, poses = _least_squares(usable, image_size, 0)
+    if not _is_monotone(K, distortion, image_size):
+        # A few pictures bend k3 with their noise, so that the lens folds at the rim of the image.
+        num_free -= 1
+        rms_px, K, distortion, poses = _least_squares(usable, image_size, cv2.CALIB_FIX_K3)
+    _check_focal(usable, K, distortion, poses, num_free)
+    if not _is_monotone(K, distortion, image_size):
+        raise ValueError(
+            f"views fit only a lens, k1 and k2 = {distortion[0]:.3g} and {distortion[1]:.3g}, that maps two directions "
+            f"to one pixel of the image, {image_size[0]}x{image_size[1]}; hold the board near its corners as well."
+        )
+    return K, distortion, rms_px
 
 
 def calibrate_on_floor(view: BoardView, K: np.ndarray, distortion: np.ndarray) -> Calibration:
@@ -101,7 +120,7 @@ def calibrate_on_floor(view: BoardView, K: np.ndarray, distortion: np.ndarray) -
     Raises:
         ValueError: too little of the board is visible, or the camera would be below the floor.
     """
-    if not _is_usable(view):
+    if not is_usable(view):
         raise ValueError(
             f"view must show {FEWEST_CORNERS} corners or more of the board on the floor, not in one line; "
             f"got {len(view.pixels)}."
@@ -109,8 +128,78 @@ def calibrate_on_floor(view: BoardView, K: np.ndarray, distortion: np.ndarray) -
     return calibrate_pose(view.points_m @ _UPWARDS, view.pixels, K, distortion)
 
 
-def _is_usable(view: BoardView) -> bool:
+def is_usable(view: BoardView) -> bool:
+    """Whether a view shows enough corners, and not all in one line."""
     if len(view.pixels) < FEWEST_CORNERS:
         return False
     extents = np.linalg.svd(view.points_m - view.points_m.mean(axis=0), compute_uv=False)
     return bool(extents[1] > 1e-2 * extents[0])
+
+
+def _moved(views: Sequence[BoardView]) -> list[BoardView]:
+    """Views without those that show the board where an earlier one does: with the same noise, they add nothing."""
+    kept: list[BoardView] = []
+    for view in views:
+        if not any(_is_same(view, other) for other in kept):
+            kept.append(view)
+    return kept
+
+
+def _is_same(view: BoardView, other: BoardView) -> bool:
+    if not np.array_equal(view.points_m, other.points_m):
+        return False
+    return bool(np.sqrt(((view.pixels - other.pixels) ** 2).sum(axis=1).mean()) < _SAME_VIEW_PX)
+
+
+def _least_squares(
+    views: Sequence[BoardView], image_size: tuple[int, int], flags: int
+) -> tuple[float, np.ndarray, np.ndarray, list[Any]]:
+    """`(rms_px, K, distortion, poses)`, the poses as rotation vectors and translations of the board in each view."""
+    points = [view.points_m.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    rms_px, K, lens, *poses = cv2.calibrateCamera(points, pixels, image_size, np.eye(3), np.zeros(5), flags=flags)
+    return float(rms_px), K, np.asarray(lens, float).ravel()[:5], poses
+
+
+def _check_focal(
+    views: Sequence[BoardView], K: np.ndarray, distortion: np.ndarray, poses: Sequence[Any], num_free: int
+) -> None:
+    """Raise `ValueError` where views leave the focal lengths open.
+
+    Args:
+        views: What was calibrated with.
+        K: (3, 3) intrinsics that were found.
+        distortion: (5,) k1, k2, p1, p2, k3.
+        poses: As `_least_squares` gives them.
+        num_free: How many of the intrinsics were searched for.
+    """
+    ends = np.cumsum([0, *(2 * len(view.pixels) for view in views)])
+    slopes, errors = np.zeros((ends[-1], num_free + 6 * len(views))), np.zeros(ends[-1])
+    for i, (view, turn, t) in enumerate(zip(views, *poses, strict=True)):
+        projected, derivatives = cv2.projectPoints(view.points_m, turn, t, K, distortion)
+        rows = slice(ends[i], ends[i + 1])
+        slopes[rows, :num_free] = derivatives[:, 6 : 6 + num_free]
+        slopes[rows, num_free + 6 * i : num_free + 6 * (i + 1)] = derivatives[:, :6]
+        errors[rows] = (projected.reshape(-1, 2) - view.pixels).ravel()
+    logarithms = np.zeros((slopes.shape[1], 2))
+    logarithms[[0, 1], [0, 1]] = 1 / K[[0, 1], [0, 1]]
+    deviation = standard_deviations(slopes, errors, logarithms, least_noise_px=_LEAST_NOISE_PX).max()
+    if not deviation <= MOST_OPEN_FOCAL:
+        raise ValueError(
+            f"views leave the focal length open: {K[0, 0]:.4g} px with a standard deviation of {deviation:.2g} of it; "
+            f"expected at most {MOST_OPEN_FOCAL:g}. Take more pictures, with the board tilted by 30 degrees or more to "
+            "different sides and so near that it fills much of the image."
+        )
+
+
+def _is_monotone(K: np.ndarray, distortion: np.ndarray, image_size: tuple[int, int]) -> bool:
+    """Whether directions farther from the axis lie farther from the principal point, all over the image."""
+    k1, k2, _, _, k3 = distortion
+    corners = np.array([[u, v] for u in (-0.5, image_size[0] - 0.5) for v in (-0.5, image_size[1] - 0.5)])
+    rim = np.linalg.norm((corners - K[:2, 2]) / K[[0, 1], [0, 1]], axis=1).max()
+    turns = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
+    turns = turns[(np.abs(turns.imag) < 1e-12 * np.abs(turns)) & (turns.real > 0)].real
+    if not len(turns):
+        return True
+    r2 = turns.min()
+    return bool(np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) > rim)

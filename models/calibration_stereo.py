@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfilters.models.calibration import Calibration
-from jaxfilters.models.calibration_board import FEWEST_CORNERS, FEWEST_VIEWS, BoardView
+from jaxfilters.models.calibration_board import FEWEST_CORNERS, FEWEST_VIEWS, BoardView, is_usable
 
 _UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
 _SAME_CORNER = 1e-6
@@ -57,11 +57,12 @@ def calibrate_stereo(
     if len(first) != len(second):
         raise ValueError(f"first and second must have one view each for every moment; got {len(first)}, {len(second)}.")
     pairs = [_shared(a, b) for a, b in zip(first, second, strict=True)]
-    usable = [pair for pair in pairs if len(pair[0]) >= FEWEST_CORNERS]
+    shows_enough = [is_usable(BoardView(points_m, pixels)) for points_m, pixels, _ in pairs]
+    usable = [pair for pair, is_shown in zip(pairs, shows_enough, strict=True) if is_shown]
     if len(usable) < FEWEST_VIEWS:
         raise ValueError(
-            f"both cameras must see the same {FEWEST_CORNERS} corners or more in {FEWEST_VIEWS} pairs of pictures or "
-            f"more; they do in {len(usable)} of {len(pairs)}."
+            f"both cameras must see the same {FEWEST_CORNERS} corners or more, not in one line, in {FEWEST_VIEWS} "
+            f"pairs of pictures or more; they do in {len(usable)} of {len(pairs)}."
         )
     points, pixels_1, pixels_2 = ([part.astype(np.float32) for part in parts] for parts in zip(*usable, strict=True))
     (K_1, lens_1), (K_2, lens_2) = intrinsics
@@ -73,10 +74,8 @@ def calibrate_stereo(
     cameras = [Calibration(K, lens, np.eye(3), np.zeros(3), 0.0) for K, lens in intrinsics]
     fundamental = _fundamental(K_1, K_2, R, t)
     errors = [
-        epipolar_rms(fundamental, cameras[0].undistort(u), cameras[1].undistort(v))
-        if len(x) >= FEWEST_CORNERS
-        else np.nan
-        for x, u, v in pairs
+        epipolar_rms(fundamental, cameras[0].undistort(u), cameras[1].undistort(v)) if is_shown else np.nan
+        for (_, u, v), is_shown in zip(pairs, shows_enough, strict=True)
     ]
     return StereoPose(np.asarray(R, float), t, float(rms_px), np.asarray(errors))
 

@@ -34,6 +34,11 @@ def wide_camera():
     return Calibration(K, LENS, roll @ camera.R, -roll @ camera.R @ [-0.5, -2.5, 2.4], 0.0)
 
 
+def level_camera():
+    """Where the paper's camera is, with 640 x 480 pixels."""
+    return paper_camera()._replace(K=np.array([[560.0, 0, 319.5], [0, 560, 239.5], [0, 0, 1]]))
+
+
 def points_in_view(seed, n, *, height=1.8):
     rng = np.random.default_rng(seed)
     return rng.uniform([-2, 0.3, 0], [0.3, 3, height], (n, 3))
@@ -86,7 +91,7 @@ def test_refinement_finds_the_lens(coefficients):
     truth = wide_camera()
     truth = truth._replace(distortion=np.where(np.arange(5) < coefficients, truth.distortion, 0))
     points = points_in_view(1, 60)
-    found = calibrate_points(points, truth.project(points), coefficients=coefficients)
+    found = calibrate_points(points, truth.project(points), (640, 480), coefficients=coefficients)
     assert found.rms_px < 1e-6
     np.testing.assert_allclose(found.K, truth.K, rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(found.P, truth.P, rtol=1e-4, atol=1e-3)
@@ -112,6 +117,43 @@ def test_points_on_the_floor_alone_place_a_camera_with_square_pixels():
     np.testing.assert_allclose(found.P, truth.P, rtol=1e-4, atol=1e-4)
     four = np.array([[0.0, 0.3, 0], [-2, 0.3, 0], [-2, 3, 0], [0, 3, 0]])
     np.testing.assert_allclose(calibrate_floor(four, truth.project(four), (160, 120)).P, truth.P, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_nearly_level_floor_fixes_no_matrix_but_a_camera_with_square_pixels(seed):
+    """All heights are errors of 1 cm, over 3 m of floor."""
+    truth, rng = level_camera(), np.random.default_rng(seed)
+    floor = points_in_view(seed, 12, height=0.0)
+    measured = floor + rng.normal(0, 0.01, floor.shape)
+    pixels = truth.project(floor) + rng.normal(0, 0.5, (12, 2))
+    with pytest.raises(ValueError, match=r"leave the camera open|behind it"):
+        calibrate_points(measured, pixels, (640, 480))
+    found = calibrate_floor(measured, pixels, (640, 480))
+    assert abs(np.log(found.K[0, 0] / 560)) < 3 * found.deviations.focal < 0.2
+    assert (np.abs(found.position - truth.position) < 3 * found.deviations.position_m).all()
+
+
+def test_standard_deviations_are_those_of_the_errors():
+    """Squared errors over their variances have a mean of one; of 3 x 40, its standard error is about 0.2."""
+    truth, shares, focals = level_camera(), [], []
+    for seed in range(40):
+        points = points_in_view(seed, 20)
+        found = calibrate_points(
+            points, truth.project(points) + np.random.default_rng(seed).normal(0, 0.7, (20, 2)), (640, 480)
+        )
+        shares.append((found.position - truth.position) / found.deviations.position_m)
+        focals.append(np.log(found.K[0, 0] / 560) / found.deviations.focal)
+    assert 0.5 < np.mean(np.square(shares)) < 1.6
+    assert 0.4 < np.mean(np.square(focals)) < 1.6
+
+
+def test_cameras_that_none_builds_are_named():
+    points, truth = points_in_view(0, 20), level_camera()
+    flat = truth._replace(K=np.diag([560.0, 300.0, 1]) + np.array([[0, 0, 319.5], [0, 0, 239.5], [0, 0, 0]]))
+    with pytest.raises(ValueError, match=r"focal lengths of 560 x 300 px .* ratio of at most 1\.5"):
+        calibrate_points(points, flat.project(points), (640, 480))
+    with pytest.raises(ValueError, match=r"principal point at \(319\.5, 239\.5\); .* in the image of 640x200"):
+        calibrate_points(points, truth.project(points), (640, 200))
 
 
 def test_known_intrinsics_leave_the_pose():

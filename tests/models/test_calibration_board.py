@@ -93,10 +93,64 @@ def test_an_image_without_the_board_shows_nothing():
     assert (view.points_m.shape, view.pixels.shape) == ((0, 3), (0, 2))
 
 
+def noisy_view(turn, middle, seed, lens=LENS):
+    """The corners of the board in the image, with 0.1 px of noise."""
+    R, t = pose(turn, middle)
+    inner = np.stack([*np.meshgrid(np.arange(1, 7), np.arange(1, 5)), np.zeros((4, 6))], axis=-1).reshape(-1, 3) * 0.04
+    pixels = Calibration(K, lens, R, t, 0.0).project(inner)
+    pixels += np.random.default_rng(seed).normal(0, 0.1, pixels.shape)
+    is_inside = ((pixels > 0) & (pixels < (639, 479))).all(axis=1)
+    return BoardView(inner[is_inside], pixels[is_inside])
+
+
+@pytest.mark.parametrize("num_views", [6, 12])
+def test_boards_that_face_the_camera_leave_the_focal_length_open(num_views):
+    """OpenCV finds another focal length, and calls it good: its own standard deviations miss the open direction."""
+    middles = [(0.004 * i - 0.02, 0.0, 0.45 + 0.02 * i) for i in range(num_views)]
+    facing = [noisy_view((0, 0, 0.05 * i), middle, i) for i, middle in enumerate(middles)]
+    with pytest.raises(ValueError, match=r"leave the focal length open: .* tilted by 30 degrees"):
+        calibrate_intrinsics(facing, SIZE)
+    alike = [noisy_view((0.3, 0.2, 0), middle, i) for i, middle in enumerate(middles[:3])]
+    with pytest.raises(ValueError, match="leave the focal length open"):
+        calibrate_intrinsics(alike, SIZE)
+
+
+def test_a_picture_counts_once():
+    """The noise of copies does not average out, so that their number must not lower the standard deviation."""
+    copies = [noisy_view((0.5, 0.3, 0), (0, 0, 0.42), 0)] * 12
+    with pytest.raises(ValueError, match="with the board moved in between; 1 of 12 do"):
+        calibrate_intrinsics(copies, SIZE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_four_tilted_pictures_are_enough(seed):
+    turns = [(0.5, 0, 0), (-0.5, 0.1, 0.2), (0, 0.5, 0), (0.1, -0.5, -0.3)]
+    tilted = [noisy_view(turn, (0.02 * i - 0.03, 0, 0.42), 10 * seed + i) for i, turn in enumerate(turns)]
+    found, _, rms_px = calibrate_intrinsics(tilted, SIZE)
+    np.testing.assert_allclose(found[[0, 1], [0, 1]], [520, 516], rtol=0.03)
+    assert rms_px < 0.2
+
+
+def test_a_lens_never_folds_in_the_image():
+    """Corners in the middle of the image leave k3 to their noise: directions must still keep their order at the rim."""
+    turns = [(0.6, 0, 0), (-0.6, 0.1, 0.2), (0, 0.6, 0), (0.1, -0.6, -0.3)]
+    for seed in range(6):
+        central = [noisy_view(turn, (0, 0, 0.6), 10 * seed + i) for i, turn in enumerate(turns)]
+        found, lens, _ = calibrate_intrinsics(central, SIZE)
+        rim = np.linalg.norm((found[:2, 2] + 0.5) / found[[0, 1], [0, 1]])
+        radii = np.linspace(0, 1.5 * rim, 400)
+        mapped = Calibration(np.eye(3), lens * [1, 1, 0, 0, 1], np.eye(3), np.zeros(3), 0.0).project(
+            np.column_stack([radii, 0 * radii, 1 + 0 * radii])
+        )[:, 0]
+        until = np.argmax(mapped > rim) or len(radii)
+        assert (np.diff(mapped[:until]) > 0).all()
+        assert mapped.max() > rim
+
+
 def test_too_little_to_see_is_named(views):
     nothing = BoardView(np.zeros((0, 3)), np.zeros((0, 2)))
     row = BoardView(np.column_stack([np.arange(8.0), np.zeros((8, 2))]), np.zeros((8, 2)))
-    with pytest.raises(ValueError, match=r"in 3 pictures or more; 2 of 4 do \(are the squares"):
+    with pytest.raises(ValueError, match=r"with the board moved in between; 2 of 4 do \(are the squares"):
         calibrate_intrinsics([*views[:2], nothing, row], SIZE)
     with pytest.raises(ValueError, match="corners or more of the board on the floor, not in one line; got 0"):
         calibrate_on_floor(nothing, K, LENS)

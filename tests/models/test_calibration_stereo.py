@@ -73,6 +73,10 @@ def test_pairs_that_show_too_little_are_left_out_or_refused():
     found = calibrate_stereo([*left[:4], nothing], right[:5], INTRINSICS, SIZE)
     np.testing.assert_array_equal(np.isnan(found.epipolar_px), [False] * 4 + [True])
     np.testing.assert_allclose(found.t, T, atol=1e-5)
+    row = [BoardView(BOARD[:6], np.zeros((6, 2)))] * 8
+    lines = [BoardView(BOARD[:6], Calibration(K_RIGHT, LENSES[1], R, (0, 0, 0.5), 0.0).project(BOARD[:6]))] * 8
+    with pytest.raises(ValueError, match="not in one line, in 3 pairs of pictures or more; they do in 0 of 8"):
+        calibrate_stereo(row, lines, INTRINSICS, SIZE)
     with pytest.raises(ValueError, match="one view each for every moment; got 4, 5"):
         calibrate_stereo(left[:4], right[:5], INTRINSICS, SIZE)
     with pytest.raises(ValueError, match="in 3 pairs of pictures or more; they do in 2 of 3"):

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxfilters.models.calibration import (
+    FEWEST_FLOOR_POINTS,
     FEWEST_POINTS,
     Calibration,
     calibrate_floor,
     calibrate_points,
     calibrate_pose,
     floor_errors_m,
-    is_flat,
+    is_level,
 )
 from jaxfilters.models.calibration_board import (
     calibrate_intrinsics,
@@ -21,10 +22,10 @@ from jaxfilters.models.calibration_board import (
     charuco_board,
     detect_board,
 )
-from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.tsai import calibration_of_tsai
+from jaxfilters.trackers.calibration.checked import write_checked
 from jaxfilters.trackers.calibration.stereo import calibrate_rig
-from jaxfilters.trackers.io.cameras import open_intrinsics, read_tsai, write_calibration, write_camera
+from jaxfilters.trackers.io.cameras import open_camera, open_intrinsics, read_tsai, write_calibration, write_camera
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import read_image
 from jaxfilters.trackers.io.tables import exactly, read_table
@@ -66,22 +67,37 @@ def _from_points(options: argparse.Namespace) -> str:
 
 def _camera_of_points(points_m: np.ndarray, pixels: np.ndarray, options: argparse.Namespace) -> tuple[Calibration, str]:
     if options.intrinsics is not None:
+        if options.distortion:
+            raise ValueError(
+                f"--distortion finds what --intrinsics {options.intrinsics} gives; expected one of the two options."
+            )
         K, distortion, size = open_intrinsics(options.intrinsics)
         if size != options.image_size:
             raise ValueError(f"{options.intrinsics} is for images of {size[0]}x{size[1]}; got {options.image_size}.")
         return calibrate_pose(points_m, pixels, K, distortion), "the pose, with the intrinsics that were given"
-    if len(points_m) >= 4 and is_flat(points_m):
-        if options.distortion:
-            raise ValueError("points in one plane do not show distortion; add points at other heights, or use a board.")
-        how = "pose and focal length (all points lie in one plane: square pixels about the image's centre are assumed)"
-        return calibrate_floor(points_m, pixels, options.image_size), how
-    if len(points_m) < FEWEST_POINTS:
-        raise ValueError(f"{FEWEST_POINTS} points or more are needed, or 4 in one plane; got {len(points_m)}.")
+    may_be_floor = len(points_m) >= FEWEST_FLOOR_POINTS and is_level(points_m)
+    if len(points_m) < FEWEST_POINTS and not may_be_floor:
+        raise ValueError(
+            f"{FEWEST_POINTS} points or more are needed, or {FEWEST_FLOOR_POINTS} at one height; got {len(points_m)}."
+        )
     coefficients = 0
     if options.distortion:
         coefficients = 5 if len(points_m) >= _MANY_POINTS else _FEW_COEFFICIENTS
-    how = "pose and intrinsics" + (f", {coefficients} coefficients of distortion" if coefficients else "")
-    return calibrate_points(points_m, pixels, coefficients=coefficients), how
+    # Heights that differ by centimetres may be errors of the tape. They count where they fix a projection matrix.
+    try:
+        found = calibrate_points(points_m, pixels, options.image_size, coefficients=coefficients)
+        return found, "pose and intrinsics" + (f", {coefficients} coefficients of distortion" if coefficients else "")
+    except ValueError:
+        if not may_be_floor:
+            raise
+    if options.distortion:
+        raise ValueError(
+            "points in one plane, or nearly, do not show distortion; add points at other heights, or use a board."
+        )
+    how = (
+        "pose and focal length (all points are at about one height: square pixels about the image's centre are assumed)"
+    )
+    return calibrate_floor(points_m, pixels, options.image_size), how
 
 
 def read_room_points(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -111,7 +127,11 @@ def _from_boards(options: argparse.Namespace) -> str:
     corners = sum(len(view.pixels) for view in views.values())
     lines = [f"intrinsics from {corners} corners in {len(files)} pictures: reprojection error {rms_px:.3f} px"]
     if options.floor is None:
-        write_camera(options.out, size, K=K, distortion=distortion, name=options.out.stem)
+
+        def write(path: Path) -> None:
+            write_camera(path, size, K=K, distortion=distortion, name=options.out.stem)
+
+        write_checked(options.out, write, open_intrinsics)
         lines += [
             f"focal length {K[0, 0]:.1f} x {K[1, 1]:.1f} px; where the camera stands is open: give --floor IMAGE of a "
             f"board on the floor, or use `calibrate points --intrinsics {options.out}`",
@@ -148,12 +168,17 @@ def _written(
     pixels: np.ndarray | None = None,
     lines: list[int] | None = None,
 ) -> str:
-    """Write the camera and describe it; it is checked as its reader will."""
-    cols, rows = options.image_size
-    camera = as_input_error(lambda: FloorCamera.from_matrix(calibration.P, (rows, cols)))
-    write_calibration(options.out, calibration, (cols, rows), name=options.out.stem)
-    x, y, z = np.asarray(camera.position(), float)
+    """Write the camera and describe it."""
+
+    def write(path: Path) -> None:
+        write_calibration(path, calibration, options.image_size, name=options.out.stem)
+
+    write_checked(options.out, write, open_camera)
+    x, y, z = calibration.position
     described = [f"camera at ({x:.2f}, {y:.2f}) m, {z:.2f} m above the floor; from {how}"]
+    if calibration.deviations is not None:
+        focal, (x, y, z) = calibration.deviations
+        described += [f"standard deviations: focal length {focal:.1%}, position ({x:.2f}, {y:.2f}, {z:.2f}) m"]
     if points_m is not None and pixels is not None:
         described += _errors(calibration, points_m, pixels, lines)
     return "\n".join([*described, f"camera in {options.out}"])

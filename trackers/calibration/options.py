@@ -27,10 +27,12 @@ def _add_points(sources: Any, pair: Callable[[str], Pair]) -> None:
         type=Path,
         metavar="FILE.csv",
         help="columns x_m,y_m,z_m,u,v: metres with Z up from the floor, pixels from the centre of the top left one; "
-        "six or more at several heights, or four or more in one plane",
+        "six or more at several heights, or four or more on the floor",
     )
     points.add_argument("--image-size", type=pair, required=True, metavar="WIDTHxHEIGHT", help="of the images")
-    points.add_argument("--distortion", action="store_true", help="find the lens's distortion as well")
+    points.add_argument(
+        "--distortion", action="store_true", help="find the lens's distortion as well; not with --intrinsics"
+    )
     points.add_argument(
         "--intrinsics", type=Path, metavar="CAMERA.json", help="keep K and distortion of this file; find the pose alone"
     )

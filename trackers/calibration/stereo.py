@@ -8,9 +8,10 @@ import numpy as np
 
 from jaxfilters.models.calibration_board import BoardView, calibrate_intrinsics, charuco_board, detect_board
 from jaxfilters.models.calibration_stereo import StereoPose, calibrate_stereo
+from jaxfilters.trackers.calibration.checked import write_checked
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import images_in, read_image
-from jaxfilters.trackers.io.rigs import RigCamera, write_rig
+from jaxfilters.trackers.io.rigs import RigCamera, open_rig, write_rig
 
 WORST_PX = 3.0
 """Epipolar error beyond which there is no rig: landmarks are matched along these lines."""
@@ -45,7 +46,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
         for folder, (K, distortion, _), (R, t_mm) in zip(folders, found, poses, strict=True)
     ]
     note = f"reprojection error {pose.rms_px:.3g} px, epipolar error {total:.3g} px"
-    write_rig(options.out, cameras, note=note)
+    write_checked(options.out, lambda path: write_rig(path, cameras, note=note), open_rig)
     return _described(options, pose, total, cameras, [rms for *_, rms in found])
 
 

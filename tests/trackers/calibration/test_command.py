@@ -56,7 +56,7 @@ def test_points_on_the_floor_alone(tmp_path, capsys):
     assert "square pixels about the image's centre are assumed" in capsys.readouterr().out
     np.testing.assert_allclose(open_camera(out).camera.P, straight.P, rtol=1e-3, atol=0.01)
     assert calibrate("points", file, "--image-size", SIZE, "--distortion", "--out", out) == FAILURE
-    assert "points in one plane do not show distortion" in capsys.readouterr().err
+    assert "points in one plane, or nearly, do not show distortion" in capsys.readouterr().err
 
 
 def test_points_with_known_intrinsics(tmp_path, capsys):
@@ -67,6 +67,8 @@ def test_points_with_known_intrinsics(tmp_path, capsys):
     given = ("--image-size", SIZE, "--intrinsics", tmp_path / "k.json", "--out", out)
     assert calibrate("points", file, *given) == 0
     np.testing.assert_allclose(open_camera(out).camera.P, CAMERA.P, rtol=1e-3, atol=0.01)
+    assert calibrate("points", file, *given, "--distortion") == FAILURE
+    assert "--distortion finds what --intrinsics" in capsys.readouterr().err
     given = ("--image-size", "320x240", "--intrinsics", tmp_path / "k.json", "--out", out)
     capsys.readouterr()
     assert calibrate("points", file, *given) == FAILURE
@@ -93,7 +95,7 @@ def test_the_worst_point_is_pointed_at(tmp_path, capsys):
         ("x_m,y_m,z_m,u,v\n1,2,3,4,5,6\n", "line 2 has 6 entries, its header 5"),
         ("x_m,y_m,z_m,u,v\n1,2,3,-4,5\n", "line 2: pixel (-4, 5) lies outside an image of 640x480"),
         ("x_m,y_m,z_m,u,v\n1,2,3,4,500\n", "line 2: pixel (4, 500) lies outside an image of 640x480"),
-        ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n2,3,4,5,6\n", "6 points or more are needed, or 4 in one plane; got 2"),
+        ("x_m,y_m,z_m,u,v\n1,2,3,4,5\n2,3,4,5,6\n", "6 points or more are needed, or 4 at one height; got 2"),
         ("x_m,y_m,z_m,u,v\n", "got 0"),
     ],
 )
@@ -102,6 +104,53 @@ def test_wrong_points_are_named(tmp_path, capsys, content, message):
     assert calibrate("points", tmp_path / "p.csv", "--image-size", SIZE, "--out", tmp_path / "c.json") == FAILURE
     assert message in capsys.readouterr().err
     assert not (tmp_path / "c.json").exists()
+
+
+STRAIGHT = CAMERA._replace(distortion=np.zeros(5))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_floor_measured_with_a_tape_places_the_camera(tmp_path, capsys, seed):
+    """Heights of a few centimetres, all of them errors: a projection matrix puts such cameras metres away."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform([-2, 0.2], [0, 3], (12, 2)), np.zeros(12)])
+    pixels = STRAIGHT.project(floor) + rng.normal(0, 0.5, (12, 2))
+    rows = np.column_stack([floor + rng.normal(0, 0.01, floor.shape), pixels])
+    rows = rows[((pixels > 0) & (pixels < (639, 479))).all(axis=1)]
+    file, out = tmp_path / "points.csv", tmp_path / "camera.json"
+    np.savetxt(file, rows, delimiter=",", header="x_m,y_m,z_m,u,v", comments="")
+    assert calibrate("points", file, "--image-size", SIZE, "--out", out) == 0
+    text = capsys.readouterr().out
+    assert "square pixels about the image's centre are assumed" in text
+    focal_percent, *position_m = map(
+        float, re.search(r"focal length ([\d.]+)%, position \(([\d.]+), ([\d.]+), ([\d.]+)\) m", text).groups()
+    )
+    assert 0 < focal_percent < 10
+    assert 0 < max(position_m) < 0.3
+    np.testing.assert_allclose(open_camera(out).camera.position(), STRAIGHT.position, atol=0.25)
+    mirrored = rows * [-1, 1, 1, 1, 1]
+    np.savetxt(file, mirrored, delimiter=",", header="x_m,y_m,z_m,u,v", comments="")
+    assert calibrate("points", file, "--image-size", SIZE, "--out", out) == FAILURE
+
+
+def test_low_steps_that_leave_the_camera_open_are_named(tmp_path, capsys):
+    """Heights up to 30 cm over 2.8 m, pixels good to one: too high for a floor, too low for a projection matrix."""
+    file, out = points_file(tmp_path, STRAIGHT, n=12, height=0.3, noise=1.0), tmp_path / "c.json"
+    assert calibrate("points", file, "--image-size", SIZE, "--out", out) == FAILURE
+    assert re.search(r"points.csv: points_m and pixels leave the camera open: .* Give points", capsys.readouterr().err)
+    assert not out.exists()
+
+
+def test_a_camera_that_its_reader_refuses_is_not_written(tmp_path, capsys):
+    """Points in centimetres: a camera 264 m above the floor."""
+    file, out = points_file(tmp_path, STRAIGHT, n=20), tmp_path / "camera.json"
+    rows = np.loadtxt(file, delimiter=",", skiprows=1) * [100, 100, 100, 1, 1]
+    np.savetxt(file, rows, delimiter=",", header="x_m,y_m,z_m,u,v", comments="")
+    out.write_text("what was there")
+    assert calibrate("points", file, "--image-size", SIZE, "--out", out) == FAILURE
+    error = capsys.readouterr().err
+    assert f"{out}: not written, since it could not be used: the camera stands 264 m above the floor" in error
+    assert out.read_text() == "what was there"
 
 
 def board_pictures(folder):
@@ -143,7 +192,7 @@ def test_pictures_that_do_not_fit_are_named(tmp_path, capsys):
     assert calibrate("charuco", *files, "--squares", "2x5", *board) == FAILURE
     assert "squares must be three or more" in capsys.readouterr().err
     assert calibrate("charuco", files[0], "--squares", "7x5", *board) == FAILURE
-    assert "in 3 pictures or more; 1 of 1 do" in capsys.readouterr().err
+    assert "with the board moved in between; 1 of 1 do" in capsys.readouterr().err
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((40, 50), np.uint8))
     assert calibrate("charuco", files[0], tmp_path / "small.png", "--squares", "7x5", *board) == FAILURE
     assert "small.png: (50, 40) pixels" in capsys.readouterr().err
