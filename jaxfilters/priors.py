@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
+from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian
-from jaxfilters.math import linalg
 from jaxfilters.particle import checks
 from jaxfilters.typing import AnyKey, DrawNoise, SamplePrior, as_pytree
 
@@ -77,7 +77,7 @@ class GaussianPrior:
         """Draw `num_particles` vectors, one a column."""
         mean = self.belief.mean
         noise = standard_normal(key, (mean.shape[0], num_particles), mean.dtype)
-        return mean[:, None] + jnp.matmul(linalg.cholesky(self.belief.covariance), noise, precision="highest")
+        return mean[:, None] + jnp.matmul(factor.exact_root(self.belief.covariance), noise, precision="highest")
 
 
 def from_noise(transform: Callable[[Any], PyTree], noise: DrawNoise) -> FromNoise:

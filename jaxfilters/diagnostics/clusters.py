@@ -19,7 +19,7 @@ class Draws(NamedTuple):
     number: Float[Array, " m"]
     """Between 1 and the number of frames."""
     correlation: Float[Array, " m"]
-    """Autocorrelation from one frame to the next."""
+    """Autocorrelation from one frame that is there to the next."""
 
 
 def effective_draws(errors: Float[Array, "t m"]) -> Draws:
@@ -29,6 +29,10 @@ def effective_draws(errors: Float[Array, "t m"]) -> Draws:
     have, and at least one (G. V. Bayley and J. M. Hammersley, "The effective number of independent observations in an
     autocorrelated time series", Supplement to J. R. Statist. Soc. 8, 1946). A mean of a statistic over the recording,
     such as that of `nees`, has about the spread of one over so many independent frames.
+
+    Over gaps, $\phi$ is the correlation from a frame that is there to the next one, and t the number of frames that are
+    there. This is exact where gaps are all alike or independent of one another, e.g. frames missing at random, and
+    counts too few draws where frames that are there come in short bursts.
 
     Args:
         errors: Estimates minus truth, time first, (t, m), at least two frames; NaN where there is none.
@@ -45,10 +49,14 @@ def effective_draws(errors: Float[Array, "t m"]) -> Draws:
         >>> jf.diagnostics.effective_draws(jnp.ones((100, 1))).number.tolist()
         [1.0]
     """
-    phi = jnp.clip(autocorrelation(errors, 1)[1], 0.0, 1.0)
-    # The sample autocorrelation of a constant is 1 - 1 / t.
-    frames = jnp.sum(jnp.isfinite(errors), axis=0)
-    phi = jnp.minimum(phi * frames / jnp.maximum(frames - 1, 1), 1.0)
+    checks.floating("errors", errors)
+    known = jnp.isfinite(errors)
+    frames, length = jnp.sum(known, axis=0), errors.shape[0]
+    # A stable sort moves the frames that are there to the front, in their order.
+    dense = jnp.take_along_axis(errors, jnp.argsort(~known, axis=0, stable=True), axis=0)
+    phi = jnp.clip(autocorrelation(dense, 1)[1], 0.0, 1.0)
+    # The sample autocorrelation of a constant is 1 - 1 / t. A single frame is one draw.
+    phi = jnp.where(frames == 1, 0.0, jnp.minimum(phi * length / max(length - 1, 1), 1.0))
     return Draws(jnp.maximum(frames * (1 - phi) / (1 + phi), 1.0), phi)
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxfilters._full_precision import PRECISION
 from jaxfilters._struct import pytree_dataclass
@@ -27,6 +27,8 @@ _ARMIJO = 1e-4
 """Constant of the sufficient decrease condition (Nocedal and Wright, equation 3.4)."""
 _MIN_STEP_LENGTH = 1e-10
 """Step length at which the backtracking line search gives up."""
+_GROWTH = 10.0
+"""Factor of the next step where the last one was too short for the gradient to tell a curvature."""
 
 
 class FirstOrderState(NamedTuple):
@@ -87,6 +89,8 @@ class BfgsState(NamedTuple):
     """Step length along `direction`."""
     num_accepted: Int[Array, ""]
     """Number of accepted points, including the first one."""
+    nearly: Bool[Array, ""]
+    """Whether the last accepted point promised no more than the tolerance: the trial point is to confirm it."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,8 @@ class Bfgs:
     """Quasi-Newton steps with backtracking (J. Nocedal and S. Wright, "Numerical optimization", 2006, algorithm 6.1).
 
     One step evaluates the loss and its gradient once. The search converges when the predicted decrease of the next full
-    step is at most `tolerance`.
+    step is at most `tolerance` and the step to it confirms this. The curvature that predicts it may be that of a steep
+    wall before the last point: the step then finds a smaller curvature, or none, and the search continues.
     """
 
     max_steps: int
@@ -106,7 +111,9 @@ class Bfgs:
         del objective, bounds
         infinite, one = jnp.full((), jnp.inf, z.dtype), jnp.ones((), z.dtype)
         none = jnp.zeros_like(z)
-        return BfgsState(z, infinite, none, jnp.eye(z.size, dtype=z.dtype), none, one, jnp.zeros((), jnp.int32))
+        return BfgsState(
+            z, infinite, none, jnp.eye(z.size, dtype=z.dtype), none, one, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        )
 
     def step(self, objective: Any, step: Array, z: Array, state: BfgsState, bounds: tuple[Array, Array]) -> StepResult:
         """Evaluate the trial point, and accept it or halve the step."""
@@ -119,19 +126,30 @@ class Bfgs:
         accept = first | (loss <= state.loss + _ARMIJO * state.length * descent + rounding)
         accepted = jnp.where(accept, state.trial, z)
         loss, slope = jnp.where(accept, loss, state.loss), jnp.where(accept, gradient, state.gradient)
-        inverse = jnp.where(accept, _updated_inverse(state, state.trial - z, gradient), state.inverse_hessian)
+        updated, curved = _updated_inverse(state, state.trial - z, gradient)
+        inverse = jnp.where(accept, updated, state.inverse_hessian)
+        # A step too short to show a curvature confirms nothing, unless a unit curvature promises no more, either.
+        steep = (0.5 * jnp.sum(slope**2) > self.tolerance) & jnp.any(state.trial != z)
+        unclear = accept & state.nearly & ~curved & steep
+        inverse = jnp.where(unclear, _GROWTH, 1.0) * inverse
         direction = jnp.where(accept, -_product(inverse, slope), state.direction)
         length = jnp.where(accept, 1.0, 0.5 * state.length)
-        predicted = -0.5 * jnp.sum(slope * direction)
-        converged = (accept & ~first & (predicted <= self.tolerance)) | (length < _MIN_STEP_LENGTH)
+        low = -0.5 * jnp.sum(slope * direction) <= self.tolerance
+        # A rejected step shows that even less can be gained than predicted.
+        confirmed = state.nearly & (~accept | (low & ~unclear))
+        converged = confirmed | (length < _MIN_STEP_LENGTH)
+        nearly = jnp.where(accept, low, state.nearly)
         after = BfgsState(
-            accepted + length * direction, loss, slope, inverse, direction, length, state.num_accepted + accept
+            accepted + length * direction, loss, slope, inverse, direction, length, state.num_accepted + accept, nearly
         )
         return StepResult(accepted, after, loss, slope, z, converged)
 
 
-def _updated_inverse(state: BfgsState, step: Array, gradient: Array) -> Array:
-    """The inverse Hessian approximation after an accepted step (Nocedal and Wright, equations 6.17 and 6.20)."""
+def _updated_inverse(state: BfgsState, step: Array, gradient: Array) -> tuple[Array, Bool[Array, ""]]:
+    """The inverse Hessian approximation after an accepted step, and whether that shows a positive curvature.
+
+    Nocedal and Wright, equations 6.17 and 6.20.
+    """
     unit = jnp.eye(step.size, dtype=step.dtype)
     change = gradient - state.gradient
     curvature, square = jnp.sum(step * change), jnp.sum(change**2)
@@ -144,7 +162,7 @@ def _updated_inverse(state: BfgsState, step: Array, gradient: Array) -> Array:
     after = _product(_product(left, before), left.T) + rate * jnp.outer(step, step)
     # The very first step has at most unit length.
     initial = unit / jnp.maximum(1.0, jnp.sqrt(jnp.sum(gradient**2)))
-    return jnp.where(state.num_accepted == 0, initial, jnp.where(curved, after, state.inverse_hessian))
+    return jnp.where(state.num_accepted == 0, initial, jnp.where(curved, after, state.inverse_hessian)), curved
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -42,7 +42,10 @@ class Gaussian:
 
     def sample(self, key: Key, count: int) -> Float[Array, "n count"]:
         """Independent draws, (n, count): one per column."""
-        return GaussianRoot(self.mean, linalg.cholesky(self.covariance)).sample(key, count)
+        # That package imports this module.
+        from jaxfilters.gaussian.arithmetic import factor
+
+        return GaussianRoot(self.mean, factor.exact_root(self.covariance)).sample(key, count)
 
     def marginal(self, indices: Sequence[int]) -> "Gaussian":
         """Belief about the chosen components, in that order."""

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxfilters._full_precision import dot
 from jaxfilters._struct import pytree_dataclass
 from jaxfilters._xla.noise import standard_normal
+from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.linearize import Linearize, taylor
 from jaxfilters.math.linalg import cholesky, log_det_triangular, matmul, safe_norm, solve_triangular
@@ -264,10 +265,10 @@ def prediction(
     ahead = checks.like("the result of transition", model.transition(x, inputs), x, "x")
     if not callable(model.process_noise):
         checks.check_shape("process_noise", model.process_noise, x.shape * 2, "the size of x")
-        return ahead, cholesky(model.process_noise)
+        return ahead, factor.exact_root(model.process_noise)
     Q = model.process_noise(inputs)
     checks.check_covariance("the result of process_noise", Q, x.size)
-    return ahead, cholesky(Q)
+    return ahead, factor.exact_root(Q)
 
 
 def _precision_root(fit: Callable, z: Array) -> Array:

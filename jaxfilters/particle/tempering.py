@@ -6,6 +6,7 @@ before that factor, so that a guide whose correction is uneven is tempered toget
 """
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfilters import weights
@@ -24,12 +25,13 @@ class AdaptiveTempering:
 
     With weights $W_i$ before an update and factors $g_i$, the update uses $W_i g_i^\beta$ with the largest
     $\beta \le 1$ for which the effective sample size (ESS) of $W_i g_i^\beta$ is at least `ess_fraction` times that of
-    $W_i$. The factor $g_i$ is the likelihood $p(y \mid x_i)$, times the ratio of transition and proposal density where
-    the proposal is `guided`: at a small power the particles then stay where the guide put them, and are not returned to
-    the prediction. The choice of a power by the effective sample size follows A. Jasra, D. A. Stephens, A. Doucet and
-    T. Tsagaris, "Inference for Levy-driven stochastic volatility models via adaptive sequential Monte Carlo",
-    Scandinavian Journal of Statistics 38, 2011. Wherever the power is below 1 the posterior is wider than the exact
-    one, and the log evidence is that of the tempered model.
+    the $W_i$ with $g_i > 0$: no power brings back a particle that is impossible. The factor $g_i$ is the likelihood
+    $p(y \mid x_i)$, times the ratio of transition and proposal density where the proposal is `guided`: at a small power
+    the particles then stay where the guide put them, and are not returned to the prediction. The choice of a power by
+    the effective sample size follows A. Jasra, D. A. Stephens, A. Doucet and T. Tsagaris, "Inference for Levy-driven
+    stochastic volatility models via adaptive sequential Monte Carlo", Scandinavian Journal of Statistics 38, 2011.
+    Wherever the power is below 1 the posterior is wider than the exact one, and the log evidence is that of the
+    tempered model.
 
     Builders reject an `ess_fraction` outside (0, 1] where its value is concrete.
 
@@ -42,10 +44,11 @@ class AdaptiveTempering:
     """
 
     ess_fraction: float | Float[Array, ""]
-    """Fraction of the effective sample size before the update that is retained, in (0, 1]."""
+    """Fraction that is retained of the effective sample size of the possible particles before the update, in (0, 1]."""
 
     def __call__(self, log_factor: Float[Array, " n"], log_weights: Float[Array, " n"]) -> Float[Array, " n"]:
         """Log factors `(n,)` times the power, which is a constant to differentiation."""
-        target = self.ess_fraction * weights.effective_sample_size(log_weights)
+        possible = jnp.where(log_factor > -jnp.inf, log_weights, -jnp.inf)
+        target = self.ess_fraction * weights.effective_sample_size(possible)
         exponent = weights.temper_exponent(log_factor, log_weights, target)
         return jax.lax.stop_gradient(exponent) * log_factor

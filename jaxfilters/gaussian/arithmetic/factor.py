@@ -45,6 +45,18 @@ def _root_jvp(primals, tangents):
     return L, root_tangent(L, dS)
 
 
+def exact_root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """As `root`, with the full precision of variables that stand beside some without variance.
+
+    `root` adds noise to all where one has none, which costs digits of ill-conditioned covariances.
+    """
+    if S.shape[0] <= UNROLLED:
+        return linalg.cholesky(S)
+    certain = diagonal(S) == 0
+    apart = certain[:, None] | certain
+    return jnp.where(apart, 0.0, _root(jnp.where(apart, identity(len(S), S.dtype), S)))
+
+
 def independent_root(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"], Bool[Array, ""]]:
     """The lower root of a small S over its independent variables, which they are, and whether S is semidefinite.
 

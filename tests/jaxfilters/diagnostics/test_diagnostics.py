@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
 
 import jaxfilters as jf
@@ -50,6 +51,55 @@ def test_autocorrelations_and_their_test_find_a_correlation(x64):
     np.testing.assert_allclose(test.p_value, scipy.stats.chi2.sf(statistic, 12), rtol=1e-8)
     assert test.p_value[0] > 0.01 > test.p_value[1]
     np.testing.assert_allclose(D.autocorrelation_band(400), scipy.stats.norm.ppf(0.975) / 20)
+
+
+@pytest.mark.system
+def test_gaps_leave_autocorrelations_and_their_test_as_they_are(x64):
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=(300, 3))
+    x[:150, 0] = np.nan
+    x[rng.random(300) < 0.5, 1] = np.nan
+    x[::2, 2] = np.nan
+    rho, test = D.autocorrelation(jnp.asarray(x), 6), D.whiteness(jnp.asarray(x), 6)
+    for i, c in enumerate(x.T):
+        pairs = [(c[k:] * c[: 300 - k])[np.isfinite(c[k:] * c[: 300 - k])] for k in range(7)]
+        expected = [(1 - k / 300) * np.mean(p) / np.mean(pairs[0]) if len(p) else np.nan for k, p in enumerate(pairs)]
+        np.testing.assert_allclose(rho[:, i], expected, atol=1e-12)
+        n, some = len(pairs[0]), [p for p in pairs[1:] if len(p)]
+        statistic = n * (n + 2) * sum(p.sum() ** 2 / len(p) for p in some) / np.sum(pairs[0]) ** 2
+        np.testing.assert_allclose(test.statistic[i], statistic)
+        np.testing.assert_allclose(test.p_value[i], scipy.stats.chi2.sf(statistic, len(some)), rtol=1e-8)
+    # A gap at an end changes nothing of the test.
+    np.testing.assert_allclose(test.p_value[0], D.whiteness(jnp.asarray(x[150:, :1]), 6).p_value[0], rtol=1e-12)
+    assert jnp.all(jnp.isnan(D.whiteness(jnp.full((9, 1), jnp.nan), 2).p_value))
+    assert jnp.isnan(D.whiteness(jnp.asarray([[1.0], [jnp.nan]]), 1).p_value[0])
+
+
+@pytest.mark.system
+def test_the_test_of_whiteness_keeps_its_level_over_gaps():
+    e = np.random.default_rng(9).normal(size=(400, 2000)).astype(np.float32)
+    e[:200] = np.nan
+    share = np.mean(D.whiteness(jnp.asarray(e), 10).p_value < 0.05)
+    # Of 2000 tests at 0.05 the share has the standard deviation 0.005; the statistic is chi-square to 0.01.
+    assert abs(share - 0.05) < 0.03
+
+
+@pytest.mark.system
+def test_missing_frames_take_no_draws_from_lasting_errors():
+    # The variance of the mean of n frames at times t_i is sum_ij phi^|t_i - t_j| / n^2: the reciprocal is what counts.
+    phi, length, count = 0.95, 4000, 50
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(length, count)) * np.sqrt(1 - phi**2)
+    x = scipy.signal.lfilter([1.0], [1.0, -phi], noise, axis=0).astype(np.float32)
+    for known in (np.ones(length, bool), rng.random(length) < 0.5, np.arange(length) % 2 == 0):
+        times = np.flatnonzero(known)
+        expected = times.size**2 / np.sum(phi ** np.abs(times[:, None] - times))
+        found = D.effective_draws(jnp.asarray(np.where(known[:, None], x, np.nan)))
+        # The correlation over 50 recordings has a standard error of 0.0007, one of 1.5 percent of the number, and a
+        # negative bias of 2 percent: four standard errors and the bias.
+        np.testing.assert_allclose(np.mean(found.number), expected, rtol=0.09)
+    few = jnp.asarray([[jnp.nan, 2.0, jnp.nan], [jnp.nan, jnp.nan, 1.0], [jnp.nan, jnp.nan, 1.0]])
+    np.testing.assert_allclose(D.effective_draws(few).number, [np.nan, 1.0, 1.0])
 
 
 def test_transforms_and_their_uniformity(x64):
@@ -181,3 +231,9 @@ def test_a_consistent_filter_passes_and_an_overconfident_one_fails():
     assert errors.mean() > band.high
     assert squares.mean() > wide.high
     assert D.uniformity(transforms.ravel()).p_value < 1e-4
+
+
+def test_truths_that_are_not_known_do_not_count_in_the_coverage():
+    truth = jnp.array([0.5, jnp.nan, -1.5, 0.1, jnp.nan, 2.5])
+    np.testing.assert_allclose(jf.diagnostics.sigma_coverage(truth, 0.0, 1.0)[0], [0.5, 0.75, 1.0])
+    assert np.isnan(jf.diagnostics.sigma_coverage(jnp.array([jnp.nan]), 0.0, 1.0)[0]).all()

@@ -223,6 +223,30 @@ def test_a_start_outside_its_constraint_is_rejected():
         fit.maximize(density(), {"mean": 0.0, "std": -2.0}, LIMITS)
 
 
+WALLS = {
+    # From a steep wall into a flat valley: the first curvature is that of the wall.
+    "wall": (lambda z: -(1e6 * jnp.maximum(1 - z, 0.0) ** 2 + 0.01 * (z - 100.0) ** 2), 0.0, 100.0),
+    "logarithm": (lambda z: jnp.log(z) - z, 0.01, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_quasi_newton_does_not_end_at_the_foot_of_a_wall(name):
+    log_density, start, maximum = WALLS[name]
+    found = fit.maximize(log_density, start, errors=fit.no_errors)
+    assert found.converged
+    assert found.num_steps < 20
+    assert log_density(jnp.asarray(maximum)) - found.log_density < 1e-5
+    np.testing.assert_allclose(found.theta, maximum, rtol=3e-3)
+
+
+def test_a_slope_that_promises_nothing_ends_the_search():
+    # Without curvature, a gain of 5e-15 nats by a step of the length of the gradient.
+    found = fit.maximize(lambda z: -1e-7 * z, 0.0, errors=fit.no_errors)
+    assert found.converged
+    assert abs(found.theta) < 1e-5
+
+
 def test_where_there_is_no_maximum_errors_are_unknown():
     found = fit.maximize(partial(jnp.sum), {"x": jnp.ones(2)}["x"], method=fit.bfgs(max_steps=3))
     assert np.isnan(found.standard_errors).all()

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
+from jaxfilters.priors import gaussian_prior
 
 FORMS = {
     "covariance": lambda mean, root: Gaussian(jnp.asarray(mean), jnp.asarray(root @ root.T)),
@@ -90,3 +91,28 @@ def test_indices_from_the_end_are_those_from_the_beginning_and_differ(form, rng)
     np.testing.assert_allclose(found.mean, expected.mean)
     with pytest.raises(ValueError, match=r"indices must name different components; got \[2, -1\] of 3"):
         belief.condition([2, -1], jnp.zeros(2))
+
+
+@pytest.mark.system
+def test_draws_of_a_large_covariance_that_has_lost_rank_lie_in_its_space(x64, rng):
+    # Rank 3 of 12: the first three variables determine the others.
+    mean, A = rng.normal(size=12), rng.normal(size=(12, 3))
+    A[:3] = np.tril(A[:3], -1) + np.eye(3)
+    belief = Gaussian(jnp.asarray(mean), jnp.asarray(A @ A.T))
+    for draws in (belief.sample(jax.random.key(3), 20_000), gaussian_prior(belief).ensemble(jax.random.key(4), 20_000)):
+        noise = np.linalg.lstsq(A, np.asarray(draws) - mean[:, None])[0]
+        np.testing.assert_allclose(A @ noise + mean[:, None], draws, atol=1e-6)
+        # Nine moments, each with a standard error of at most sqrt(2 / 20000) = 0.01: 4.5 of them, probability 1e-4.
+        np.testing.assert_allclose(noise @ noise.T / 20_000, np.eye(3), atol=0.045)
+
+
+def test_variables_without_variance_cost_the_others_no_precision(rng):
+    # In float32 the condition number 1e5 leaves two digits; noise on the diagonal would leave none.
+    orthogonal = np.linalg.qr(rng.normal(size=(11, 11)))[0]
+    P = (orthogonal * np.geomspace(1.0, 1e-5, 11)) @ orthogonal.T
+    with_zero = jnp.zeros((12, 12)).at[1:, 1:].set(P.astype(np.float32))
+    x = rng.normal(size=12).astype(np.float32)
+    x[0] = 0
+    found = Gaussian(jnp.zeros(12), with_zero).logpdf(jnp.asarray(x))
+    alone = Gaussian(jnp.zeros(11), with_zero[1:, 1:]).logpdf(jnp.asarray(x[1:]))
+    np.testing.assert_allclose(found, alone, rtol=1e-4)

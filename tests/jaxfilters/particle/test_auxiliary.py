@@ -335,3 +335,25 @@ def test_noise_in_few_directions_is_proposed_in_these():
     )
     ratio = np.exp(np.asarray(ratio, float))
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(300)
+
+
+@pytest.mark.system
+def test_many_positions_with_velocities_may_be_driven_by_one_acceleration_each():
+    """Five copies: Q is (10, 10) of rank 5."""
+    eye = jnp.eye(5)
+    F, Q = (
+        jnp.kron(eye, jnp.array([[1.0, 1.0], [0.0, 1.0]])),
+        jnp.kron(eye, jnp.outer(jnp.array([0.5, 1.0]), jnp.array([0.5, 1.0]))),
+    )
+    prior, ys = jf.Gaussian(jnp.zeros(10), 0.05 * jnp.eye(10)), jnp.ones((4, 5))
+    model = (Q, lambda x: x[::2], 0.1 * eye)
+    pf = jf.locally_optimal(prior, lambda x: F @ x, *model, num_particles=100, ess_threshold=1.0)
+    _, infos = jf.run(pf, KEY, ys, collect=jf.keep_info)
+    np.testing.assert_allclose(infos.effective_sample_size, 100.0, rtol=1e-4)
+    assert jnp.all(infos.num_invalid == 0)
+    exact = jf.log_evidence(jf.kalman(prior, F, Q, jnp.eye(10)[::2], model[2]), KEY, ys)
+    estimates = jax.vmap(lambda key: jf.log_evidence(pf, key, ys))(jax.random.split(KEY, 300))
+    # The estimate is unbiased: within four standard errors.
+    ratio = np.exp(np.asarray(estimates - exact, float))
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(300)
+    assert ratio.std() < 2

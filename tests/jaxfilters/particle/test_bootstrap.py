@@ -152,6 +152,19 @@ def test_tempering_leaves_the_share_of_the_effective_sample_size_before(share):
     assert np.min(plain.effective_sample_size) < 0.05 * 100
 
 
+def test_tempering_counts_only_particles_that_are_possible():
+    # 70 of 100 particles are impossible: half of an effective size of 100 could not be reached.
+    log_likelihood = jnp.where(jnp.arange(100) < 70, -jnp.inf, -jnp.linspace(0, 50, 100)).at[3].set(jnp.nan)
+    tempered = AdaptiveTempering(0.5)(log_likelihood, jnp.zeros(100))
+    np.testing.assert_allclose(weights.effective_sample_size(tempered), 15, rtol=1e-4)
+    # A power of 1 retains what is asked for.
+    mild = jnp.where(log_likelihood > -jnp.inf, 0.1 * log_likelihood, -jnp.inf)
+    assert weights.effective_sample_size(mild) > 15
+    np.testing.assert_array_equal(AdaptiveTempering(0.5)(mild, jnp.zeros(100)), mild)
+    nothing = AdaptiveTempering(0.5)(jnp.full(4, -jnp.inf), jnp.zeros(4))
+    np.testing.assert_array_equal(nothing, jnp.full(4, -jnp.inf))
+
+
 def test_resampling_is_reported():
     ys = simulate(4)
     always = run(make_filter(ess_threshold=1.0), jax.random.key(0), ys, collect=keep_info)[1]
