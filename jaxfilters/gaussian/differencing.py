@@ -5,13 +5,16 @@ $y_t - \phi y_s = h(x_t) - \phi h(x_s) + q_t$ from the last observed frame s has
 Henrikson, "Estimation using sampled data containing sequentially correlated noise", Journal of Spacecraft and Rockets
 5(6), 1968). It depends on two states. Here the belief about $x_s$ and the transition since then, $x_t = F x_s + w$, are
 kept apart, so that neither a correlation with the process noise nor a singular covariance of both states appears. With
-m independent rows and n states an update takes time of the order of $m n^2$.
+m independent rows and n states an update takes time of the order of $m n^2$, by adding up the information of the rows.
+Rows with no noise, or hardly any, have too much of it: a frame with such rows is updated by the covariance of its m
+innovations, in time of the order of $m^2 (m + n)$.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
@@ -19,8 +22,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian import checks
-from jaxfilters.gaussian.arithmetic import factor, info
-from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.gaussian.arithmetic import factor, info, square_root
+from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.correlated import CorrelatedNoise, check_dt, check_inner, observed_linearly
 from jaxfilters.gaussian.extended import ExtendedKalman, as_observation
 from jaxfilters.gaussian.gauss_markov import GaussMarkov, check_process
@@ -65,7 +68,7 @@ class DifferencedInfo(NamedTuple):
     nis: Float[Array, ""]
     """Normalised innovation squared: chi-squared with `rank` degrees of freedom."""
     rank: Int[Array, ""]
-    """Number of rows used."""
+    """Number of rows used. Rows without noise that were certain beforehand, or follow from others, are left out."""
     num_invalid: Int[Array, ""]
     """Number of rows, not masked, that are not finite, or whose prediction is not."""
 
@@ -74,8 +77,10 @@ def measurement_differencing(inner: Filter, noise: GaussMarkov, *, dt: ArrayLike
     """Gaussian filter `inner` for observations whose noise is a Gauss-Markov process and nothing else.
 
     For a linear model the result is that of `correlated_noise` with a white noise of zero, to rounding, with a state of
-    n instead of n + m components, and in time proportional to the number m of rows. The state is a
-    `DifferencedState`, whose `belief` is that about x, and the info a `DifferencedInfo`.
+    n instead of n + m components, and in time proportional to the number m of rows, unless an error has a variance of
+    zero or changes so slowly that its changes are lost in the rounding of what is known; under `vmap` frames take the
+    time of both cases. The state is a `DifferencedState`, whose `belief` is that about x, and the info a
+    `DifferencedInfo`.
 
     Rows may be missing. One that was not read in the last observed frame, but before, has no difference; it adds
     nothing in this frame, and counts again from the next one on. Frames without any observation lose nothing.
@@ -191,7 +196,7 @@ def _update(
     differenced, first = usable & clone.read, usable & ~clone.ever
     decay = jnp.where(differenced, model.noise.decay(clone.elapsed), 0.0)
     variance = jnp.where(differenced, model.noise.added(clone.elapsed), model.noise.covariance)
-    counts = (differenced | first) & (variance > 0)
+    counts = differenced | first
     rows = _Rows(
         (residual - decay * clone.residual, H, linalg.matmul(H, clone.F) - decay[:, None] * clone.H), variance, counts
     )
@@ -241,24 +246,47 @@ class _Rows(NamedTuple):
 
 
 def _conditioned(belief: Gaussian, clone: Clone, rows: _Rows) -> tuple[Gaussian, DifferencedInfo]:
-    """Belief about x_t = m_t + F (x_s - m_s) + w after independent rows, in time of the order of m n^2."""
-    innovation, by_w, by_s = rows.measured
-    scale = jnp.where(rows.counts, 1 / jnp.sqrt(jnp.where(rows.counts, rows.variance, 1.0)), 0.0)
+    """Belief about x_t = m_t + F (x_s - m_s) + w after independent rows."""
+    _, by_w, by_s = rows.measured
     root = block_diag(factor.root(clone.Q), factor.root(clone.belief.covariance))
-    A = linalg.matmul(scale[:, None] * jnp.hstack([by_w, by_s]), root)
-    e = scale * innovation
+    visible = linalg.matmul(jnp.hstack([by_w, by_s]), root)
+    moved = jnp.hstack([jnp.eye(belief.mean.shape[0], dtype=root.dtype), clone.F])
+    # Information has the rounding error of its sharpest row, in units of the noise: the ratio of the variances.
+    spread = jnp.sum(visible * visible, axis=1)
+    noisy = rows.variance > float(jnp.finfo(root.dtype).eps) ** 0.5 * spread
+    ready = visible, linalg.matmul(moved, root), rows._replace(counts=rows.counts & noisy)
+    shift, spread_root, found = jax.lax.cond(
+        jnp.any(rows.counts & ~noisy), lambda: _by_innovations(*ready[:2], rows), lambda: _by_information(*ready)
+    )
+    return Gaussian(belief.mean + shift, factor.outer(spread_root, spread_root)), found
+
+
+_Found = tuple[Array, Array, DifferencedInfo]
+"""Shift of the mean of x_t, a root of its covariance, (n, 2 n), and the diagnostics."""
+
+
+def _by_innovations(visible: Float[Array, "m k"], to_x: Float[Array, "n k"], rows: _Rows) -> _Found:
+    """The update by the covariance of the innovations, which may have rows without noise."""
+    k, dtype = visible.shape[1], visible.dtype
+    whitened = GaussianRoot(jnp.zeros(k, dtype), jnp.eye(k, dtype=dtype))
+    noise = factor.diagonal_matrix(linalg.safe_sqrt(rows.variance))
+    after, report = square_root.update(whitened, rows.measured[0], visible, noise, None, rows.counts)
+    found = DifferencedInfo(report.log_evidence, report.nis, report.rank, jnp.zeros((), jnp.int32))
+    return factor.apply(to_x, after.mean), linalg.matmul(to_x, after.root), found
+
+
+def _by_information(visible: Float[Array, "m k"], to_x: Float[Array, "n k"], rows: _Rows) -> _Found:
+    """The update by the information of rows with noise, in time proportional to their number."""
+    scale = jnp.where(rows.counts, 1 / jnp.sqrt(jnp.where(rows.counts, rows.variance, 1.0)), 0.0)
+    A, e = scale[:, None] * visible, scale * rows.measured[0]
     # C C^T = I + A^T A without forming the product, whose rounding would be that of the sharpest row.
-    C = linalg.tria(jnp.hstack([jnp.eye(root.shape[0], dtype=e.dtype), A.T]))
+    C = linalg.tria(jnp.hstack([jnp.eye(A.shape[1], dtype=e.dtype), A.T]))
     half = linalg.solve_triangular(C, factor.apply(A.T, e))
     u = linalg.solve_triangular(C, half, transpose=True)
-    moved = jnp.hstack([jnp.eye(belief.mean.shape[0], dtype=e.dtype), clone.F])
-    to_x = linalg.matmul(moved, root)
-    spread = linalg.solve_triangular(C, to_x.T)
-    posterior = Gaussian(belief.mean + factor.apply(to_x, u), factor.outer(spread.T, spread.T))
     left = e - factor.apply(A, u)
     nis = jnp.sum(left * left) + jnp.sum(u * u)
     log_scales = 0.5 * np.log(2 * np.pi) - jnp.log(jnp.where(rows.counts, scale, 1.0))
     log_scale = jnp.sum(jnp.where(rows.counts, log_scales, 0.0))
     log_evidence = -0.5 * nis - log_scale - jnp.sum(jnp.log(factor.diagonal(C)))
-    rank = jnp.sum(rows.counts, dtype=jnp.int32)
-    return posterior, DifferencedInfo(log_evidence, nis, rank, jnp.zeros((), jnp.int32))
+    found = DifferencedInfo(log_evidence, nis, jnp.sum(rows.counts, dtype=jnp.int32), jnp.zeros((), jnp.int32))
+    return factor.apply(to_x, u), linalg.solve_triangular(C, to_x.T).T, found

@@ -8,7 +8,7 @@ Transactions on Automatic Control 62(4), 2017). Of each step the length of the l
 halves to none (S. Särkkä and L. Svensson, "Levenberg-Marquardt and line-search extended Kalman smoothers", ICASSP
 2020), for sigma points with covariances and linearisation errors held during the step (J. Lindqvist, S. Särkkä,
 A. F. Garcia-Fernandez, M. Raitoharju and L. Svensson, "Posterior linearisation smoothing with robust iterations",
-2021).
+2021). Where a noise is singular, what is exact comes first, as in the iterated update (`measurement_update`).
 """
 
 from dataclasses import replace
@@ -34,6 +34,8 @@ from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.extended import ExtendedKalman
 from jaxfilters.gaussian.linearize import lower_root
 from jaxfilters.gaussian.manifold import Belief
+from jaxfilters.gaussian.measurement_update import exact_rows, least, misfit
+from jaxfilters.gaussian.posterior_linearization import widened
 from jaxfilters.gaussian.smoothing import reverse_transition, rts
 from jaxfilters.math import linalg
 from jaxfilters.typing import AnyKey, Mask
@@ -46,11 +48,11 @@ class IterationInfo(NamedTuple):
 
     cost: Float[Array, " i"]
     """Cost of the trajectory before each iteration, in nats: minus the log density of states and observations, but for
-    a constant; of sigma points, with the covariances of that iteration."""
+    a constant; of sigma points, with the covariances of that iteration. What is exact has none."""
     reached: Float[Array, " i"]
-    """The same cost after the iteration; never larger."""
+    """The same cost after the iteration; never larger, but where something exact was violated before."""
     step: Float[Array, " i"]
-    """Length of the step, 1 for a whole one, 0 where no step lowered the cost."""
+    """Length of the step, 1 for a whole one, 0 where no step lowered the cost or the violation of what is exact."""
     log_evidence: Float[Array, ""]
     """Of the model linearised about the last trajectory."""
 
@@ -68,6 +70,8 @@ def iterated(
 ) -> tuple[Belief, IterationInfo]:
     """Smoothed beliefs by iterated linearisation about the smoothed states; no iteration raises the cost.
 
+    Transitions and observations without noise are exact: iterations first reduce what violates them, at any cost.
+
     A filter linearised by `taylor` finds the most probable trajectory; one linearised by `cubature` or `unscented`
     finds means and covariances whose linearisation errors are least over the posterior.
 
@@ -81,7 +85,8 @@ def iterated(
         start: Beliefs of all frames to linearise about first, time first; `None` is what filter and smoother find.
         smoother: `jf.smoothing.sequential`, or `jf.smoothing.parallel` for logarithmic depth (F. Yaghoobi,
             A. Corenflos, S. Hassan and S. Särkkä, "Parallel iterated extended and sigma-point Kalman smoothers",
-            ICASSP 2021); both find the same.
+            ICASSP 2021); both find the same. The latter is NaN where the noise of a transition and of its observation
+            leave something exact, H Q H^T + R being singular.
 
     Returns:
         The smoothed beliefs, time first, and the course of the iteration.
@@ -102,20 +107,33 @@ def iterated(
         >>> smoothed.mean.shape, bool((info.reached <= info.cost).all())
         ((10, 2), True)
     """
+    _check_filter(filter)
+    checks.count("iterations", iterations)
+    checks.function("smoother", smoother)
+    _, (beliefs, infos) = run(filter, key, observations, inputs, mask=mask)
+    if start is None:
+        start = rts(filter, beliefs, inputs)
+    elif checks.beliefs("start", start, filter.params.prior) != len(beliefs.mean):
+        raise ValueError(f"start must have the {len(beliefs.mean)} frames of observations; got {len(start.mean)}.")
+    found = _Filtered(beliefs, linalg.safe_norm(infos.innovation_root))
+    return _iterated(filter.params, start, observations, inputs, mask, found, iterations, smoother)
+
+
+def _check_filter(filter: Filter) -> None:
     checks.is_filter("filter", filter)
     if not isinstance(filter.params, ExtendedKalman) or not filter.params.manifold.flat:
         raise ValueError(
             "filter must be made by extended_kalman, unscented_kalman or cubature_kalman, and have vectors for states; "
             f"its parameters are {type(filter.params).__name__}."
         )
-    checks.count("iterations", iterations)
-    checks.function("smoother", smoother)
-    _, (beliefs, _) = run(filter, key, observations, inputs, mask=mask)
-    if start is None:
-        start = rts(filter, beliefs, inputs)
-    elif checks.beliefs("start", start, filter.params.prior) != len(beliefs.mean):
-        raise ValueError(f"start must have the {len(beliefs.mean)} frames of observations; got {len(start.mean)}.")
-    return _iterated(filter.params, start, observations, inputs, mask, iterations, smoother)
+
+
+class _Filtered(NamedTuple):
+    """What the filter found, as the unit of what violates exact transitions and observations."""
+
+    beliefs: Belief
+    innovations: Float[Array, "t m"]
+    """Standard deviations, 0 for components that do not count."""
 
 
 @partial(jax.jit, static_argnames=("iterations", "smoother"))
@@ -125,62 +143,111 @@ def _iterated(
     observations: PyTree,
     inputs: PyTree,
     mask: Mask | None,
+    filtered: _Filtered,
     iterations: int,
     smoother: Smoother,
 ) -> tuple[Belief, IterationInfo]:
-    def improve(trajectory: Belief, index: Array) -> tuple[Belief, tuple]:
-        affine = affine_model(model, trajectory, observations, inputs, mask)
+    first = _joined(_before_first(model, start, inputs), start)
+    about_start = affine_model(model, first, observations, inputs, mask)
+    predicted = _predicted(model, filtered.beliefs, about_start)
+    scales = _std(predicted), filtered.innovations
+    exact_at_first = _is_exact(_noise_roots(model, about_start)[1], filtered.innovations)
+
+    def improve(carry: tuple[Belief, Array], index: Array) -> tuple[tuple[Belief, Array], tuple]:
+        trajectory, exact = carry
+        rest = jax.vmap(widened)(jax.tree.map(lambda leaf: leaf[1:], trajectory), predicted, exact)
+        over = jax.tree.map(lambda many, wide: jnp.concatenate([many[:1], wide]), trajectory, rest)
+        affine = affine_model(model, over, observations, inputs, mask)
         target, log_evidence = smoother(model.prior, affine, model.arithmetic)
         step = target.mean - trajectory.mean
-        cost = _cost(model, trajectory, affine, observations, inputs)
+        roots = _noise_roots(model, affine)
+        cost = _cost(model, over, affine.read, roots, (observations, inputs), scales)
         lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype), 0.0)
-        costs = jax.lax.map(lambda length: cost(trajectory.mean + length * step), lengths)
-        best = jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
+        costs, violations = jax.lax.map(lambda length: cost(trajectory.mean + length * step), lengths)
+        best = least(lengths, costs, violations)
         # The last pass gives the covariances and the evidence about the trajectory, and takes no step.
         length = jnp.where(index < iterations, lengths[best], 0.0)
-        moved = jnp.where(length > 0, trajectory.mean + length * step, trajectory.mean)
+        stay = jnp.where(jnp.isnan(target.mean), jnp.nan, trajectory.mean)
+        moved = jnp.where(length > 0, trajectory.mean + length * step, stay)
+        course = costs[-1], costs[best], length, log_evidence
         # Covariances are those about the trajectory, also where no step lowers the cost.
-        return replace(target, mean=moved), (costs[-1], costs[best], length, log_evidence)
+        return (replace(target, mean=moved), _is_exact(roots[1], filtered.innovations)), course
 
-    first = _with_first(model, start, inputs)
-    final, (*course, log_evidence) = jax.lax.scan(improve, first, jnp.arange(iterations + 1))
+    (final, _), (*course, log_evidence) = jax.lax.scan(improve, (first, exact_at_first), jnp.arange(iterations + 1))
     cost, reached, step = (each[:-1] for each in course)
     info = IterationInfo(cost, reached, step, log_evidence[-1])
     return jax.tree.map(lambda leaf: leaf[1:], final), info
 
 
-def _with_first(model: Any, start: Belief, inputs: PyTree) -> Belief:
-    """The beliefs with that of the state before the first observation."""
+def _joined(first: Belief, rest: Belief) -> Belief:
+    """Beliefs of all frames after one; roots as lower roots."""
+    if isinstance(first, GaussianRoot):
+        assert isinstance(rest, GaussianRoot)
+        first = GaussianRoot(first.mean, linalg.tria(first.root))
+        rest = GaussianRoot(rest.mean, jax.vmap(linalg.tria)(rest.root))
+    return jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), first, rest)
+
+
+def _before_first(model: Any, start: Belief, inputs: PyTree) -> Belief:
+    """Belief about the state before the first observation, from that of the first frame."""
     first, inputs = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (start, inputs))
     prior = model.prior
     if isinstance(prior, GaussianRoot):
         prior = GaussianRoot(prior.mean, linalg.tria(prior.root))
-        assert isinstance(start, GaussianRoot)
-        start = GaussianRoot(start.mean, jax.vmap(linalg.tria)(start.root))
     origin, gain, rest = reverse_transition(model, prior, inputs)
-    before = replace(prior, mean=prior.mean + rest.mean + factor.apply(gain, first.mean - origin))
-    return jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), before, start)
+    return replace(prior, mean=prior.mean + rest.mean + factor.apply(gain, first.mean - origin))
 
 
-def _cost(model: ExtendedKalman, trajectory: Belief, affine: AffineModel, observations: PyTree, inputs: PyTree):
-    """Minus the log density of a trajectory of means, with the covariances and errors of a linearisation."""
+def _predicted(model: ExtendedKalman, filtered: Belief, affine: AffineModel) -> Belief:
+    """The belief about every state given the observations before it; its mean is that of an affine model."""
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], _joined(model.prior, filtered))
+    return jax.vmap(model.arithmetic.predict)(earlier, affine.F, affine.Q, affine.b, affine.added_Q)
+
+
+def _std(beliefs: Belief) -> Array:
+    """Standard deviations, 1 where they are zero."""
+    if isinstance(beliefs, GaussianRoot):
+        std = linalg.safe_norm(beliefs.root)
+    else:
+        std = linalg.safe_sqrt(jnp.diagonal(beliefs.covariance, axis1=1, axis2=2))
+    return jnp.where(std > 0, std, 1.0)
+
+
+def _noise_roots(model: ExtendedKalman, affine: AffineModel) -> tuple[Array, Array]:
+    """Roots of the noises of all transitions and observations, with the linearisation errors."""
     noise_root = jax.vmap(model.arithmetic.noise_root)
-    root_P = lower_root(model.prior)
-    root_Q, root_R = noise_root(affine.Q, None, affine.added_Q), noise_root(affine.R, affine.read, affine.added_R)
+    return noise_root(affine.Q, None, affine.added_Q), noise_root(affine.R, affine.read, affine.added_R)
 
-    def one(before: Belief, here: Belief, observation: PyTree, inputs: PyTree, read: Array, roots: tuple) -> Array:
+
+def _is_exact(root_R: Array, innovations: Array) -> Array:
+    """In which frames something of the observation is exact."""
+    return jnp.any(jax.vmap(exact_rows)(root_R, innovations), axis=1)
+
+
+def _cost(
+    model: ExtendedKalman, trajectory: Belief, read: Array, roots: tuple, given: tuple[PyTree, PyTree], scales: tuple
+):
+    """Minus the log density of a trajectory of means, with the covariances and errors of a linearisation.
+
+    Beside it, the squared violation of what is exact.
+    """
+    root_P = lower_root(model.prior)
+    scales = scales[0], jnp.where(read, scales[1], 0.0)
+
+    def one(before: Belief, here: Belief, given: tuple[PyTree, PyTree], read: Array, roots: tuple, scales: tuple):
+        observation, inputs = given
         ahead, step = model.linear_transition(before, inputs)
-        surprise = linalg.solve_triangular(roots[0], here.mean - ahead - step.value)
+        surprise = misfit(roots[0], scales[0], here.mean - ahead - step.value)
         y, _, own_noise = read_components(observation)
         linear = linear_observation(model, here, jnp.where(read, y, 0.0), own_noise, inputs)
         residual = jnp.where(read, linear.y - factor.apply(linear.H, here.mean) - linear.d, 0.0)
-        return jnp.sum(surprise**2) + jnp.sum(linalg.solve_triangular(roots[1], residual) ** 2)
+        return jax.tree.map(jnp.add, surprise, misfit(roots[1], scales[1], residual))
 
-    def cost(means: Array) -> Array:
+    def cost(means: Array) -> tuple[Array, Array]:
         at = replace(trajectory, mean=means)
         before, here = (jax.tree.map(lambda leaf, cut=cut: leaf[cut], at) for cut in (slice(-1), slice(1, None)))
-        each = jax.vmap(one)(before, here, observations, inputs, affine.read, (root_Q, root_R))
+        squares, violations = jax.vmap(one)(before, here, given, read, roots, scales)
         start = linalg.solve_triangular(root_P, means[0] - model.prior.mean)
-        return 0.5 * (jnp.sum(start**2) + jnp.sum(each))
+        return 0.5 * (jnp.sum(start**2) + jnp.sum(squares)), jnp.sum(violations)
 
     return cost

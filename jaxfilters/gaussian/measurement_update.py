@@ -7,6 +7,10 @@ F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE
 expansion it minimises $J(x) + \tfrac12 \log |S(x)|$, with $S = H P H^T + R$ of the observation linearised at x
 (L. Tierney and J. B. Kadane, "Accurate approximations for posterior moments and marginal densities", Journal of the
 American Statistical Association 81, 1986; `docs/derivations/iterated_update.md`).
+
+Where R is singular, some combinations of the components are exact: they are constraints, which no cost can weigh. As in
+R. Fletcher and S. Leyffer, "Nonlinear programming without a penalty function", Mathematical Programming 91, 2002, a
+step is then taken if it reduces their violation, or else the cost.
 """
 
 from collections.abc import Callable
@@ -16,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters.gaussian.arithmetic import Arithmetic, KalmanInfo, factor, info
 from jaxfilters.gaussian.linearize import Linearization, Linearize, lower_root
@@ -86,8 +90,9 @@ def iterated_update(
 ) -> tuple[Belief, KalmanInfo]:
     """Belief in the coordinates after damped Gauss-Newton steps, and the diagnostics of an update linearised there.
 
-    Every step is halved until it lowers the cost, with the residual as it is, not linearised. An increment from the
-    mean is P g, and g is carried beside it: the prior's part of the cost is g^T P g / 2, without an inverse of P.
+    Every step is halved until it lowers the cost, with the residual as it is, not linearised; or, where the noise is
+    singular, until it reduces the violation of what is exact. An increment from the mean is P g, and g is carried
+    beside it: the prior's part of the cost is g^T P g / 2, without an inverse of P.
 
     Args:
         measurement: The observation.
@@ -118,11 +123,11 @@ def iterated_update(
 
         def cost(length):
             at = offset + length * step
-            return 0.5 * jnp.sum((dual + length * dual_step) * at) + likelihood_cost(at)
+            likelihood, violation = likelihood_cost(at)
+            return 0.5 * jnp.sum((dual + length * dual_step) * at) + likelihood, violation
 
         lengths = jnp.append(0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype), 0.0)
-        costs = jax.lax.map(cost, lengths)
-        length = lengths[jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))]
+        length = lengths[least(lengths, *jax.lax.map(cost, lengths))]
         # The last round only linearises the observation at the final point.
         length = jnp.where(index < iterations, length, 0.0)
         return offset + length * step, dual + length * dual_step, posterior, report
@@ -202,22 +207,69 @@ def dual_of(report: KalmanInfo, F: Float[Array, "m n"], innovation: Float[Array,
 
 
 def _likelihood_cost(measurement, report, linear, prior_root):
-    """Negative log likelihood at an increment, but for a constant; with log|S| / 2 where a root of P is given."""
+    """Negative log likelihood at an increment, but for a constant; with log|S| / 2 where a root of P is given.
+
+    Beside it, the squared violation of what is exact.
+    """
     if measurement.log_probability is not None:
-        return lambda offset: -measurement.log_probability(measurement.start + offset)
+        return lambda offset: (-measurement.log_probability(measurement.start + offset), jnp.zeros_like(offset[0]))
     counts = factor.diagonal(report.innovation_root) > 0
     noise_root = measurement.arithmetic.noise_root(measurement.noise, counts, linear.residual_root)
+    scales = linalg.safe_norm(report.innovation_root)
 
     def cost(offset):
         residual = info.observed(counts, _difference(measurement, measurement.predict(measurement.start + offset))[1])
-        misfit = 0.5 * jnp.sum(linalg.solve_triangular(noise_root, residual) ** 2)
+        square, violation = misfit(noise_root, scales, residual)
         if prior_root is None:
-            return misfit
+            return 0.5 * square, violation
         F = _counted(report, _linear_at(measurement, offset)[0].F)
         diagonal = factor.diagonal(linalg.tria(jnp.hstack([linalg.matmul(F, prior_root), noise_root])))
-        return misfit + jnp.sum(jnp.log(jnp.where(counts, jnp.abs(diagonal), 1.0)))
+        return 0.5 * square + jnp.sum(jnp.log(jnp.where(counts, jnp.abs(diagonal), 1.0))), violation
 
     return cost
+
+
+def exact_rows(noise_root: Float[Array, "m m"], scales: Float[Array, " m"]) -> Bool[Array, " m"]:
+    """Which components have no noise, given those before them, to rounding.
+
+    Args:
+        noise_root: Lower root of the covariance of the noise.
+        scales: Standard deviations of the components before they are read; 0 for those that do not count.
+    """
+    tolerance = 4 * len(scales) * float(jnp.finfo(scales.dtype).eps)
+    return (factor.diagonal(noise_root) <= tolerance * scales) & (scales > 0)
+
+
+def misfit(
+    noise_root: Float[Array, "m m"], scales: Float[Array, " m"], residual: Float[Array, " m"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Squared length of a residual whitened by its noise; and of what no noise explains, in units of `scales`.
+
+    The residual is 0 in components that do not count. The other arguments are those of `exact_rows`.
+    """
+    exact = exact_rows(noise_root, scales)
+    root = jnp.where(exact, 0.0, noise_root)
+    whitened = linalg.solve_triangular(root, residual)
+    unexplained = (residual - factor.apply(root, whitened)) / jnp.where(exact, scales, 1.0)
+    return jnp.sum(whitened**2), jnp.sum(jnp.where(exact, unexplained, 0.0) ** 2)
+
+
+def least(lengths: Float[Array, " k"], costs: Float[Array, " k"], violations: Float[Array, " k"]) -> Int[Array, ""]:
+    """Index of the length of least cost, unless one reduces the violation of what is exact: see `feasible`."""
+    merits = costs + 0.5 * violations
+    return feasible(lengths, violations, jnp.argmin(jnp.where(jnp.isnan(merits), jnp.inf, merits)))
+
+
+def feasible(lengths: Float[Array, " k"], violations: Float[Array, " k"], otherwise: Int[Array, ""]) -> Int[Array, ""]:
+    """Index of the first length of a step that reduces a squared violation; `otherwise` where there is none.
+
+    The violation is that of constraints, in standard deviations before they are known; the last length is 0. One below
+    the rounding error of its root is no reason for a step. To compare costs instead, `otherwise` should add half of
+    the squared violation: a step along a constraint may then leave it a little, but not far.
+    """
+    now = violations[-1]
+    reduces = (violations <= (1 - lengths / 4) ** 2 * now) & (lengths > 0) & (now > jnp.finfo(now.dtype).eps)
+    return jnp.where(jnp.any(reduces), jnp.argmax(reduces), otherwise)
 
 
 def _log_determinant_slope(measurement, report, linear, prior_root, offset):

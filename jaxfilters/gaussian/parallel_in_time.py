@@ -7,6 +7,9 @@ An element summarises a run of frames; elements are combined by an associative o
 "Parallel square-root statistical linear regression for inference in nonlinear state space models", 2022, sections 3 and
 4). The total number of operations is several times larger: it is meant for accelerators and long sequences. On a CPU,
 `kalman` and `smoothing.rts` are faster.
+
+An element holds what its observations say about the state before them as information, which is infinite where
+$H_t Q_t H_t^T + R_t$ is singular: such a frame is announced by NaN.
 """
 
 import math
@@ -23,7 +26,7 @@ from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.arithmetic.factor import UNROLLED
 from jaxfilters.gaussian.belief import GaussianRoot
 from jaxfilters.gaussian.manifold import euclidean
-from jaxfilters.math.linalg import matmul, solve_triangular, tria, tria_of_many, tria_of_many_with_zeros
+from jaxfilters.math.linalg import matmul, safe_norm, solve_triangular, tria, tria_of_many, tria_of_many_with_zeros
 
 
 class LinearModel(NamedTuple):
@@ -80,6 +83,11 @@ def parallel_kalman(
     prior: GaussianRoot, model: LinearModel, ys: Float[Array, "t m"], mask: Bool[Array, "t m"] | None = None
 ) -> tuple[GaussianRoot, Float[Array, " t"]]:
     """Kalman filter in logarithmic depth: beliefs after every observation, and the log evidence of each.
+
+    H Q H^T + R must be positive definite over the components that are read, in every frame but the first: what would
+    be known of the state before the frame without any noise has infinite information. From such a frame on beliefs are
+    NaN, and log evidences after it. Digits are lost where it is nearly so: the relative error is that of rounding times
+    the largest ratio of a predicted variance of an observation and this one. `kalman` has neither limit.
 
     Args:
         prior: Belief before the first step, with a mean of shape (n,).
@@ -204,11 +212,25 @@ def _filter_element(step: _Step, y: Array) -> _FilterElement:
     root, gain, rest = _conditioned(step.H, step.root_Q, step.root_R)
     innovation = y - _times(step.H, step.b)
     HF = matmul(step.H, step.F)
-    whitened = solve_triangular(root, HF)
+    root, whitened = informative(root, HF)
     Z = tria_of_many(whitened.T)
     A = step.F - matmul(gain, HF)
     eta = _times(whitened.T, solve_triangular(root, innovation))
     return _FilterElement(A, step.b + _times(gain, innovation), rest[:, :n], eta, Z)
+
+
+def informative(root: Float[Array, "m m"], H: Float[Array, "m n"]) -> tuple[Float[Array, "m m"], Float[Array, "m n"]]:
+    """A lower root of a noise without what is rounding error on its diagonal, and `root^-1 H`.
+
+    NaN where a row of H has no noise that the rows before it do not have, but is another one: what it says is infinite.
+    """
+    tolerance = 4 * len(root) * float(jnp.finfo(root.dtype).eps)
+    exact = jnp.diagonal(root) <= tolerance * safe_norm(root)
+    root = jnp.where(exact, 0.0, root)
+    whitened = solve_triangular(root, H)
+    rest = H - matmul(root, whitened)
+    infinite = jnp.any(exact & (safe_norm(rest) > 16 * tolerance * safe_norm(H)))
+    return root, jnp.where(infinite, jnp.nan, whitened)
 
 
 def _first(prior: GaussianRoot, step: _Step, y: Array) -> _FilterElement:

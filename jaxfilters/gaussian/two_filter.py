@@ -8,6 +8,7 @@ lost by squaring.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from jaxfilters.filter import Filter
@@ -15,10 +16,12 @@ from jaxfilters.gaussian import checks
 from jaxfilters.gaussian.affine import AffineModel, affine_model
 from jaxfilters.gaussian.arithmetic import factor
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
-from jaxfilters.gaussian.extended import ExtendedKalman
+from jaxfilters.gaussian.extended import ExtendedKalman, Observation
 from jaxfilters.gaussian.linear import Kalman
-from jaxfilters.gaussian.linearize import lower_root
+from jaxfilters.gaussian.linearize import lower_root, taylor
 from jaxfilters.gaussian.manifold import Belief
+from jaxfilters.gaussian.noise_models import NonAdditiveNoise
+from jaxfilters.gaussian.parallel_in_time import informative
 from jaxfilters.math import linalg
 from jaxfilters.typing import Mask
 
@@ -30,7 +33,8 @@ def two_filter(
 
     For linear models the result is that of `rts`. Others are linearised about the beliefs of the filter, the
     observations about the belief after them. Unlike `rts` it needs the observations, and never inverts a predicted
-    covariance.
+    covariance. The information of an exact observation is infinite: its noise must be positive definite. Where that is
+    known only when it runs, beliefs of frames before one that is exact are NaN.
 
     Args:
         filter: Filter made by `kalman`, `extended_kalman`, `unscented_kalman` or `cubature_kalman`, of vectors.
@@ -43,7 +47,8 @@ def two_filter(
         The smoothed beliefs, time first; the last is that of the filter.
 
     Raises:
-        ValueError: If `filter` is another kind of filter or its states are no vectors, or shapes or lengths differ.
+        ValueError: If `filter` is another kind of filter or its states are no vectors, shapes or lengths differ, or the
+            observation noise has a variance of zero.
         TypeError: If `filter` is no filter, or `beliefs` are of another kind than its prior.
 
     Examples:
@@ -67,7 +72,26 @@ def two_filter(
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((observations, inputs, mask))}
     if lengths != {(length,)}:
         raise ValueError(f"observations, inputs and mask must be as long as beliefs, {length}; got {sorted(lengths)}.")
+    _check_noise(model, observations)
     return _two_filter(model, beliefs, observations, inputs, mask)
+
+
+def _check_noise(model: Kalman | ExtendedKalman, observations: PyTree) -> None:
+    """Raise an error where a component of the observation is known to have no noise."""
+    has_own = isinstance(observations, Observation) and observations.noise is not None
+    # Other noises are evaluated where it runs, or have linearisation errors added to them.
+    is_added = isinstance(model, Kalman) or (
+        model.linearize is taylor and not isinstance(model.observe, NonAdditiveNoise)
+    )
+    if has_own or not is_added or not hasattr(model.observation_noise, "shape"):
+        return
+    R = checks.concrete(model.observation_noise)
+    if R is not None and not np.all(np.any(R != 0, axis=1)):
+        row = int(np.argmin(np.any(R != 0, axis=1)))
+        raise ValueError(
+            "the observation noise of filter must be positive definite, because the information of an exact "
+            f"observation is infinite; the variance of component {row} is 0. Use jf.smoothing.rts."
+        )
 
 
 @jax.jit
@@ -95,7 +119,7 @@ def _two_filter(model: Kalman | ExtendedKalman, beliefs: Belief, observations: P
 def _observed(model, frame, eta, Z):
     """The information about a state, with that of the observation of its frame."""
     root_R = model.arithmetic.noise_root(frame.R, frame.read, frame.added_R)
-    whitened = linalg.solve_triangular(root_R, jnp.where(frame.read[:, None], frame.H, 0.0))
+    root_R, whitened = informative(root_R, jnp.where(frame.read[:, None], frame.H, 0.0))
     residual = linalg.solve_triangular(root_R, jnp.where(frame.read, frame.y - frame.d, 0.0))
     return eta + factor.apply(whitened.T, residual), linalg.tria(jnp.hstack([Z, whitened.T]))
 

@@ -176,16 +176,6 @@ class TrackWriter:
             raise OutputError(f"cannot write {path}: {reason(error)}; {self.kept()}.") from error
 
 
-def check_no_track(folder: Path) -> None:
-    """Refuse a folder with the results of another run.
-
-    Raises:
-        OutputError: there is a track.
-    """
-    if (path := folder / "track.csv").exists():
-        raise OutputError(f"{path}: holds the track of another run; choose another --out, or --resume.")
-
-
 def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bool = False) -> TrackWriter:
     """A writer for a new run in `folder`, which is made if need be.
 
@@ -193,12 +183,11 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
         folder: where the results go.
         run: what must be equal for a run to be continued (input, configuration, versions), JSON-able.
         table: how rows are written.
-        overwrite: discard a run that lies there.
+        overwrite: discard an unfinished run that lies there.
 
     Raises:
         CheckpointError: an unfinished run lies there, and `overwrite` is false.
-        OutputError: the folder cannot be written, or another run writes into it, or has written a track into it and
-            `overwrite` is false.
+        OutputError: the folder cannot be written, or another run writes into it.
     """
     output = OutputFolder(folder)
     try:
@@ -208,8 +197,6 @@ def begin(folder: Path, run: dict[str, Any], table: TrackTable, *, overwrite: bo
                 f"{folder} holds an unfinished run of {meta['frames']} frames: continue it with --resume, "
                 f"choose another --out, or delete {path.parent}."
             )
-        if not overwrite:
-            check_no_track(folder)
         shutil.rmtree(_checkpoint_folder(folder), ignore_errors=True)
         return TrackWriter(output, run, table, [])
     except BaseException:

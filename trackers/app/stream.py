@@ -12,7 +12,7 @@ import numpy as np
 from jaxfilters.trackers.app.output_folder import reason
 from jaxfilters.trackers.app.progress import ProgressLine, warn
 from jaxfilters.trackers.app.rerun_log import RerunLog, open_log
-from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, TrackTable, check_no_track, open_writer
+from jaxfilters.trackers.app.results import CHECKPOINT_EVERY_S, TrackTable, open_writer
 from jaxfilters.trackers.app.video import OverlayVideo
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.video_input import FrameSet, VideoSource, continued
@@ -87,8 +87,8 @@ def check_unused(options: argparse.Namespace) -> None:
     Raises:
         OutputError: there is a track, and the run is not to be continued.
     """
-    if not options.resume:
-        check_no_track(options.out)
+    if not options.resume and (path := options.out / "track.csv").exists():
+        raise OutputError(f"{path}: holds the track of another run; choose another --out, or --resume.")
 
 
 class StreamRun:

@@ -140,6 +140,31 @@ def test_differencing_is_the_conditional_without_white_noise():
     np.testing.assert_allclose(evidence, expected, atol=3e-4)
 
 
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("tau", "variances"),
+    [([np.inf, 8.0, 1.5], [1.0, 0.5, 2.0]), ([1e7, 8.0, 1.5], [1.0, 0.5, 2.0]), ([3.0, 8.0, 1.5], [1.0, 0.0, 2.0])],
+    ids=["constant", "almost constant", "without noise"],
+)
+def test_differencing_uses_rows_whose_difference_has_no_noise(tau, variances):
+    """In float32, where the differences of the second case have a thousandth of the spread of the others."""
+    noise = jf.GaussMarkov(jnp.array(tau), jnp.array(variances))
+    filter = jf.measurement_differencing(of(linear, 0.0), noise, dt=identity)
+    last, (_, infos) = jax.jit(one_pass)(filter, WHOLE_FRAMES, STEPS)
+    mean, P, expected = brute_force(WHOLE_FRAMES, variances, tau, np.zeros((3, 3)), STEPS)
+    np.testing.assert_allclose(last.belief.mean, mean, atol=3e-5)
+    np.testing.assert_allclose(last.belief.covariance, P, atol=3e-5)
+    np.testing.assert_allclose(infos.log_evidence.sum(), expected, atol=3e-4)
+    assert infos.rank.tolist() == [3, 3, 0, 3, 3, 3]
+
+
+@pytest.mark.system
+def test_derivatives_are_finite_where_a_difference_has_no_noise():
+    evidence = partial(evidence_of, build=jf.measurement_differencing, R=0.0)
+    slopes = jax.jit(jax.grad(evidence))((jnp.array([jnp.inf, 8.0, 1.5]), jnp.array([1.0, 0.0, 2.0])))
+    assert np.isfinite(np.concatenate(slopes)).all()
+
+
 def test_a_row_that_returns_adds_nothing_once_and_never_certainty():
     """Against the exact conditional: what is left out may widen the belief, never narrow it."""
     noise = jf.GaussMarkov(TAU, B)

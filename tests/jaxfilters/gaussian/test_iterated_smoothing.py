@@ -111,3 +111,49 @@ def test_in_parallel_it_finds_the_same(x64):
     )
     expected, found = run(jf.smoothing.sequential), run(jf.smoothing.parallel)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-8), found, expected)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
+@pytest.mark.parametrize("kind", ["extended_kalman", "cubature_kalman"])
+def test_what_is_exact_holds_from_any_start(x64, kind, root):
+    """Exact observations and positions, noise on the velocity alone: against the conditional of the joint Gaussian."""
+    A, Q, H, mean = (
+        np.array([[1.0, 1.0], [0.0, 1.0]]),
+        np.diag([0.0, 0.2]),
+        np.array([[1.0, 0.0]]),
+        np.array([1.0, 0.5]),
+    )
+    ys, frames = np.array([0.3, 1.1, 0.7, 2.0]), 4
+    spread = [jnp.asarray(np.sqrt(C) if root else C) for C in (np.diag([4.0, 1.0]), Q, np.zeros((1, 1)))]
+    form = jf.GaussianRoot if root else jf.Gaussian
+    arithmetic = jf.arithmetic.square_root if root else jf.arithmetic.joseph
+    filter = getattr(jf, kind)(
+        form(jnp.asarray(mean), spread[0]),
+        lambda x: A @ x,
+        spread[1],
+        lambda x: H @ x,
+        spread[2],
+        arithmetic=arithmetic,
+    )
+    start = form(jnp.zeros((frames, 2)), jnp.tile(jnp.eye(2), (frames, 1, 1)))
+    found, info = jf.smoothing.iterated(filter, KEY, jnp.asarray(ys)[:, None], iterations=3, start=start)
+    # States are a linear function of the first one and of the noises.
+    L = np.zeros((frames, 2, 2 + 2 * frames))
+    part = np.eye(2, 2 + 2 * frames)
+    for t in range(frames):
+        part = A @ part
+        part[:, 2 + 2 * t : 4 + 2 * t] += np.eye(2)
+        L[t] = part
+    joint = (
+        L.reshape(2 * frames, -1)
+        * np.concatenate([[4.0, 1.0], np.tile(np.diag(Q), frames)])
+        @ L.reshape(2 * frames, -1).T
+    )
+    means = np.concatenate([np.linalg.matrix_power(A, t + 1) @ mean for t in range(frames)])
+    gain = joint[:, ::2] @ np.linalg.inv(joint[::2, ::2])
+    np.testing.assert_allclose(found.mean.ravel(), means + gain @ (ys - means[::2]), atol=1e-7)
+    assert info.step[0] == 1
+    P = found.root @ found.root.transpose(0, 2, 1) if root else found.covariance
+    expected = joint - gain @ joint[::2]
+    np.testing.assert_allclose(P, [expected[i : i + 2, i : i + 2] for i in range(0, 2 * frames, 2)], atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from jaxfilters.gaussian import arithmetic as arithmetics
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
@@ -103,3 +104,68 @@ def test_an_iterated_linear_update_with_masks_is_the_plain_one(x64, n):
         np.testing.assert_allclose(found.mean, results[0][0].mean, atol=1e-9)
         np.testing.assert_allclose(found.covariance, results[0][0].covariance, atol=1e-9)
         np.testing.assert_allclose(info.log_evidence, results[0][1].log_evidence, atol=1e-9)
+
+
+EXACT = {
+    "row": np.diag([0.1, 0.0, 0.2]),
+    "difference of rows": np.array([[0.1, 0.1, 0.0], [0.1, 0.1, 0.0], [0.0, 0.0, 0.2]]),
+    "all": np.zeros((3, 3)),
+}
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("form", [Gaussian, GaussianRoot])
+@pytest.mark.parametrize("target", ["mean", "mode"])
+@pytest.mark.parametrize("noise", EXACT)
+def test_linear_iterations_keep_what_is_exact(x64, noise, target, form):
+    """Against the conditional of the joint Gaussian, and where the prediction satisfies what is exact, too."""
+    rng = np.random.default_rng(5)
+    H, root, mean, y = rng.normal(size=(3, 4)), rng.normal(size=(4, 4)), rng.normal(size=4), rng.normal(size=3)
+    R, P = EXACT[noise], root @ root.T
+    is_root = form is GaussianRoot
+    belief = form(jnp.asarray(mean), jnp.asarray(root if is_root else P))
+    spread = jnp.asarray(np.linalg.svd(R)[0] * np.sqrt(np.linalg.svd(R)[1]) if is_root else R)
+    arithmetic = arithmetics.square_root if is_root else arithmetics.joseph
+    options = dict(arithmetic=arithmetic, iterations=8, iterate_to=target)
+    update = jax.jit(lambda y: condition(belief, y, lambda x: H @ x, spread, **options))
+    for reading in (y, np.array([y[0], y[0] + (H[1] - H[0]) @ mean, y[2]]), H @ mean + np.array([0.0, 1.0, 0.0])):
+        found, info = update(jnp.asarray(reading))
+        S = H @ P @ H.T + R
+        expected = mean + P @ H.T @ np.linalg.solve(S, reading - H @ mean)
+        np.testing.assert_allclose(found.mean, expected, atol=1e-8)
+        np.testing.assert_allclose(info.log_evidence, log_density(reading - H @ mean, S), atol=1e-8)
+
+
+def log_density(e, S):
+    return -0.5 * (e @ np.linalg.solve(S, e) + np.linalg.slogdet(2 * np.pi * S)[1])
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("reading", [1.5, 5.0, 12.0])
+def test_an_exact_distance_is_met_and_the_mode_lies_on_the_circle(x64, reading):
+    """Against Brent's minimisation along the circle; the first whole step leaves the circle by a part of the radius."""
+    mean, std, other = np.array([3.0, 4.0]), np.array([1.0, 2.0]), 0.5
+    belief = Gaussian(jnp.asarray(mean), jnp.diag(jnp.asarray(std**2)))
+    observe = lambda x: jnp.stack([jnp.sqrt(x @ x), x[0]])
+    y, R = jnp.array([reading, 1.0]), jnp.diag(jnp.array([0.0, other**2]))
+    found, _ = jax.jit(lambda y: condition(belief, y, observe, R, iterations=40, iterate_to="mode"))(y)
+
+    def cost(angle):
+        x = reading * np.array([np.cos(angle), np.sin(angle)])
+        return 0.5 * np.sum(((x - mean) / std) ** 2) + 0.5 * ((1.0 - x[0]) / other) ** 2
+
+    angle = minimize_scalar(cost, bounds=(0.0, np.pi), method="bounded", options=dict(xatol=1e-12)).x
+    np.testing.assert_allclose(np.linalg.norm(found.mean), reading, atol=1e-8)
+    # Gauss-Newton steps ignore the curvature of the circle: along the smallest one they converge slowly.
+    np.testing.assert_allclose(found.mean, reading * np.array([np.cos(angle), np.sin(angle)]), atol=1e-4)
+
+
+@pytest.mark.system
+def test_derivatives_of_exact_iterations_are_those_of_the_plain_update(x64):
+    belief, R = Gaussian(jnp.asarray([1.0, 0.5]), jnp.diag(jnp.array([4.0, 1.0]))), jnp.diag(jnp.array([0.1, 0.0]))
+
+    def moved(y, iterations):
+        return condition(belief, y, lambda x: jnp.stack([x[0] + x[1], x[1]]), R, iterations=iterations)[0].mean
+
+    plain, iterated = (jax.jit(jax.jacrev(lambda y, k=k: moved(y, k)))(jnp.array([1.0, -1.0])) for k in (1, 4))
+    np.testing.assert_allclose(iterated, plain, atol=1e-9)

@@ -96,6 +96,23 @@ def test_float32_keeps_the_evidence_of_certain_readings():
     np.testing.assert_allclose(found.sum(), expected.sum(), rtol=1e-3)
 
 
+@pytest.mark.system
+def test_infinite_information_is_announced(x64):
+    """An exact position whose noise acts on the velocity alone; by hand, the first reading has the variance 5."""
+    F = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+    root_Q, H = jnp.diag(jnp.array([0.0, 0.5])), jnp.array([[1.0, 0.0], [1.0, 0.0]])
+    model = LinearModel(F, root_Q, H, jnp.zeros((2, 2)))
+    prior = GaussianRoot(jnp.zeros(2), jnp.diag(jnp.array([2.0, 1.0])))
+    ys = jnp.array([[3.0, jnp.nan], [jnp.nan, jnp.nan], [1.0, jnp.nan], [1.0, jnp.nan]])
+    beliefs, evidences = parallel_kalman(prior, model, ys)
+    np.testing.assert_allclose(evidences[0], -0.5 * (9 / 5 + np.log(2 * np.pi * 5)), rtol=1e-12)
+    # A frame without readings loses nothing; the third frame does, and all from it on.
+    assert np.isfinite(beliefs.mean[:2]).all()
+    assert np.isfinite(beliefs.root[:2]).all()
+    assert np.isnan(beliefs.mean[2:]).all()
+    assert np.isnan(evidences[3])
+
+
 def test_a_model_of_another_length_is_rejected():
     prior = GaussianRoot(jnp.asarray(MEAN), jnp.asarray(ROOT))
     with pytest.raises(ValueError, match=r"model\.F must have the 6 frames of the sequence; got 7"):

@@ -59,3 +59,26 @@ def test_with_derivatives_it_finds_the_mode_and_its_smoother_runs(x64):
     assert np.isfinite(infos.log_evidence).all()
     # The state stands still: smoothing carries the last belief back.
     np.testing.assert_allclose(beliefs.mean[0], beliefs.mean[-1], atol=1e-4)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("root", [False, True], ids=["covariance", "root"])
+@pytest.mark.parametrize("kind", ["extended_kalman", "cubature_kalman"])
+def test_exact_linear_observations_are_those_of_the_kalman_filter(x64, kind, root):
+    """The regression over the last belief has no slope in the direction that was observed; the update needs it."""
+    F, H, ys = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.2]]), np.array([[0.3], [1.1], [0.7]])
+    Q = np.diag([0.0, 0.2])
+    spread = [jnp.asarray(np.sqrt(C) if root else C) for C in (P, Q, np.zeros((1, 1)))]
+    prior = (jf.GaussianRoot if root else jf.Gaussian)(jnp.asarray(MEAN), spread[0])
+    arithmetic = jf.arithmetic.square_root if root else jf.arithmetic.joseph
+    build = getattr(jf, kind)
+    inner = build(prior, lambda x: F @ x, spread[1], lambda x: H @ x, spread[2], arithmetic=arithmetic)
+    last, (_, infos) = jf.run(jf.posterior_linearization(inner, 4), KEY, jnp.asarray(ys))
+    mean, C = MEAN, P
+    for y, info in zip(ys, np.asarray(infos.log_evidence), strict=True):
+        mean, C = F @ mean, F @ C @ F.T + Q
+        e, S = y - H @ mean, H @ C @ H.T
+        gain = C @ H.T / S
+        np.testing.assert_allclose(info, (-0.5 * e**2 / S - 0.5 * np.log(2 * np.pi * S))[0, 0], atol=1e-7)
+        mean, C = mean + gain @ e, C - gain @ H @ C
+    np.testing.assert_allclose(last.mean, mean, atol=1e-7)

@@ -7,6 +7,7 @@ from jaxfilters.filter import run
 from jaxfilters.gaussian import arithmetic as arithmetics
 from jaxfilters.gaussian.belief import Gaussian, GaussianRoot
 from jaxfilters.gaussian.extended import Observation, extended_kalman
+from jaxfilters.gaussian.linear import kalman
 from jaxfilters.gaussian.linearize import cubature, taylor
 from jaxfilters.gaussian.manifold import Manifold, add, displacement
 from jaxfilters.gaussian.smoothing import filter_and_smooth, lag_one_covariances, posterior_samples, rts
@@ -142,6 +143,21 @@ def test_an_unseen_frame_is_smoothed_from_both_sides(x64):
     )
     np.testing.assert_allclose(masked.mean, joint_posterior()[0], atol=1e-9)
     assert infos.log_evidence[3] == 0
+
+
+@pytest.mark.system
+def test_a_second_filter_announces_exact_observations(x64):
+    """Their information is infinite: an error where the noise is known, and NaN in earlier frames where it is not."""
+    prior, one = Gaussian(jnp.zeros(1), jnp.eye(1)), jnp.eye(1)
+    ys, noises = jnp.array([[0.3], [1.1], [0.7]]), jnp.array([1.0, 0.0, 1.0])[:, None, None]
+    filter = kalman(prior, one, one, one, lambda noise: noise)
+    beliefs = run(filter, KEY, ys, noises)[1][0]
+    with pytest.raises(ValueError, match="the variance of component 0 is 0"):
+        two_filter(kalman(prior, one, one, one, 0.0 * one), beliefs, ys)
+    found = two_filter(filter, beliefs, ys, noises)
+    assert np.isnan(found.mean[0]).all()
+    assert np.isnan(found.covariance[0]).all()
+    np.testing.assert_allclose(found.mean[1:], rts(filter, beliefs, noises).mean[1:], atol=1e-12)
 
 
 @pytest.mark.system
