@@ -73,7 +73,7 @@ QUICK_HANDS, QUICK_HAND_FRAMES = 2, 16
 PIP_COLUMNS = np.array([12, 15, 18, 21])
 """Of the pose: flexion of the second joint of the four fingers."""
 CHOSEN_FRAMES = 350
-"""Of the key points of real hands: constants of the articulated tracker were chosen on them."""
+"""Of the recordings of keypoints of real hands: constants of the articulated tracker were chosen on them."""
 DETECTED_HANDS: dict[str, dict[str, Any]] = {
     "nyu_feedback": {"hands": "nyu"},
     "nyu_v2v": {"hands": "nyu", "network": 1},
@@ -177,7 +177,7 @@ def articulated_claims(quick: bool, seed: int) -> Claims:
 def articulated_points_claims(
     quick: bool, seed: int, *, data: str, hands: str, network: int = 0, known_size: bool = False
 ) -> Claims:
-    """Joints of hands whose key points a network detected; one recording a joint, as in `keypoint_claims`.
+    """Joints of hands whose keypoints a network detected; one recording a joint, as in `keypoint_claims`.
 
     Constants were chosen on the frames that are left out, the first `CHOSEN_FRAMES`.
     """
@@ -262,7 +262,7 @@ def _heads(quick: bool, seed: int) -> range:
 
 
 def _of_head(run: HeadRun) -> Recording:
-    # By its own word: frames in which it is astray, which only the truth tells, are what claims are judged by.
+    # The tracker's own status: frames in which it is wrong without noticing, which only the truth shows, have to count.
     return _where(np.isin(run.track.status, TRACKED), run.errors, run.deviations)
 
 

@@ -141,7 +141,7 @@ def mono_metrics(quick: bool, seed: int) -> dict[str, Metric]:
             np.asarray(made.shapes[0], float), simplest.flowed_points(images, made.uv[0, 0]), made.rig
         )
         of_simple = np.abs(pose_errors(poses, made.poses))[first:]
-        errors["_simple"].append(np.mean(of_simple[-len(run.errors) :][run.is_tracked], axis=0))
+        errors["_simple"].append(np.mean(of_simple[len(of_simple) - len(run.errors) :][run.is_tracked], axis=0))
     return _pose_metrics("head_mono", errors, MONO_PAPER)
 
 
