@@ -389,12 +389,12 @@ def _by_linear_observation(
     checks.check_linear_observation(linear, y, belief.mean.shape[0])
     h, C, R = linear
     condition = last_axis.batch_last(_condition) if max(C.shape) <= factor.UNROLLED else _condition
-    return condition(belief, y - h, C, R)
+    return condition(belief, y - h, C, R, jnp.isfinite(y).all())
 
 
-def _condition(belief: Gaussian, y: Array, C: Array, R: Array) -> tuple[Gaussian, Array]:
-    innovation = y - dot(C, belief.mean)
-    usable = jnp.all(jnp.isfinite(innovation))  # Otherwise weights are invalid, and beliefs do not change.
+def _condition(belief: Gaussian, innovation: Array, C: Array, R: Array, observed: Array) -> tuple[Gaussian, Array]:
+    innovation = innovation - dot(C, belief.mean)
+    usable = jnp.all(jnp.isfinite(innovation))  # Otherwise weights are invalid, and means do not change.
     found = arithmetic.joseph.condition(belief.covariance, C, R, jnp.where(usable, innovation, 0.0))
-    covariance = jnp.where(usable, found.covariance, belief.covariance)
+    covariance = jnp.where(observed, found.covariance, belief.covariance)  # No particle changes a shared one.
     return Gaussian(belief.mean + found.shift, covariance), jnp.where(usable, found.log_density, jnp.nan)

@@ -347,9 +347,10 @@ def test_transport_is_refused(build):
         )
 
 
-def test_an_observation_that_is_no_number_leaves_the_linear_beliefs_as_they_are():
+@pytest.mark.parametrize("builder", [rao_blackwell, rao_blackwell_shared])
+def test_an_observation_that_is_no_number_leaves_the_linear_beliefs_as_they_are(builder):
     one = jnp.ones((1, 1))
-    filter = rao_blackwell(
+    filter = builder(
         lambda key: jax.random.normal(key, (1,)),
         Gaussian(jnp.zeros(1), one),
         lambda x: MixedDynamics(x, 0.0 * one, one, jnp.zeros(1), one, 0.1 * one),
@@ -359,6 +360,7 @@ def test_an_observation_that_is_no_number_leaves_the_linear_beliefs_as_they_are(
     )
     _, (states, infos) = run(filter, jax.random.key(0), jnp.array([[0.0], [jnp.nan], [0.0]]))
     assert np.isfinite(states.linear_mean).all()
+    assert np.isfinite(states.covariance).all()
     assert np.isfinite(infos.log_evidence).tolist() == [True, False, True]
 
 
