@@ -141,7 +141,7 @@ def _init(model: IMM, key: AnyKey) -> IMMState:
 
 
 def _predict(model: IMM, key: AnyKey, state: IMMState, inputs: PyTree) -> IMMState:
-    transition = banks.transition_at(model.transition, inputs, model.bank.count)
+    transition = banks.transition_at(model.transition, inputs, model.bank.count).astype(state.log_probabilities.dtype)
     log_predicted, origins = interaction(transition, state.log_probabilities)
     mixed = _mixed(model, state.beliefs, origins)
     ahead = model.bank.apply(lambda filter, belief: filter.predict(filter.params, key, belief, inputs), mixed)

@@ -154,7 +154,7 @@ def _init(model: Switching, key: AnyKey) -> SwitchingState:
 
 def _predict(model: Switching, key: AnyKey, state: SwitchingState, inputs: PyTree) -> SwitchingState:
     count, num = model.bank.count, model.num_particles
-    transition = banks.transition_at(model.transition, inputs, count)
+    transition = banks.transition_at(model.transition, inputs, count).astype(state.log_weights.dtype)
     chosen, log_weights = _chosen(model, key, state.log_weights)
     places = jnp.tile(chosen, count)
     parents = jax.tree.map(lambda leaf: jnp.take(leaf, places, axis=-1, mode="clip"), state.particles.belief)

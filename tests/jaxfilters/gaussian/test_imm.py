@@ -1,5 +1,7 @@
 """The interacting multiple model filter against loops in float64, filterpy, and the cases in which it is exact."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -254,3 +256,17 @@ def test_moments_of_a_mixture_ignore_what_has_no_weight():
     beliefs = jf.Gaussian(jnp.array([[1.0, 3.0, jnp.nan]]), jnp.array([[[0.5, 1.5, jnp.inf]]]))
     found = jf.mixture_moments(beliefs, jnp.array([0.0, 0.0, -jnp.inf]))
     np.testing.assert_allclose([found.mean[0], found.covariance[0, 0]], [2.0, 2.0])
+
+
+@pytest.mark.parametrize("combined", [jf.imm, partial(jf.switching, num_particles=3**4)], ids=["imm", "switching"])
+def test_filters_in_single_precision_run_where_double_precision_is_the_default(combined):
+    """The transition matrix is then in double precision, and the state stays in single precision."""
+
+    def evidence(dtype):
+        convert = partial(jnp.asarray, dtype=dtype)
+        priors = [jf.Gaussian(convert(MEANS[i]), convert(COVARIANCES[i])) for i in range(3)]
+        filters = [jf.kalman(priors[i], *map(convert, (F[i], Q[i], H, R))) for i in range(3)]
+        return jf.log_evidence(combined(filters, CHAIN, INITIAL), KEY, convert(YS[:4]))
+
+    assert evidence(np.float32).dtype == np.float32
+    np.testing.assert_allclose(evidence(np.float32), evidence(np.float64), rtol=1e-5)
