@@ -100,7 +100,12 @@ def linear_observation(
 
     Residuals that are no differences, as of angles, are linearised from the predicted observation; y is then the
     residual, too.
+
+    Raises:
+        ValueError: If the observation has an emission.
     """
+    if model.observation_noise is None:
+        raise ValueError("the filter must have Gaussian observation noise; it has an emission.")
     R = model.observation_noise_of(belief, inputs) if own_noise is None else own_noise
     if isinstance(model, Kalman):
         step = model.matrices(inputs)

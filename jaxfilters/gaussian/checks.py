@@ -191,6 +191,10 @@ def observation(y: Any, mask: Any) -> None:
         raise TypeError(f"the observation y must be an array of shape (m,), or an Observation of one; got a {kind}.")
     if y.ndim != 1:
         raise ValueError(f"the observation y of one step must have the shape (m,); got {y.shape}.")
+    if not y.size:
+        raise ValueError(
+            "the observation y must have one component or more (NaN or masked where it is missing); got none."
+        )
     if mask is not None:
         boolean("Observation.mask", mask, y.shape, ", that of the observation y")
 

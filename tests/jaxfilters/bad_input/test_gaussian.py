@@ -417,6 +417,11 @@ NOISES = [
     Case("emission with a noise", lambda: counted(COUNTS, observation_noise=R), ("observation_noise", "None")),
     Case("emission to the mean", lambda: counted(COUNTS, iterations=3), ("iterate_to", "mode")),
     Case("emission with a residual", lambda: counted(COUNTS, residual=lambda y, z: y - z), ("residual",)),
+    Case(
+        "observation of nothing",
+        lambda: jf.update(jf.kalman(PRIOR, Q, Q, Q[:0], Q[:0, :0]), KEY, PRIOR, jnp.zeros(0)),
+        ("observation y", "component", "none"),
+    ),
     Case("counts, wide", lambda: counted(COUNTS, jnp.zeros(3)), ("observation y", "(2,)", "(3,)")),
     Case(
         "counts, noise", lambda: counted(COUNTS, jf.Observation(jnp.zeros(2), None, R)), ("Observation.noise", "None")

@@ -99,6 +99,7 @@ SMOOTHING = [
     ),
     Case("iterated, linear", lambda: iterated(LINEAR), ("filter", "extended_kalman", "Kalman")),
     Case("iterated, manifold", lambda: iterated(POSE), ("filter", "vectors")),
+    Case("iterated, counts", lambda: iterated(extended(observe=jf.emissions.poisson(lambda x: x[:1]))), ("emission",)),
     Case("iterated, none", lambda: iterated(iterations=0), ("iterations", "0")),
     Case("iterated, smoother", lambda: iterated(smoother="parallel"), ("smoother", "function", "str")),
     Case(
