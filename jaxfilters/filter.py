@@ -91,7 +91,9 @@ def predict(filter: Filter, key: AnyKey, state: PyTree, inputs: PyTree = None) -
 
     Args:
         filter: The filter.
-        key: Random key; deterministic filters ignore it.
+        key: Random key; deterministic filters ignore it. The state of a filter that samples may hold the random numbers
+            of this prediction already; the key then draws those of the next one, and predictions of one state with
+            several keys are the same.
         state: State after the last observation.
         inputs: Known inputs of the step, or `None`.
 
