@@ -109,12 +109,13 @@ def build_fake(camera, config):
             pose=jnp.concatenate([wrist, jnp.asarray([1.0, 0.0, 0.0, 0.0], jnp.float32), angles]),
             pose_std=jnp.full(21, 0.01, jnp.float32),
             joints=wrist + _joints(1)[0] - _joints(1)[0, 0],
+            innovations=jnp.asarray([20, 19], jnp.int32),
             effective_sample_size=jnp.asarray(32.0, jnp.float32),
             log_evidence=-jnp.abs(walk[0]),
             status=jnp.asarray(1, jnp.int32),
         )
-        nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(status=0.0))
-        nothing = nothing._replace(status=jnp.asarray(0, jnp.int32))
+        nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(innovations=0.0, status=0.0))
+        nothing = nothing._replace(innovations=jnp.zeros(2, jnp.int32), status=jnp.asarray(0, jnp.int32))
         observed = jnp.isfinite(frame).any()
         return FakeState(key, state.frames + 1, wrist), jax.tree.map(partial(jnp.where, observed), row, nothing)
 
@@ -173,6 +174,7 @@ def perfect_track(features):
         num_hypotheses=np.arange(FRAMES, dtype=np.int32) % 3,
         is_new_view=np.zeros(FRAMES, bool),
         nis_per_row=ones,
+        innovations=np.full((FRAMES, 2), (20, 19), np.int32),
         least_distance=ones,
         log_evidence=-ones,
         length_observed=np.arange(FRAMES)[:, None] > np.arange(hand.layout.lengths.stop - hand.layout.lengths.start),
@@ -199,6 +201,7 @@ def nothing_tracked():
             num_hypotheses=np.zeros(frames, np.int32),
             is_new_view=np.zeros(frames, bool),
             nis_per_row=one,
+            innovations=np.zeros((frames, 2), np.int32),
             least_distance=one,
             log_evidence=one,
             length_observed=np.zeros((frames, LINKS * layout.num_fingers), bool),
@@ -253,12 +256,13 @@ def build_fake_articulated(sequence, config):
             num_hypotheses=jnp.asarray(2, jnp.int32),
             is_new_view=state.frames % 2 == 0,
             nis_per_row=one,
+            innovations=jnp.asarray([20, 19], jnp.int32),
             least_distance=-one,
             log_evidence=walk[0],
             length_observed=jnp.zeros(LINKS * layout.num_fingers, bool),
             status=jnp.asarray(1, jnp.int32),
         )
-        whole = {"num_hypotheses": 0, "is_new_view": False, "length_observed": False, "status": 0}
+        whole = {"num_hypotheses": 0, "innovations": 0, "is_new_view": False, "length_observed": False, "status": 0}
         nothing = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), row._replace(**dict.fromkeys(whole, 0.0)))
         nothing = nothing._replace(**{name: jnp.full_like(getattr(row, name), x) for name, x in whole.items()})
         row = jax.tree.map(partial(jnp.where, frame.mask.any()), row, nothing)
@@ -319,6 +323,7 @@ def face_track(face_model):
         image_points=known(project(shapes, jnp.asarray(pose))[0]),
         score=known(0.85 - 0.1 * rng.random(FRAMES), status != 5),
         effective_sample_size=known(np.full(FRAMES, 300.0), status != 5),
+        innovations=known(np.full((FRAMES, 2), (6.0, 5.0))),
         status=status,
     )
     return track, HeadTruth(metres * poses, np.asarray(project(shapes, jnp.asarray(poses, jnp.float32))[0]))
@@ -339,8 +344,9 @@ def fake_head(monkeypatch, face_model):
     class FakeSession(head_command.HeadSession):
         model, contribution, events = None, 0.0, ()
 
-        def __init__(self, rig, options, points):
+        def __init__(self, rig, options, points, *, focal_log_std=0.0):
             self.rig, self.options, self.points, self.frames = rig, options, points, 0
+            self.focal_log_std = focal_log_std
             self.events, self.sizes = [], []
             made.append(self)
 
@@ -373,6 +379,7 @@ def fake_head(monkeypatch, face_model):
                 image_points=np.full((b, self.rig.num_cameras, 10, 2), 5.0),
                 score=np.full(b, 0.75),
                 effective_sample_size=np.full(b, 100.0),
+                innovations=np.full((b, 2), (6, 5)),
                 status=status,
             )
 

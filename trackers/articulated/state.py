@@ -33,6 +33,8 @@ class ArticulatedTrack(NamedTuple):
     """Whether lengths were estimated from this frame."""
     nis_per_row: Float[Array | np.ndarray, " b"]
     """Normalised innovation squared over the number of rows that count; about 1 where all is well."""
+    innovations: Int[Array | np.ndarray, "b 2"]
+    """How many rows were compared with their prediction, and how many of these lie within its 95 % band."""
     least_distance: Float[Array | np.ndarray, " b"]
     """Standard deviations to the nearest limit before truncation, negative outside; infinite without limits."""
     log_evidence: Float[Array | np.ndarray, " b"]

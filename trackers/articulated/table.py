@@ -27,6 +27,7 @@ class TimedArticulatedTrack(NamedTuple):
     num_hypotheses: np.ndarray
     is_new_view: np.ndarray
     nis_per_row: np.ndarray
+    innovations: np.ndarray
     least_distance: np.ndarray
     log_evidence: np.ndarray
     length_observed: np.ndarray

@@ -54,6 +54,7 @@ from jaxfilters.trackers.articulated.recording import (
 )
 from jaxfilters.trackers.articulated.start import NUM_STARTS, HandSize, Starts, size_of, starts_from_points
 from jaxfilters.trackers.articulated.state import LOST, SEARCHING, TRACKING, ArticulatedTrack, TrackState
+from jaxfilters.trackers.innovations import innovation_counts
 from jaxfilters.trackers.tracker import Tracker, checked_times, track_frames
 
 LOST_NIS = 25.0
@@ -358,6 +359,7 @@ def _report(
         num_hypotheses=jnp.sum(bank.log_weights > -jnp.inf, dtype=jnp.int32),
         is_new_view=reported.is_new_view & ~nothing,
         nis_per_row=jnp.where(nothing, jnp.nan, nis),
+        innovations=jnp.where(nothing, 0, innovation_counts(reported.kalman)),
         least_distance=jnp.where(nothing, jnp.nan, reported.least_distance),
         log_evidence=log_evidence,
         length_observed=length_observed,

@@ -29,6 +29,7 @@ from jaxfilters.trackers.fingertips.session import VARIANTS, FingertipSession
 from jaxfilters.trackers.fingertips.summary import write_summary
 from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
 from jaxfilters.trackers.fingertips.tally import Tally
+from jaxfilters.trackers.innovations import contradiction, innovation_share
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
 from jaxfilters.trackers.io.video_input import FrameSet, is_live
@@ -96,9 +97,12 @@ def _tracked(
     began = time.perf_counter()
     result = run.follow()
     stream.finish()
-    report = _report(source, user, session, stream.tally, result, config, options, time.perf_counter() - began)
+    results = run.writer.results
+    report = _report(source, user, session, stream.tally, result, config, options, time.perf_counter() - began) | {
+        "innovations": innovation_share(results.innovations, results.frame).report()
+    }
     run.writer.finish(report, status_names=np.asarray(STATUS))
-    write_summary(options.out / "summary.png", run.writer.results, stream.tally, session.events, source.image_size)
+    write_summary(options.out / "summary.png", results, stream.tally, session.events, source.image_size)
     return run.conclude(result, format_report(report, options))
 
 
@@ -205,7 +209,8 @@ def format_report(report: dict[str, Any], options: argparse.Namespace) -> str:
         + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
         + f", {report['fingertips']} fingertips, {symbols} {'symbol' if symbols == 1 else 'symbols'}"
         + (f", mean error {error:.2f} px" if error is not None else "")
-        + (", interrupted" if report["interrupted"] else ""),
+        + (", interrupted" if report["interrupted"] else "")
+        + contradiction(report["innovations"]),
         f"results in {options.out}: track.csv, track.npz, events.jsonl, report.json, summary.png"
         + (", overlay.mp4" if options.video else ""),
     ]

@@ -195,6 +195,8 @@ class HandReport(NamedTuple):
     """Pixels."""
     sd: Float[Array, " slots"]
     """Of a coordinate, pixels."""
+    innovations: Int32[Array, "slots 2"]
+    """How many coordinates were compared with their prediction, and how many of these lie within its 95 % band."""
     velocity: Float[Array, "slots 2"]
     """Pixels a frame of 1/30 s."""
     is_thumb: Bool[Array, " slots"]

@@ -31,6 +31,9 @@ class TimedTips(NamedTuple):
     """(rows, 2) pixels per second."""
     position_std: np.ndarray
     """(rows, 2) pixels."""
+    innovations: np.ndarray
+    """(rows, 2) how many coordinates were compared with their prediction, and how many of these lie within its 95 %
+    band."""
     is_thumb: np.ndarray
     """(rows,) 1 for what is taken for a thumb, otherwise 0."""
     thumb_probability: np.ndarray
@@ -76,6 +79,7 @@ def tip_rows(frame: int, time_s: float, report: HandReport) -> TimedTips:
         position=np.asarray(report.position)[at].astype(np.float32),
         velocity=_FRAMES_PER_SECOND * np.asarray(report.velocity)[at].astype(np.float32),
         position_std=np.repeat(np.asarray(report.sd)[at].astype(np.float32)[:, None], 2, axis=1),
+        innovations=np.asarray(report.innovations)[at].astype(np.int64),
         is_thumb=np.asarray(report.is_thumb)[at].astype(np.int64),
         thumb_probability=np.asarray(report.thumb_probability)[at].astype(np.float32),
         status=np.where(np.asarray(report.is_observed)[at], 0, 1).astype(np.int64),

@@ -30,6 +30,7 @@ from jaxfilters.trackers.fingertips.state import (
     no_tracks,
 )
 from jaxfilters.trackers.fingertips.thumbs import MEAN_SCORE, POSTERIOR
+from jaxfilters.trackers.innovations import innovation_counts
 
 MODERN = Method(
     lifecycle.carried,
@@ -102,7 +103,7 @@ def step(
     beliefs = method.hint(config, state, observed)
     tip, doubt = method.associate(config, placed, beliefs, observed)
     matched = tip >= 0
-    corrected, _ = jax.vmap(motion.correct)(beliefs, observed.tips[jnp.maximum(tip, 0)], matched)
+    corrected, info = jax.vmap(motion.correct)(beliefs, observed.tips[jnp.maximum(tip, 0)], matched)
     following = jax.vmap(motion.predict, in_axes=(None, 0, None))(moves, corrected, config.drive)
     tracks, ready = lifecycle.continued(config, state.tracks, following, matched)
     # Fingers of a hand that turned over have no names any more.
@@ -122,7 +123,8 @@ def step(
         disordered=jnp.where(doubt, placed.disordered + 1, 0).astype(jnp.int32),
         next_identity=(state.next_identity + jnp.sum(ready)).astype(jnp.int32),
     )
-    sight = _Sight(corrected, observed.tips[jnp.maximum(tip, 0)], matched, probability)
+    innovations = jax.vmap(innovation_counts, in_axes=(0, None))(info, config.measurement_sd)
+    sight = _Sight(corrected, observed.tips[jnp.maximum(tip, 0)], matched, probability, innovations)
     report = _report(config, after, observed, sight, method)
     gone = after.empty >= config.empty_frames
     nothing = start(config, angles, method=method)._replace(
@@ -172,6 +174,7 @@ class _Sight(NamedTuple):
     tips: Array
     matched: Array
     probability: Array
+    innovations: Array
 
 
 def _usable(observed: HandObservation) -> HandObservation:
@@ -267,6 +270,7 @@ def _report(
         is_observed=is_tip & sight.matched,
         position=jnp.where(is_tip[:, None], position, 0.0),
         sd=jnp.where(is_tip, sd, 0.0),
+        innovations=jnp.where(is_tip[:, None], sight.innovations, 0),
         velocity=jnp.where(is_tip[:, None], sight.corrected.mean[:, 2:], 0.0),
         is_thumb=is_tip & tracks.is_thumb,
         thumb_probability=jnp.where(is_tip, sight.probability, 0.0),

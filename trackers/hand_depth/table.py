@@ -35,6 +35,7 @@ class TimedHandTrack(NamedTuple):
     pose: np.ndarray
     pose_std: np.ndarray
     joints: np.ndarray
+    innovations: np.ndarray
     effective_sample_size: np.ndarray
     log_evidence: np.ndarray
     status: np.ndarray

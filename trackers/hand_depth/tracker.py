@@ -20,7 +20,7 @@ from jaxfilters._xla.compiled_quickly import compiled_fully
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.hand.cost import gibbs_abs
 from jaxfilters.models.hand.observation import HandLikelihood, hidden_digits, union
-from jaxfilters.models.hand.skeleton import DIGITS, HandGeometry, anatomical_hand, forward_kinematics, open_palm
+from jaxfilters.models.hand.skeleton import DIGITS, HandGeometry, anatomical_hand, forward_kinematics, local, open_palm
 from jaxfilters.models.hand.surface import CapsuleHand, triangle_hand
 from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
 from jaxfilters.particle.weighting import ParticleInfo
@@ -46,6 +46,7 @@ from jaxfilters.trackers.hand_depth.filtering import (
 )
 from jaxfilters.trackers.hand_depth.recording import DepthSequence, from_array, with_nan_for_nothing
 from jaxfilters.trackers.hand_depth.search import race, search
+from jaxfilters.trackers.innovations import correction_counts
 from jaxfilters.trackers.tracker import HandTrack, Tracker, track_frames
 
 SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
@@ -193,7 +194,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     filter = build_filter(setup, open_palm(jnp.zeros(3)), likelihood, state.doubt, state.hidden)
     elapsed = time - state.time
     predicted = filter.predict(filter.params, predict_key, state.ensemble, elapsed)
-    expected, _ = pose_moments(*particles_of(predicted))
+    expected, spread = pose_moments(*particles_of(predicted))
     image = look(setup, state, filled(frame, state.missing_is_background), expected)
 
     @jax.jit  # traced once for its shapes and its program
@@ -213,10 +214,12 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     least_cost = jnp.where(observed, jnp.minimum(cost, state.least_cost), state.least_cost)
     misses = jnp.where(observed, 0, state.misses + 1)
     joints = forward_kinematics(pose, likelihood.geometry).joints
+    corrections = correction_counts(local(expected, pose), jnp.diagonal(spread), jnp.diagonal(covariance))
     track = HandTrack(
         pose=pose,
         pose_std=standard_deviations(pose, covariance),
         joints=joints,
+        innovations=jnp.where(observed, corrections, 0),
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
         status=jnp.where(observed, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
@@ -236,7 +239,8 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
 def _nothing_found() -> HandTrack:
     """The row of a frame in which no hand was found: nothing but its status."""
     nan = partial(np.full, fill_value=np.nan, dtype=np.float32)
-    return HandTrack(nan((1, 22)), nan((1, 21)), nan((1, 21, 3)), nan(1), nan(1), np.full(1, SEARCHING, np.int32))
+    none = np.zeros((1, 2), np.int32)
+    return HandTrack(nan((1, 22)), nan((1, 21)), nan((1, 21, 3)), none, nan(1), nan(1), np.full(1, SEARCHING, np.int32))
 
 
 def synthetic_sequence(seed: int) -> tuple[DepthSequence, np.ndarray]:

@@ -37,6 +37,8 @@ class Sighting(NamedTuple):
     """`tentative`, `tracked`, `hidden` (occluded) or `no_depth` (not measurable along the line of sight)."""
     image: int = NO_IMAGE
     """Of the first camera: the number of its image, from 0; it has none in some frames if another camera is faster."""
+    innovations: tuple[int, int] = (0, 0)
+    """How many coordinates were compared with their prediction, and how many of these lie within its 95 % band."""
 
 
 MODES = ("tentative", "tracked", "hidden", "no_depth")
@@ -96,6 +98,7 @@ def as_arrays(sightings: Sequence[tuple[int, Sighting]]) -> dict[str, np.ndarray
         "mean": np.reshape(np.asarray(arrays["mean"], np.float64), (n, STATE)),
         "covariance": np.reshape(np.asarray(arrays["covariance"], np.float64), (n, STATE, STATE)),
         "mode": np.asarray(modes, np.int64),
+        "innovations": np.reshape(np.asarray(arrays["innovations"], np.int64), (n, 2)),
     }
 
 
@@ -113,6 +116,7 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Sighting]]:
                 int(arrays["slot"][i]),
                 MODES[int(arrays["mode"][i])],
                 int(arrays["image"][i]),
+                (int(arrays["innovations"][i, 0]), int(arrays["innovations"][i, 1])),
             ),
         )
         for i in range(len(arrays["key"]))
@@ -134,6 +138,7 @@ def _sighting(frame, image, time_s, slot, people, report) -> Sighting:
         slot,
         mode,
         image,
+        (int(report.innovations[slot, 0]), int(report.innovations[slot, 1])),
     )
 
 

@@ -145,6 +145,8 @@ class Report(NamedTuple):
     """False where the distance from the camera cannot be measured, as with head and feet hidden (section 4, E2)."""
     nis: Float[Array, " slots"]
     """Normalised innovation squared of the update, over its four coordinates."""
+    innovations: Int32[Array, "slots 2"]
+    """How many coordinates were compared with their prediction, and how many of these lie within its 95 % band."""
 
 
 def nobody(config: PeopleConfig, cameras: int = 1) -> People:

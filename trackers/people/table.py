@@ -37,6 +37,9 @@ class TimedPeopleTrack(NamedTuple):
     """(rows,) where the tracker kept this person."""
     image: np.ndarray
     """(rows,) number of the image of the first camera, from 0; -1 in frames in which it has none."""
+    innovations: np.ndarray
+    """(rows, 2) how many coordinates were compared with their prediction, and how many of these lie within its 95 %
+    band."""
     status: np.ndarray
     """(rows,) int64: places in `STATUS`."""
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int32
 
 from jaxfilters._full_precision import dot, einsum
 from jaxfilters._xla.compiled_quickly import compiled_fully
@@ -21,6 +21,7 @@ from jaxfilters.gaussian.consider import consider
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import Outline, outline
 from jaxfilters.motion.models import constant_velocity
+from jaxfilters.trackers.innovations import innovation_counts
 from jaxfilters.trackers.people import detectability, lifecycle
 from jaxfilters.trackers.people.appearance import appearances, identity_switch_correction
 from jaxfilters.trackers.people.fit import Fit, as_measurement, fit_people
@@ -125,7 +126,7 @@ def step(
     tracked = people.mode == TRACKED
     log_weights = detectability.predicted(people.detectability, dt, tracked)
     fit = fit_people(scene, predicted, people.shift, log_weights, active, lifecycle.seniority(people), frames)
-    belief, nis = updated(scene, predicted, fit, dt)
+    belief, nis, innovations = updated(scene, predicted, fit, dt)
     people = people._replace(
         belief=chosen(active, belief, people.belief),
         shift=fit.shift,
@@ -140,7 +141,7 @@ def step(
     people = identity_switch_correction(people, histograms, good, dt)
     people = lifecycle.named(lifecycle.remembered(people, histograms, good))
     people = lifecycle.confirm(scene, people, birth(scene, places, active, frames))
-    return people, _report(scene, people, fit, nis)
+    return people, _report(scene, people, fit, nis, innovations)
 
 
 @compiled_fully
@@ -154,7 +155,7 @@ def _observed_places(scene: PeopleScene, people: People) -> Array:
     return jax.vmap(observed_place, in_axes=(None, 0))(scene, people.belief.mean)
 
 
-def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
+def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array, innovations: Array) -> Report:
     covariance = people.belief.covariance[:, :2, :2]
     sight = fit.axes[:, 0, :2]
     radial = jnp.sqrt(jnp.maximum(einsum("ki,kij,kj->k", sight, covariance, sight), 0.0))
@@ -169,6 +170,7 @@ def _report(scene: PeopleScene, people: People, fit: Fit, nis: Array) -> Report:
         fit.flatness,
         radial < NO_DEPTH * _distance(scene, people.belief.mean[:, :2]),
         nis,
+        innovations,
     )
 
 
@@ -192,8 +194,8 @@ def motion(config: PeopleConfig, dt: Float[Array, ""]) -> tuple[Float[Array, "9 
 
 def updated(
     scene: PeopleScene, predicted: Gaussian, fit: Fit, dt: Float[Array, ""]
-) -> tuple[Gaussian, Float[Array, " slots"]]:
-    """Beliefs after the readings in turn, and their mean normalised innovation squared.
+) -> tuple[Gaussian, Float[Array, " slots"], Int32[Array, "slots 2"]]:
+    """Beliefs after the readings in turn, their mean normalised innovation squared, and `innovation_counts`.
 
     Args:
         scene: Cameras and constants.
@@ -205,13 +207,15 @@ def updated(
     frames = 2 * scene.config.silhouette_bias_s / jnp.clip(dt, LEAST_DT_S, 2 * scene.config.silhouette_bias_s)
     readings = as_measurement(fit, scene.config.silhouette_sd_m)
     belief, nis = predicted, jnp.zeros(len(fit.score))
+    innovations = jnp.zeros((len(fit.score), 2), jnp.int32)
     whole = jnp.any((fit.shares_seen > WHOLE) & (fit.crowding < MOST_CROWDING), axis=-1)
     for i in range(readings.y.shape[1]):
         mine = jax.tree.map(lambda leaf, i=i: leaf[:, i], readings)
         one = jax.vmap(lambda b, r, w, i=i: _of_one(scene, i, b, r, w, frames))
-        belief, one_nis = one(belief, mine, whole)
+        belief, one_nis, counts = one(belief, mine, whole)
         nis += one_nis
-    return belief, nis / jnp.maximum(jnp.sum(jnp.any(readings.observed, axis=-1), axis=-1), 1)
+        innovations += counts
+    return belief, nis / jnp.maximum(jnp.sum(jnp.any(readings.observed, axis=-1), axis=-1), 1), innovations
 
 
 def _of_one(scene, camera, belief, reading, whole, frames):
@@ -225,4 +229,5 @@ def _of_one(scene, camera, belief, reading, whole, frames):
         R += dot(frames * loading, loading.T)
     after, info = joseph.update(belief, reading.y, H, R, mask=reading.observed)
     size = (jnp.arange(STATE) == HEIGHT) | (jnp.arange(STATE) == WIDTH)
-    return jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size)), info.nis
+    after = jax.tree.map(lambda a, b: jnp.where(whole, a, b), after, consider(belief, after, size))
+    return after, info.nis, innovation_counts(info)

@@ -206,6 +206,7 @@ def two_hands():
         is_observed=np.array([[True, False], [False, True]]),
         position=np.full((2, 2, 2), 30.0),
         sd=np.ones((2, 2)),
+        innovations=np.full((2, 2, 2), (2, 1)),
         velocity=np.full((2, 2, 2), 1.5),
         is_thumb=np.array([[False, False], [True, False]]),
         thumb_probability=np.array([[0.1, 0], [0.9, 0.2]]),

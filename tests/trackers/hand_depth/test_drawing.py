@@ -27,6 +27,7 @@ def results(recording):
         pose.astype(np.float32),
         np.full((frames, 21), 0.003, np.float32),
         recording.joints,
+        np.zeros((frames, 2), np.int32),
         np.linspace(100, 300, frames, dtype=np.float32),
         np.zeros(frames, np.float32),
         np.arange(frames, dtype=np.int32) % 3,

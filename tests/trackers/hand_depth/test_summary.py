@@ -15,8 +15,8 @@ RED = (0, 0, 255)
 def make_results(recording, joints):
     frames = len(recording)
     pose = np.concatenate([joints[:, 0], np.ones((frames, 1)), np.zeros((frames, 18))], axis=1)
-    spread, ones = np.full((frames, 21), 0.003), np.ones(frames)
-    return TimedHandTrack(recording.times_s, pose, spread, joints, ones, ones, ones.astype(int))
+    spread, ones, counts = np.full((frames, 21), 0.003), np.ones(frames), np.zeros((frames, 2), int)
+    return TimedHandTrack(recording.times_s, pose, spread, joints, counts, ones, ones, ones.astype(int))
 
 
 def test_joint_error_is_the_mean_distance(recording):

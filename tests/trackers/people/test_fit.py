@@ -136,7 +136,7 @@ def test_heights_are_measured_of_whole_silhouettes_only(found, camera, floor):
     full = lambda value: jnp.full((SLOTS, 1), value)
     for share, crowding, is_measured in ((0.93, 0.2, False), (0.97, 0.2, True), (0.97, 0.4, False)):
         given = fit._replace(shares_seen=full(share), crowding=full(crowding))
-        after, _ = updated(scene, before, given, jnp.array(0.1))
+        after, *_ = updated(scene, before, given, jnp.array(0.1))
         moved = np.abs(np.asarray(after.mean - mean))[0]
         assert (moved[HEIGHT] > 0.005) == is_measured
         assert np.linalg.norm(moved[:2]) > 0.02

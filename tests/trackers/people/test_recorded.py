@@ -24,8 +24,8 @@ def _frame(mode, identity, x=0.0, share=1.0, has_depth=True):
         identity=jnp.array([identity, -1]),
         log_odds=jnp.array([1.0, 0.0]),
     )
-    n = np.zeros(2)
-    report = Report(people.identity, people.mode, mean[:, :2], n, n, n, n + share, n, np.array([has_depth, True]), n)
+    n, depth, counts = np.zeros(2), np.array([has_depth, True]), np.array([[4, 3], [4, 4]])
+    report = Report(people.identity, people.mode, mean[:, :2], n, n, n, n + share, n, depth, n, counts)
     return jax.tree.map(np.asarray, people), report
 
 
@@ -47,6 +47,7 @@ def test_sightings_are_saved_with_the_image_that_they_belong_to():
         recorder.add(frame, image, 0.1 * frame, *_frame(TRACKED, 5))
     rows = as_rows([(5, sighting) for sighting in recorder.tracks[5]])
     assert rows.image.tolist() == [0, NO_IMAGE, 1]
+    assert rows.innovations.tolist() == [[4, 3]] * 3
     assert [(sighting.frame, sighting.image) for _, sighting in from_rows(rows)] == [(0, 0), (1, NO_IMAGE), (2, 1)]
 
 

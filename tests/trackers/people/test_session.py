@@ -44,8 +44,8 @@ def given(monkeypatch):
             identity=people.identity.at[0].set(4 if tracked else -1),
             log_odds=people.log_odds + 1,
         )
-        n = jnp.ones(len(people.mode))
-        return people, Report(people.identity, people.mode, people.belief.mean[:, :2], n, n, n, n, n, n > 0, n)
+        n, none = jnp.ones(len(people.mode)), jnp.zeros((len(people.mode), 2), jnp.int32)
+        return people, Report(people.identity, people.mode, people.belief.mean[:, :2], n, n, n, n, n, n > 0, n, none)
 
     monkeypatch.setattr(session, "step", step)
     return steps
