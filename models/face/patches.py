@@ -25,7 +25,7 @@ SKIN_NORMALS = np.array(
     ]
 )
 """Outward normals of the skin within 9 mm of each landmark, on the mean head of the ICT face model (light-stage scans;
-R. Li et al., "Learning formation of physically-based face attributes", 2020)."""
+R. Li et al., "Learning formation of physically-based face attributes", 2020; MIT License, see the file `NOTICE`)."""
 SIZE, WIDE_SIZE = 16, 24
 """Pixels of a window; of what is kept of the first image, so that a window is still full when its picture shrinks."""
 REACH_PX = 6

@@ -131,9 +131,7 @@ def residuals(
         prior: What is known.
     """
     offset = _of_offset(person, observed_size(face, person.identity, expressions), prior)
-    measured = jnp.asarray(prior.eyes_apart_std) > 0
-    wrong = eyes_apart(face, person) - prior.eyes_apart
-    size = jnp.where(measured, wrong / jnp.where(measured, prior.eyes_apart_std, 1.0), 0.0)
+    size = _of_eyes(face, person, prior)
     before = jnp.zeros(0, offset.dtype) if prior.past is None else past.residuals(prior.past, parameters(person))
     identity = prior.weight * _of_identity(face, person.identity)
     return jnp.concatenate([identity, offset.ravel(), size[None], before])
@@ -148,6 +146,29 @@ def own_offset(person: Person, prior: Prior) -> Float[Array, "K 3"]:
     away = jnp.matmul(whitening, (person.offset - prior.offset_mean).ravel(), precision="highest")
     share = jnp.matmul(whitening.T, away, precision="highest")
     return jnp.square(jnp.asarray(prior.offset_std)) * share.reshape(person.offset.shape)
+
+
+def _of_eyes(face: MultilinearFace, person: Person, prior: Prior) -> Array:
+    """Of the known distance between the eyes, in standard deviations; 0 where it is not known.
+
+    It is that of the face. Where a detector placed the landmarks, they say how far apart it puts the eyes, and what of
+    that is the face's own is known but for the rest of the offset's variance, about its conditional mean.
+    """
+    measured = jnp.asarray(prior.eyes_apart_std) > 0
+    wrong = eyes_apart(face, person._replace(offset=own_offset(person, prior))) - prior.eyes_apart
+    variance = jnp.square(jnp.asarray(prior.eyes_apart_std)) + _unknown_of_eyes(prior)
+    return jnp.where(measured, wrong / jnp.sqrt(jnp.where(measured, variance, 1.0)), 0.0)
+
+
+def _unknown_of_eyes(prior: Prior) -> Array:
+    """Variance of what is the face's own of the distance between the eyes, given all of the offset, mm^2."""
+    if prior.misplaced is None:
+        return jnp.zeros(())
+    whitening, variance = prior.misplaced.whitening, jnp.square(jnp.asarray(prior.offset_std))
+    apart = jnp.zeros(whitening.shape[0] // 3).at[jnp.asarray(EYES)].set(jnp.array([-0.5, -0.5, 0.5, 0.5]))
+    across = jnp.kron(apart, jnp.array([1.0, 0.0, 0.0]))
+    share = jnp.matmul(whitening, across, precision="highest")
+    return variance * (jnp.sum(jnp.square(across)) - variance * jnp.sum(jnp.square(share)))
 
 
 def _of_offset(person: Person, size: Array, prior: Prior) -> Float[Array, "K 3"]:

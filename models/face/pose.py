@@ -1,8 +1,8 @@
 """Head poses: millimetres and radians, `(x, y, z, roll, yaw, pitch)`.
 
-The model frame has x to the image's right, y down, z away from the camera; a face that looks into the first camera has
-no rotation. Positive yaw turns the nose towards the image's left. Everything is algebra on components, so that
-`vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble.
+The model frame has x to the image's right, y down, z away from the camera; a face that looks along the axis of the
+first camera, towards it, has no rotation. Positive yaw turns the nose towards the image's left. Everything is algebra
+on components, so that `vmap(in_axes=-1, out_axes=-1)` runs it as vector arithmetic over an ensemble.
 """
 
 from typing import TypeVar

@@ -37,7 +37,7 @@ EXPRESSION_STD = np.array(
 )
 """(10, 3) millimetres: root mean square displacement of the landmarks along x, y, z over the expressions of the ICT
 face model without those of the gaze (light-stage scans; R. Li et al., "Learning formation of physically-based face
-attributes", 2020)."""
+attributes", 2020; MIT License, see the file `NOTICE`)."""
 MEASURED_STD = 0.1
 """Millimetres: of a measured landmark."""
 ROUNDS, DEGREES_OF_FREEDOM = 8, 1.0

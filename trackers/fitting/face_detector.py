@@ -51,6 +51,8 @@ OUTLIER_MM, ROUNDS = 4.0, 5
 """Scale of the Cauchy weights; how often they are computed."""
 FEWEST = 4
 """Pictures of a person in which the face was detected."""
+LEAST_PEOPLE = 3 * NUM_LANDMARKS // 2
+"""For a covariance of three coordinates of each landmark; people count twice, as they are and mirrored."""
 ELSEWHERE = 0.5
 """Distances between the eyes from which on a detection is of something else."""
 
@@ -70,9 +72,16 @@ def fit_detector(options: argparse.Namespace) -> str:
     """Measure the detectors, write `options.out`, and say in a few lines what was found.
 
     Raises:
-        InputError: the model cannot be read, or a detector finds hardly any face.
+        InputError: there would be too few people or images, the model cannot be read, or a detector finds hardly any
+            face.
         OutputError: the file cannot be written.
     """
+    if options.people < LEAST_PEOPLE:
+        raise InputError(f"--people must be {LEAST_PEOPLE} or more, for a covariance; got {options.people}.")
+    if options.images < FEWEST:
+        raise InputError(
+            f"--images must be {FEWEST} or more, for what the images of a person share; got {options.images}."
+        )
     model = open_ict(options.data)
     detectors: dict[str, Detector] = {name: kind() for name, kind in DETECTORS.items() if _loads(name)}
     found: dict[str, list[list[Picture]]] = {name: [] for name in detectors}
@@ -120,8 +129,11 @@ def measured(people: list[list[Picture]], name: str) -> DetectorErrors:
         InputError: if too few people were detected for a covariance.
     """
     enough = [pictures for pictures in people if len(pictures) >= FEWEST]
-    if len(enough) < 3 * NUM_LANDMARKS // 2:
-        raise InputError(f"{name}: found {len(enough)} of {len(people)} people; a covariance needs more (--people).")
+    if len(enough) < LEAST_PEOPLE:
+        raise InputError(
+            f"{name}: found {len(enough)} of {len(people)} people in {FEWEST} images or more; a covariance needs "
+            f"{LEAST_PEOPLE} (--people, --images)."
+        )
     each = [_misplaced(pictures) for pictures in enough]
     offsets, rest = np.stack([one for one, _ in each]), np.concatenate([left for _, left in each])
     mirrored = offsets[:, list(MIRROR)] * (-1.0, 1.0, 1.0)
@@ -160,8 +172,8 @@ def _rendered(
     key: AnyKey, model: IctModel, rig: CameraRig, images: int
 ) -> Iterator[tuple[np.ndarray, jax.Array, jax.Array]]:
     """Grey pictures of a person, with the landmarks in the model frame and the pose."""
-    who, looks, wall, noise, numbers = jax.random.split(key, 5)
-    person = make_ict_person(who, model)
+    person_key, looks, wall, noise, numbers = jax.random.split(key, 5)
+    person = make_ict_person(person_key, model)
     head, skin, background = make_ict_head(model, person), paint_skin(looks, model), make_background(wall, rig.shape)
     rng = np.random.default_rng(np.asarray(jax.random.bits(numbers, (4,))))
     moving = np.isin(model.names, SPEAKING)

@@ -1,6 +1,7 @@
 """`jaxfilters fit face-model`: a multilinear model of the face from examples, and how good it is."""
 
 import argparse
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,8 @@ from jaxfilters.models.face.multilinear import (
 from jaxfilters.models.face.multilinear_fit import leave_one_out
 from jaxfilters.models.face.people_alignment import aligned_people
 from jaxfilters.models.synthetic.face_training import generator_shapes, ict_shapes, people_of
+from jaxfilters.trackers.head.mono.config import EYES_APART_MM
+from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.io.enrolled_people import People, write_people
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, save_face_model
@@ -43,6 +46,8 @@ class Examples(NamedTuple):
     """Where it is from, in words."""
     parameters: dict
     """How it was drawn."""
+    note: str | None = None
+    """What was assumed, for a person."""
 
 
 class Quality(NamedTuple):
@@ -83,22 +88,31 @@ def fit(options: argparse.Namespace) -> str:
         file = FaceModelFile(model, sets.names, sets.pairs, examples.source, parameters)
         save_face_model(options.out, file)
         lines = [*_described(sets, examples.source, quality, options), *_generalisation(tensor, options)]
+        lines += [] if examples.note is None else [examples.note]
         lines.append(f"model in {options.out}")
         if options.remember is not None:
-            names = tuple(f"{examples.source}, {i + 1}" for i in range(len(sets.shapes)))
-            write_people(options.remember, People(names, gallery.of_tensor(model, tensor)), model)
+            _write_people(options.remember, examples, model, tensor)
             lines.append(f"people in {options.remember}")
         return "\n".join(lines)
+
+
+def _write_people(path: Path, examples: Examples, model: MultilinearFace, tensor: jax.Array) -> None:
+    """The people of the examples; of 68 landmarks with the ten that `track head-mono` follows, as it knows people."""
+    known = gallery.of_tensor(model, tensor)
+    if model.num_landmarks == len(NAMES_68):
+        model, known = tracked(model), known._replace(offset=known.offset[:, list(FROM_68)])
+    names = tuple(f"{examples.source}, {i + 1}" for i in range(len(known.identity)))
+    write_people(path, People(names, known), model)
 
 
 def _examples(options: argparse.Namespace) -> Examples:
     drawn = {"people": options.people, "seed": options.seed}
     # The generator of other versions would draw other people from the same seed; this names the one that is meant.
-    who, noise = jax.random.split(jax.random.key(options.seed, impl="threefry2x32"))
+    people_key, noise = jax.random.split(jax.random.key(options.seed, impl="threefry2x32"))
     if options.data is None:
         if options.points == 68:
             raise InputError("--points 68 needs DATA: the generator's faces have 10 landmarks.")
-        shapes = generator_shapes(noise, people_of(who, options.people))
+        shapes = generator_shapes(noise, people_of(people_key, options.people))
         return Examples(LandmarkSets(np.asarray(shapes), NAMES, PAIRS, None), "generator of synthetic faces", drawn)
     if (options.data / _ICT_FILE).is_file():
         return _ict_examples(options, noise, drawn)
@@ -107,7 +121,23 @@ def _examples(options: argparse.Namespace) -> Examples:
         sets = ten_of(sets)
     elif options.points == 68 and len(sets.names) != 68:
         raise InputError(f"--points 68 needs faces of 68 landmarks; {options.data} has {len(sets.names)}.")
-    return Examples(_aligned(sets), f"landmark sets {options.data.name}", {"people": len(sets.shapes)})
+    _check_millimetres(sets, options.data)
+    note = None if sets.neutral is not None else "no neutral expression is named: faces are taken to be aligned"
+    return Examples(_aligned(sets), f"landmark sets {options.data.name}", {"people": len(sets.shapes)}, note)
+
+
+def _check_millimetres(sets: LandmarkSets, path: Path) -> None:
+    """Raise `InputError` where the eyes are as far apart as in no face in millimetres, of ten landmarks or 68."""
+    if len(sets.names) not in (len(NAMES), len(NAMES_68)):
+        return
+    ten = sets.shapes if len(sets.names) == len(NAMES) else sets.shapes[:, :, list(FROM_68)]
+    right, left = np.moveaxis(ten[:, :, list(EYES)].reshape(*ten.shape[:2], 2, 2, 3).mean(axis=3), 2, 0)
+    apart = float(np.nanmedian(np.linalg.norm(left - right, axis=-1)))
+    least, most = EYES_APART_MM
+    if not least <= apart <= most:
+        raise InputError(
+            f"{path}: eyes are {apart:.3g} apart, the median of all faces; expected millimetres, {least:g} to {most:g}."
+        )
 
 
 def _ict_examples(options: argparse.Namespace, key: jax.Array, drawn: dict) -> Examples:

@@ -24,9 +24,14 @@ def fit_noise(options: argparse.Namespace) -> str:
     """
     points, times = _synthetic(options.seed) if options.tracks is None else read_points(options.tracks, options.fps)
     tracks, _ = as_input_error(lambda: tracks_of(points, times))
+    if not float(tracks.extent) > 0:
+        raise InputError(f"{options.tracks}: all points are at rest; expected points that move, and their noise.")
     found = as_input_error(lambda: learn(tracks))
     if not bool(found.converged):
-        raise InputError(f"{options.tracks}: no noise parameters explain these tracks ({found.termination}).")
+        raise InputError(
+            f"{options.tracks}: no noise parameters explain these tracks ({found.termination}); expected noisy "
+            "readings of points whose velocity changes."
+        )
     if options.out is not None:
         _write(options.out, found, points, times)
     made_up = "" if options.tracks else f"Synthetic tracks: sensor {_SYNTHETIC[0]}, drive {_SYNTHETIC[1]}.\n"

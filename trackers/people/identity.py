@@ -1,12 +1,12 @@
 """What was read from files beside the images, as hashes: what two runs must share for one to continue the other."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxfilters.trackers.io.cameras import CameraFile
+from jaxfilters.trackers.io.content_hash import content_hash
 from jaxfilters.trackers.io.scenes import SceneFile
 
 
@@ -24,22 +24,13 @@ def identity_of(
     outlines = [part for one in scene.outlines for part in (one["camera"], one["polygon"], one["at"])]
     return {
         "cameras": [_camera(one) for one in cameras],
-        "floor": _hash(scene.floor),
-        "furniture": _hash(scene.patches, *meshes, *outlines),
-        "detections": [_hash(*(part for item in sorted(one.items()) for part in item)) for one in detections],
+        "floor": content_hash(scene.floor),
+        "furniture": content_hash(scene.patches, *meshes, *outlines),
+        "detections": [content_hash(*(part for item in sorted(one.items()) for part in item)) for one in detections],
     }
 
 
 def _camera(file: CameraFile) -> str:
     undistortion = file.undistortion
     K = np.zeros((0, 0)) if undistortion.K is None else undistortion.K
-    return _hash(file.camera.P, K, undistortion.distortion)
-
-
-def _hash(*parts: Any) -> str:
-    """Of numbers and arrays of numbers, with their shapes."""
-    digest = hashlib.sha256()
-    for part in parts:
-        array = np.ascontiguousarray(part, np.float64)
-        digest.update(repr(np.shape(part)).encode() + array.tobytes())
-    return digest.hexdigest()[:16]
+    return content_hash(file.camera.P, K, undistortion.distortion)

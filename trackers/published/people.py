@@ -102,7 +102,7 @@ def paper_step(scene: PaperScene, state: PaperState, mask: Bool[Array, "rows col
     """One frame further: those in view moved to their best candidates, one at a time, and modes brought up to date.
 
     Raises:
-        ValueError: a mask of another size than the camera's image.
+        ValueError: a mask of another size than the camera's image, or not of bool.
     """
     _check_mask(scene, mask)
     config, passes = scene.config, len(scene.config.steps_m)
@@ -156,7 +156,7 @@ def score_profile(
     curved get the variance `1 / (looks * LEAST_CURVATURE)`.
 
     Raises:
-        ValueError: a mask of another size than the camera's image.
+        ValueError: a mask of another size than the camera's image, or not of bool.
     """
     _check_mask(scene, mask)
     return _profile(scene, state, mask, jnp.asarray(looks, float))
@@ -188,6 +188,8 @@ def _profile(scene, state, mask, looks):
 def _check_mask(scene, mask):
     if mask.shape != scene.camera.shape:
         raise ValueError(f"mask must have the shape of the camera's image, {scene.camera.shape}; got {mask.shape}.")
+    if mask.dtype != bool:
+        raise ValueError(f"mask must be of bool; got {mask.dtype}.")
 
 
 def _bodies(xy: Array, size: Array) -> Ellipsoid:

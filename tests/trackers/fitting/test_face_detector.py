@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import MIRROR
 from jaxfilters.models.face.rig import monocular
+from jaxfilters.trackers.app.cli import FAILURE, main
 from jaxfilters.trackers.fitting.face_detector import Picture, _on_face, measured
 from jaxfilters.trackers.io.errors import InputError
 
@@ -54,6 +55,15 @@ def test_the_mean_mesh_is_that_of_faces_turned_back():
     pictures = [[one._replace(solid=vertices + 1.0) for one in pictures_of(rng, np.zeros((10, 3)))] for _ in range(15)]
     pictures[0] = [one._replace(solid=vertices - 14.0) for one in pictures[0]]
     np.testing.assert_allclose(measured(pictures, "own").vertices, vertices, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [("--people=14", "--people must be 15 or more"), ("--images=3", "--images must be 4 or more")],
+)
+def test_too_few_to_draw_are_refused_before_anything_is_rendered(tmp_path, capsys, option, message):
+    assert main(["fit", "face-detector", str(tmp_path), "--out", str(tmp_path / "errors.npz"), option]) == FAILURE
+    assert message in capsys.readouterr().err
 
 
 def test_too_few_people_are_refused():

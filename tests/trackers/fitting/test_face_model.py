@@ -3,12 +3,13 @@ import numpy as np
 import pytest
 
 from jaxfilters.models.face.gallery import remember
-from jaxfilters.models.face.landmarks import EYES, NAMES, NOSTRILS
+from jaxfilters.models.face.landmarks import EYES, FROM_68, NAMES, NOSTRILS
 from jaxfilters.models.face.mirroring import PAIRS
-from jaxfilters.models.face.multilinear import learn, shape_tensor
+from jaxfilters.models.face.multilinear import learn, shape, shape_tensor
 from jaxfilters.models.face.people_alignment import aligned_people
 from jaxfilters.models.synthetic.face_training import NOISE_MM, generator_shapes, people_of
 from jaxfilters.trackers.app.cli import FAILURE, main
+from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.io.enrolled_people import read_people
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.face_models import default_face_model, load_face_model
@@ -27,6 +28,14 @@ def keep_environment(monkeypatch):
 def shapes():
     """(5, 10, 10, 3) millimetres."""
     return np.asarray(generator_shapes(jax.random.key(1), people_of(jax.random.key(0), 5)), float)
+
+
+@pytest.fixture(scope="module")
+def spread():
+    """(68, 10) weights: each of 68 landmarks is a mean of the ten, the ten themselves where iBUG has them."""
+    weights = np.full((68, 10), 0.1)
+    weights[list(FROM_68)] = np.eye(10)
+    return weights
 
 
 def fit(*arguments):
@@ -57,6 +66,7 @@ def test_a_file_of_landmarks_with_holes(tmp_path, capsys, shapes):
     assert "landmark sets faces.npz: 5 people, 10 expressions, 10 landmarks, 2 faces missing" in told
     assert "4 parameters of identity and 3 of expression capture 9" in told
     assert "5 people, each left out in turn" in told
+    assert "faces are taken to be aligned" in told
     read = load_face_model(tmp_path / "model.npz")
     assert (read.names, read.pairs) == (NAMES, PAIRS)
     assert read.parameters["people"] == 5
@@ -97,7 +107,31 @@ def test_a_folder_of_people_is_the_same_as_a_file(tmp_path, shapes):
     expected[2, 6] = np.nan
     np.testing.assert_array_equal(sets.shapes, expected)
     assert sets.neutral is None
+    for file in folder.glob("*.csv"):
+        file.write_text(file.read_text().replace("e4,", "Neutral,"))
+    assert read_landmark_sets(folder).neutral == 4
     assert np.argwhere(~sets.observed).tolist() == [[2, 6]]
+
+
+@pytest.mark.system
+def test_people_of_68_landmarks_are_known_by_the_ten_that_are_followed(tmp_path, shapes, spread):
+    """The ten are those of the faces of ten landmarks: what is remembered of each has its shape."""
+    np.savez(tmp_path / "faces.npz", shapes=np.einsum("jk,pekc->pejc", spread, shapes))
+    asked = ("--points", 68, "--out", tmp_path / "model.npz", "--remember", tmp_path / "people.npz", *FEW)
+    assert fit(tmp_path / "faces.npz", *asked) == 0
+    model = tracked(load_face_model(tmp_path / "model.npz").model)
+    known = read_people([tmp_path / "people.npz"], model).gallery
+    fitted = jax.vmap(lambda identity: shape(model, identity, model.expression_mean))(known.identity) + known.offset
+    halves = np.asarray(shape_tensor(jax.numpy.asarray(shapes, float)), float)
+    expected = np.moveaxis((halves[:, :, :5] + halves[:, :, 5:]).mean(axis=3) / 2, 2, 0)
+    centred = lambda faces: faces - np.mean(faces, axis=1, keepdims=True)
+    np.testing.assert_allclose(centred(np.asarray(fitted)), centred(expected), atol=1.0)
+
+
+def test_faces_that_are_not_in_millimetres_are_refused(tmp_path, capsys, shapes):
+    np.savez(tmp_path / "metres.npz", shapes=1e-3 * shapes)
+    assert fit(tmp_path / "metres.npz", "--out", tmp_path / "model.npz", *FEW) == FAILURE
+    assert "metres.npz: eyes are 0.0595 apart" in capsys.readouterr().err
 
 
 @pytest.mark.system

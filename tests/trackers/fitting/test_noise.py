@@ -32,6 +32,12 @@ def test_arrays_are_read_with_or_without_times(tmp_path):
     np.testing.assert_allclose(read_points(tmp_path / "b.npz", 20.0)[1], [0.0, 0.7])
 
 
+def test_points_at_rest_are_refused(tmp_path, capsys):
+    np.savez(tmp_path / "still.npz", points=np.ones((10, 2, 2)))
+    assert main(["fit", "noise", str(tmp_path / "still.npz")]) != 0
+    assert "still.npz: all points are at rest" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "frame,id,x,y\n0,a,1,there\n", ""])
 def test_another_table_is_refused(tmp_path, text):
     (tmp_path / "some.csv").write_text(text)

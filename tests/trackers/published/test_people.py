@@ -9,6 +9,7 @@ import pytest
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.models.person.ellipsoid import ellipse_mask, outline, standing
 from jaxfilters.models.person.score import match_score, ternary_mask
+from jaxfilters.trackers.published import people
 from jaxfilters.trackers.published.people import (
     ACQUIRE,
     LOST,
@@ -338,3 +339,5 @@ def test_bad_scenes_people_and_masks_are_named(scene):
     for act in (paper_step, score_profile):
         with pytest.raises(ValueError, match=r"mask must have the shape of the camera's image, \(120, 160\)"):
             act(scene, state, jnp.zeros((160, 120), bool))
+    with pytest.raises(ValueError, match="mask must be of bool; got uint8"):
+        people._check_mask(scene, jnp.zeros((120, 160), jnp.uint8))

@@ -11,10 +11,10 @@ from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.canvas import BLACK, draw_dot, draw_line
 from jaxfilters.trackers.app.video import caption, side_by_side
-from jaxfilters.trackers.head.common.table import STATUS_WORDS, TRACKED, HeadRows, displayed
+from jaxfilters.trackers.head.common.table import SHOWN_STATUS, TRACKED, HeadRows, displayed
 
 HEAD_STATUS_COLORS = ((0, 200, 255), (230, 190, 80), (110, 220, 90), (84, 92, 255), (60, 160, 255), (190, 190, 190))
-"""Blue, green, red, in the order of `STATUS_WORDS`."""
+"""Blue, green, red, in the order of `SHOWN_STATUS`."""
 AXIS_COLORS = ((84, 92, 255), (110, 220, 90), (255, 150, 70))
 """Of the axes to the image's right, downwards, and out of the face."""
 OUTLINES = (EYES[:2], EYES[2:], MOUTH, (BROWS[0], *NOSTRILS, BROWS[1]))
@@ -78,8 +78,9 @@ def _draw_axes(picture: np.ndarray, ends: np.ndarray) -> None:
 def _write_state(picture: np.ndarray, track: HeadRows, i: int) -> None:
     status, score = int(track.status[i]), float(track.score[i])
     scored = f"   score {score:.2f}" if np.isfinite(score) else ""
-    caption(picture, f"{STATUS_WORDS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])
+    caption(picture, f"{SHOWN_STATUS[status]}{scored}", 1, HEAD_STATUS_COLORS[status])
     if status in TRACKED:
-        x, y, z, roll, pitch, yaw = displayed(track.pose[i])
+        # Adding zero takes the sign of a negative zero away.
+        x, y, z, roll, pitch, yaw = np.round(displayed(track.pose[i])) + 0.0
         caption(picture, f"x {x:4.0f}  y {y:4.0f}  z {z:4.0f} mm", 2)
         caption(picture, f"roll {roll:4.0f}  pitch {pitch:4.0f}  yaw {yaw:4.0f}", 3)

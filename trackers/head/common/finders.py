@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfilters.models.face.landmarks import EYES
-from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, StableDetector, complete, detect
+from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, STABLE_SHARE, StableDetector, complete, detect
 from jaxfilters.trackers.head.common.mesh import MeshDetector
 
 MOST_MOVED_PX = 2.0
-"""Between two images of a face that holds still."""
+"""Between two images of a face that holds still; `STABLE_SHARE` of the eyes' distance where that is more."""
 MOST_TILT = np.radians(15.0)
 
 
@@ -86,7 +87,8 @@ class MeshFinder:
         if found is None:
             self.reset()
             return None
-        is_still = self._last is not None and float(np.abs(found - self._last).max()) < MOST_MOVED_PX
+        most = max(MOST_MOVED_PX, STABLE_SHARE * float(np.linalg.norm(np.subtract(*eye_centers(found)))))
+        is_still = self._last is not None and float(np.abs(found - self._last).max()) < most
         self._last, self._agreeing = found, self._agreeing + 1 if is_still else 1
         across = found[EYES[3]] - found[EYES[0]]
         if abs(np.arctan2(across[1], across[0])) >= MOST_TILT:

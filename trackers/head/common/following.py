@@ -1,6 +1,7 @@
 """From frames to a track, whatever tracker it is: waiting for a face, following it, finding it again after a loss."""
 
 import math
+import re
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -19,6 +20,8 @@ LOOK_EVERY_S = 1.0
 SAME_PLACE, MOST_CONTRADICTIONS = 0.5, 3
 """How far, in distances between the eyes, a detected face may be from the tracked one; how many detections in a row may
 contradict the track before it is given up."""
+UNUSED_POINTS = "the landmarks that were given cannot be used"
+"""Begins an event; they are then detected."""
 
 
 class Compared(NamedTuple):
@@ -118,6 +121,8 @@ class Following:
         self._looked, self._contradictions, self._is_refuted = -math.inf, 0, False
         self._compared = -math.inf
         """When the track was last compared with a detection; `_looked` is when any face was looked for."""
+        self._latest = -math.inf
+        """Time of the last frame, with a face or without."""
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> Any:
         """Track of the next frames, a row each.
@@ -135,8 +140,11 @@ class Following:
             raise ValueError(f"images must be {expected} of uint8; got {images.shape} of {images.dtype}.")
         if not np.all(np.isfinite(times)):
             raise ValueError("times must be finite.")
+        if np.any(np.diff(times, prepend=self._latest) <= 0):
+            raise ValueError("times must grow, from the last frame of the piece before, too.")
         if not len(times):
             return self._empty(0, None)
+        self._latest = float(times[-1])
         rows, done = [], 0
         while done < len(times):
             if self.state is None or self._is_lost:
@@ -166,6 +174,7 @@ class Following:
             "looked": self._looked,
             "contradictions": self._contradictions,
             "compared": self._compared,
+            "latest": self._latest,
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -173,7 +182,7 @@ class Following:
         self.state, self.events, self._said = saved["state"], list(saved["events"]), set(saved["said"])
         self._frames, self._time = saved["frames"], saved["time"]
         self._looked, self._contradictions = saved["looked"], saved["contradictions"]
-        self._compared = saved["compared"]
+        self._compared, self._latest = saved["compared"], saved["latest"]
         self._is_lost = self._is_refuted = False
         self._wait = None
         self._tracker.restore(saved["tracker"], self.state)
@@ -270,12 +279,13 @@ class Following:
         return self._message(wait.result())
 
     def _message(self, outcome: tuple[Any, list[str]]) -> Any:
-        """What was found; each thing that is wrong is said once in every search."""
+        """What was found; each thing that is wrong is said once in every search, whatever the numbers in it."""
         found, wrong = outcome
         for reason in wrong:
-            if reason not in self._said:
+            kind = re.sub(r"\d+(\.\d+)?", "0", reason)
+            if kind not in self._said:
                 self._say(0, reason)
-            self._said.add(reason)
+            self._said.add(kind)
         return found
 
     def _begin(self, found: Any) -> None:

@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfilters import weights
 from jaxfilters.gaussian.belief import Gaussian
@@ -17,6 +17,7 @@ from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.trackers.head.common import recent
 from jaxfilters.trackers.head.common.search import KAPPA
 from jaxfilters.trackers.head.common.state import POSE, Recent
+from jaxfilters.trackers.innovations import correction_counts
 
 UNKNOWN_STD = 0.01
 """Millimetres: of the coefficient of a mode that is not estimated yet, or not used."""
@@ -66,6 +67,23 @@ def predicted(
     mean = jnp.concatenate([before.mean[:POSE] + moved, variance / walked * before.mean[POSE:]])
     covariance = jnp.zeros_like(before.covariance).at[:POSE, :POSE].set(pose_covariance)
     return Gaussian(mean, covariance.at[POSE:, POSE:].set(jnp.diag(variance)))
+
+
+def pose_corrections(
+    search: AdaptiveDiffusionState, before: Gaussian, moved: Float[Array, " 6"], belief: Gaussian
+) -> Int[Array, "2"]:
+    """`correction_counts` of the pose in this frame.
+
+    Args:
+        search: After this frame's update.
+        before: The last belief, of pose and mode coefficients.
+        moved: What the head was predicted to move since, millimetres and radians.
+        belief: After the frame.
+    """
+    of_pose = lambda covariance: jnp.diagonal(covariance)[:POSE]
+    variance = of_pose(before.covariance) + jnp.square(search.spread[:POSE])
+    correction = belief.mean[:POSE] - before.mean[:POSE] - moved
+    return correction_counts(correction, variance, of_pose(belief.covariance))
 
 
 def anywhere(

@@ -9,7 +9,8 @@ from jaxfilters.trackers.app.results import finite, versions
 from jaxfilters.trackers.app.stream import RunResult
 from jaxfilters.trackers.head.common.report import errors, shares
 from jaxfilters.trackers.head.common.run import HeadStream
-from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, TRACKED, HeadRows, displayed
+from jaxfilters.trackers.head.common.table import DISPLAYED, TABLE_STATUS, TRACKED, HeadRows, displayed
+from jaxfilters.trackers.innovations import contradiction, innovation_share
 
 
 def run_report(stream: HeadStream, results: HeadRows, followed: RunResult) -> dict[str, Any]:
@@ -25,6 +26,7 @@ def run_report(stream: HeadStream, results: HeadRows, followed: RunResult) -> di
         "trouble": followed.trouble,
         "note": place.note,
         "events": events,
+        "innovations": innovation_share(results.innovations).report(),
         "errors": errors(results, place.truth),
         "versions": versions(),
     }
@@ -40,12 +42,14 @@ def format_report(report: dict[str, Any], out: Path, *, has_video: bool) -> str:
         + f", longest stretch without loss {report['longest_stretch_s']:.1f} s"
         + (", interrupted" if report["interrupted"] else "")
     ]
+    if text := contradiction(report["innovations"]):
+        lines.append(text.strip())
     if report["errors"]:
         values = displayed(np.asarray(list(report["errors"]["rmse"].values())))
         named = zip((axis.replace(",", " in") for axis in DISPLAYED), values, strict=True)
         rmse = ", ".join(f"{axis} {value:.2f}" for axis, value in named)
         lines.append(f"errors, root mean square: {rmse}")
-    if not any(report["status"][STATUS_WORDS[code]] for code in TRACKED):
+    if not any(report["status"][TABLE_STATUS[code]] for code in TRACKED):
         last = f"; last: {report['events'][-1]['what']}" if report["events"] else ""
         lines.append(f"no face was followed{last}")
     lines.append(

@@ -8,9 +8,10 @@ from jaxfilters.models.face.pose import within_half_turn
 from jaxfilters.trackers.head.common.table import (
     AXES,
     SKIPPED,
-    STATUS_WORDS,
+    TABLE_STATUS,
     TRACKED,
     HeadRows,
+    is_deformable,
     longest_stretch,
 )
 
@@ -29,14 +30,15 @@ class HeadTruth(NamedTuple):
 
 def shares(track: HeadRows) -> dict[str, Any]:
     """Frames by status, how much of the run is tracked, and the longest stretch without loss."""
-    counts = np.bincount(track.status, minlength=len(STATUS_WORDS))
+    counts = np.bincount(track.status, minlength=len(TABLE_STATUS))
     observed = int(len(track.status) - counts[SKIPPED])
     longest = longest_stretch(track.status)
     tracked = np.isin(track.status, TRACKED)
     ends = track.times_s[[longest.start, longest.stop - 1]] if longest.stop else np.zeros(2)
     return {
         "frames": len(track.status),
-        "status": dict(zip(STATUS_WORDS, counts.tolist(), strict=True)),
+        "status": {word: int(counts[np.equal(TABLE_STATUS, word)].sum()) for word in dict.fromkeys(TABLE_STATUS)},
+        "frames_deformable": int(is_deformable(track).sum()),
         "share_tracked": round(float(tracked.sum() / observed), 4) if observed else None,
         "longest_stretch_frames": int(tracked[longest].sum()),
         "longest_stretch_s": round(float(ends[1] - ends[0]), 3),

@@ -6,13 +6,17 @@ from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
+import jax
 import numpy as np
 
+from jaxfilters.trackers.app.progress import warn
 from jaxfilters.trackers.app.results import TrackTable
 from jaxfilters.trackers.app.stream import StreamSpec
 from jaxfilters.trackers.head.common.drawing import draw_frame
+from jaxfilters.trackers.head.common.following import UNUSED_POINTS
 from jaxfilters.trackers.head.common.input import Setup
-from jaxfilters.trackers.head.common.table import SKIPPED, STATUS_WORDS, HeadRows, with_gaps
+from jaxfilters.trackers.head.common.table import SHOWN_STATUS, SKIPPED, HeadRows, with_gaps
+from jaxfilters.trackers.io.content_hash import content_hash
 from jaxfilters.trackers.io.paired_input import PairedInput
 from jaxfilters.trackers.io.undistortion import straightened
 from jaxfilters.trackers.io.video_input import FrameSet
@@ -105,12 +109,18 @@ class HeadStream:
             [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in moment.images if image is not None]
             for moment in moments
         ]
+        num_events = len(self.session.events)
         track = self.session.process(np.asarray(grey), np.asarray([moment.time_s for moment in moments]))
-        self.status = STATUS_WORDS[int(track.status[-1])]
+        for _, what in self.session.events[num_events:]:
+            if what.startswith(UNUSED_POINTS):
+                warn(f"{what}; a face is detected instead")
+        self.status = SHOWN_STATUS[int(track.status[-1])]
         return track
 
 
-def stream_spec(stream: HeadStream, rows: RowsOf, config: Any, files: Mapping[str, Any]) -> StreamSpec:
+def stream_spec(
+    stream: HeadStream, rows: RowsOf, config: Any, files: Mapping[str, Any], contents: Mapping[str, Any] | None = None
+) -> StreamSpec:
     """A run of a head.
 
     Args:
@@ -118,22 +128,26 @@ def stream_spec(stream: HeadStream, rows: RowsOf, config: Any, files: Mapping[st
         rows: How its track becomes rows.
         config: A dataclass of Python values: the options of the session.
         files: What else decides about the results, by the names of options; None where it was not given.
+        contents: Trees of arrays that were read from files, beside the cameras and landmarks, by what they are.
     """
     sources = stream.place.sources
     paired = PairedInput(sources)
     total = min((getattr(source, "frames", 0) for source in sources), default=0) or None
     moments = straightened(iter(paired), stream.place.undistortions)
-    identity = _identity(stream.place, config, files)
+    identity = _identity(stream.place, config, files, contents or {})
     return StreamSpec(sources, moments, paired.trouble, stream, rows.table, identity, total)
 
 
-def _identity(place: Setup, config: Any, files: Mapping[str, Any]) -> dict[str, Any]:
+def _identity(place: Setup, config: Any, files: Mapping[str, Any], contents: Mapping[str, Any]) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
+    lenses = [np.zeros(5) if one.is_identity else one.distortion for one in place.undistortions]
+    read = {"cameras": [place.rig, lenses, place.focal_log_std], "landmarks": place.points, **contents}
     return {
         "input": [source.name for source in place.sources],
         "image_sizes": [list(source.image_size) for source in place.sources],
         "fps": [source.fps for source in place.sources],
         "version": version("jaxfilters"),
+        **{f"contents of {name}": content_hash(*jax.tree.leaves(tree)) for name, tree in read.items()},
         **{f"--{name}": str(value) for name, value in files.items() if value is not None},
         **{f"config.{name}": value for name, value in asdict(config).items()},
     }

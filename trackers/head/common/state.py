@@ -135,5 +135,8 @@ class HeadTrack(NamedTuple):
     score: Float[Array | np.ndarray, " b"]
     """Mean normalised correlation at the estimate, -1 to 1."""
     effective_sample_size: Float[Array | np.ndarray, " b"]
+    innovations: Int[Array | np.ndarray, "b 2"]
+    """How many coordinates of the pose the frame has corrected, and how many of these by less than 1.96 of the standard
+    deviations that the filter claims for a correction: 95 % if it is right."""
     status: Int[Array | np.ndarray, " b"]
     """Index into `HEAD_STATUS`."""

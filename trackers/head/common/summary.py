@@ -11,7 +11,7 @@ from jaxfilters.trackers.app.canvas import INK, write
 from jaxfilters.trackers.app.chart import Color, Curve, Shade, draw_chart
 from jaxfilters.trackers.head.common.drawing import HEAD_STATUS_COLORS, draw_points
 from jaxfilters.trackers.head.common.state import NUM_MODES
-from jaxfilters.trackers.head.common.table import DISPLAYED, STATUS_WORDS, HeadRows, displayed
+from jaxfilters.trackers.head.common.table import DISPLAYED, SHOWN_STATUS, HeadRows, displayed
 from jaxfilters.trackers.io.errors import OutputError
 
 DEVIATIONS = 2.0
@@ -142,7 +142,7 @@ def _legend(status: np.ndarray) -> np.ndarray:
     """The colours of the statuses, and the share of frames in each."""
     sheet = np.full((_LEGEND_ROWS, _WIDTH, 3), 255, np.uint8)
     left = _LEFT
-    for code, word in enumerate(STATUS_WORDS):
+    for code, word in enumerate(SHOWN_STATUS):
         share = float(np.mean(status == code))
         if not share:
             continue

@@ -11,10 +11,11 @@ from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.trackers.app.results import Columns, TrackTable
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, HEAD_STATUS, NUM_MODES, RIGID, HeadTrack
 
-STATUS_WORDS = (*HEAD_STATUS, "skipped")
-"""Words for the integers in `TimedHeadTrack.status`; skipped: without an image of each camera."""
 TABLE_STATUS = ("searching", "tracking", "tracking", "lost", "doubtful", "skipped")
-"""The same in tables, in the words of all trackers; `is_deformable` tells the two that are tracked apart."""
+"""Words for the integers in `TimedHeadTrack.status`, those of all trackers; `is_deformable` tells the two that are
+tracked apart. Skipped: without an image of each camera."""
+SHOWN_STATUS = ("searching", "tracking, rigid", "tracking", "lost", "doubtful", "skipped")
+"""The same in pictures and while a run goes on."""
 SKIPPED = len(HEAD_STATUS)
 TRACKED = (RIGID, DEFORMABLE, DOUBTFUL)
 """Statuses in which there is a pose."""
@@ -46,6 +47,8 @@ class HeadRows(Protocol):
     @property
     def score(self) -> np.ndarray: ...
     @property
+    def innovations(self) -> np.ndarray: ...
+    @property
     def status(self) -> np.ndarray: ...
 
 
@@ -65,11 +68,14 @@ class TimedHeadTrack(NamedTuple):
     image_points: np.ndarray
     """(frames, cameras, 10, 2) pixels without lens distortion."""
     score: np.ndarray
-    """(frames,) mean correlation of the best particle."""
+    """(frames,) mean correlation at the estimate, -1 to 1."""
     effective_sample_size: np.ndarray
     """(frames,)."""
+    innovations: np.ndarray
+    """(frames, 2) how many coordinates of the pose the frame has corrected, and how many of these by less than 1.96 of
+    the standard deviations that the filter claims for a correction."""
     status: np.ndarray
-    """(frames,) int32: places in `STATUS_WORDS`."""
+    """(frames,) int32: places in `TABLE_STATUS`."""
 
 
 def is_deformable(track: HeadRows) -> np.ndarray:
@@ -169,6 +175,7 @@ def empty_rows(num_cameras: int, frames: int) -> TimedHeadTrack:
         image_points=np.zeros((frames, num_cameras, NUM_LANDMARKS, 2), np.float32),
         score=one,
         effective_sample_size=one,
+        innovations=np.zeros((frames, 2), np.float32),
         status=np.zeros(frames, np.int32),
     )
 

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxfilters.models.face.gallery import Gallery
 from jaxfilters.models.face.landmarks import NAMES
-from jaxfilters.models.face.person_prior import eyes_apart
+from jaxfilters.models.face.multilinear import MultilinearFace
+from jaxfilters.models.face.person_prior import Person, eyes_apart
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
@@ -71,7 +73,8 @@ def track(options: argparse.Namespace) -> str:
     rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
     stream = HeadStream(place, session, rows, settings.chunk)
     files = {name: getattr(options, name) for name in _GIVEN} | {"detector": detected_by}
-    with closing(StreamRun(options, stream_spec(stream, rows, settings, files))) as run:
+    contents = {"model": model.model, "people": gallery}
+    with closing(StreamRun(options, stream_spec(stream, rows, settings, files, contents))) as run:
         return _tracked(options, settings, stream, run, session, model, known, detected_by)
 
 
@@ -89,12 +92,11 @@ def _tracked(
     if place.note:
         warn(place.note)
     followed = run.follow()
-    person = session.person
     report = run_report(stream, run.writer.results, followed) | {
         "focal_length_px": np.asarray(place.rig.focal[0], float).tolist(),
         "is_focal_length_assumed": place.focal_log_std > 0,
         "focal_length_log_std": place.focal_log_std,
-        "eyes_apart_mm": None if person is None else finite(float(eyes_apart(face, person))),
+        "eyes_apart_mm": _eyes_apart_mm(face, session.gallery),
         "adjusted_frames": int(np.nansum(run.writer.results.is_adjusted)),
         "taken_for": _taken_for(run, known),
         "detector": detected_by,
@@ -156,6 +158,13 @@ def _in_words(focal: dict[str, Any]) -> str:
     return f"the focal length looks like {focal['px']:.0f} px, give or take {focal['std_px']:.0f}"
 
 
+def _eyes_apart_mm(face: MultilinearFace, followed: Gallery | None) -> float | None:
+    """Of the person who was followed, without what the detector misplaces; None without a face."""
+    if followed is None:
+        return None
+    return finite(float(eyes_apart(face, Person(followed.identity[0], followed.offset[0]))))
+
+
 def _taken_for(run: StreamRun, known: People | None) -> dict[str, int]:
     """In how many frames each of those who are known was before the camera; nobody without frames."""
     index = np.asarray(run.writer.results.person_index)
@@ -164,8 +173,9 @@ def _taken_for(run: StreamRun, known: People | None) -> dict[str, int]:
 
 
 def _learned(session: MonoSession) -> dict[str, np.ndarray]:
-    """What `track.npz` holds beside the track."""
+    """What `track.npz` holds beside the track, metres."""
     learned = {"status_names": np.asarray(TABLE_STATUS)}
     if session.person is not None:
-        learned |= {f"person_{name}": np.asarray(value) for name, value in session.person._asdict().items()}
+        person = session.person
+        learned |= {"person_identity": np.asarray(person.identity), "person_offset": 1e-3 * np.asarray(person.offset)}
     return learned

@@ -13,12 +13,12 @@ from jaxtyping import Float, UInt8
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.bundle import Views
 from jaxfilters.models.face.gallery import Gallery, joined
-from jaxfilters.models.face.landmarks import FROM_68, NUM_LANDMARKS
+from jaxfilters.models.face.landmarks import NUM_LANDMARKS
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
-from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
+from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
 from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
@@ -32,7 +32,7 @@ from jaxfilters.trackers.head.mono.recognition import People, as_gallery, check_
 from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, prior_beside, search_of
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.mono.tracking import System, advance
-from jaxfilters.trackers.head.stereo.session import check_points
+from jaxfilters.trackers.head.stereo.session import check_at_origin, check_focal_log_std, check_points
 from jaxfilters.trackers.io.face_models import people_face_model
 from jaxfilters.trackers.tracker import checked_times
 
@@ -91,16 +91,11 @@ class MonoSession:
         """
         if rig.num_cameras != 1:
             raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
-        if np.any(np.asarray(rig.rotation[0]) != np.eye(3)) or np.any(np.asarray(rig.translation[0]) != 0):
-            raise ValueError("rig must have its camera at the origin, without a rotation: its frame is the world.")
-        if points is None or len(points) != NUM_DENSE:
-            check_points(points)
-        else:
-            check_points(np.asarray(points)[list(FROM_68)])
+        check_at_origin(rig)
+        check_points(points, (NUM_LANDMARKS, NUM_DENSE))
         options = options or MonoConfig()
         check_gallery(gallery, tracked(face), options)
-        if not (math.isfinite(focal_log_std) and focal_log_std >= 0):
-            raise ValueError(f"focal_log_std must be finite and at least 0; got {focal_log_std}.")
+        check_focal_log_std(focal_log_std)
         self._tracker = _MonoTracker(rig, face, options, points, detections, detector, gallery, focal_log_std)
         self._following = Following(self._tracker)
 
@@ -129,10 +124,7 @@ class MonoSession:
         return None if self._following.state is None else self._tracker.focal_length(self._following.state)
 
     def saved(self) -> dict[str, Any] | None:
-        """All that the next frame needs, for `restore` in a session of the same cameras and options.
-
-        A tree that `trackers.io.checkpoint` can save; None while a face is searched for.
-        """
+        """What `restore` needs in a session of the same cameras and options, as arrays; `None` without a face."""
         return self._following.saved()
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -226,7 +218,8 @@ class _MonoTracker:
         collector = self._collector
         if self._points is not None:
             points, self._points = self._points, None
-            return self._checked(collector.given(points, images[0], time))
+            found, wrong = self._checked(collector.given(points, images[0], time))
+            return found, [f"{UNUSED_POINTS}: {reason}" for reason in wrong]
         if self._detections is not None:
             if time < self._detections.time:
                 return None, []
@@ -303,7 +296,10 @@ class _MonoTracker:
         return compared
 
     def reported(self, track: MonoTrack, times: np.ndarray) -> MonoTrack:
-        return self._meshes.reported(track, times)
+        # Who was followed before a loss is known, too, but is nobody of the gallery.
+        num_known = 0 if self._gallery is None else len(self._gallery.identity)
+        index = np.where(np.asarray(track.person_index) < num_known, track.person_index, -1)
+        return self._meshes.reported(track._replace(person_index=index), times)
 
     def _beside(self, state: MonoState, row: MonoTrack, observed: Seen, images: np.ndarray) -> Compared:
         """A track in doubt, or lost, beside what was detected in the last images."""
@@ -360,6 +356,7 @@ class _MonoTracker:
             image_points=nothing(1, NUM_LANDMARKS, 2),
             score=nothing(),
             effective_sample_size=np.zeros(count, np.float32),
+            innovations=np.zeros((count, 2), np.int32),
             identity=nothing(self._face.num_identities),
             offset=nothing(NUM_LANDMARKS, 3),
             person_index=np.full(count, -1, np.int32),

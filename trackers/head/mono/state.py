@@ -142,6 +142,9 @@ class MonoTrack(NamedTuple):
     score: Float[Array | np.ndarray, " b"]
     """Mean normalised correlation at the estimate, -1 to 1."""
     effective_sample_size: Float[Array | np.ndarray, " b"]
+    innovations: Int[Array | np.ndarray, "b 2"]
+    """How many coordinates of the pose the frame has corrected, and how many of these by less than 1.96 of the standard
+    deviations that the filter claims for a correction: 95 % if it is right."""
     identity: Float[Array | np.ndarray, "b S"]
     """In standard deviations of the training set's about their mean."""
     offset: Float[Array | np.ndarray, "b K 3"]

@@ -31,6 +31,9 @@ class TimedMonoTrack(NamedTuple):
     """(frames,) mean correlation."""
     effective_sample_size: np.ndarray
     """(frames,)."""
+    innovations: np.ndarray
+    """(frames, 2) how many coordinates of the pose the frame has corrected, and how many of these by less than 1.96 of
+    the standard deviations that the filter claims for a correction."""
     identity: np.ndarray
     """(frames, S) in standard deviations of the training set's."""
     offset: np.ndarray
@@ -80,6 +83,7 @@ def empty_mono_rows(face: MultilinearFace, frames: int) -> TimedMonoTrack:
         image_points=zeros(1, NUM_LANDMARKS, 2),
         score=zeros(),
         effective_sample_size=zeros(),
+        innovations=zeros(2),
         identity=zeros(face.num_identities),
         offset=zeros(NUM_LANDMARKS, 3),
         person_index=zeros() - 1,

@@ -17,7 +17,7 @@ from jaxfilters.models.face.rig import CameraRig, jacobian, project_shape
 from jaxfilters.models.face.shape_model import shape
 from jaxfilters.particle.adaptive import AdaptiveDiffusionState
 from jaxfilters.particle.weighting import ParticleInfo
-from jaxfilters.trackers.head.common.near_mode import spread
+from jaxfilters.trackers.head.common.near_mode import pose_corrections, spread
 from jaxfilters.trackers.head.common.recent import latest_templates
 from jaxfilters.trackers.head.common.search import KAPPA, LEAST_STEPS, Searches, at, gathered, score_at
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, FRAME_S, LOST, PATIENCE, POSE
@@ -102,6 +102,7 @@ def _step(
     if not options.is_published:
         # Far from the face few landmarks are turned to the camera, and two or three may correlate by chance.
         missed |= (state.misses >= PATIENCE) & (estimate.num_anchored < FEWEST_SURE)
+    innovations = jnp.where(missed, 0, pose_corrections(search, state.belief, moved, belief))
     state = _after(state, search, belief, estimate, missed)
     state, is_adjusted = _adjusted(system, state, estimate, score, missed, options)
     state = state._replace(
@@ -114,7 +115,8 @@ def _step(
         window=state.window._replace(ages=state.window.ages + 1),
     )
     num_sure = jnp.where(missed, 0.0, estimate.num_anchored)
-    return state, _track(system, state, score, info.effective_sample_size, is_adjusted, num_sure)
+    track = _track(system, state, score, info.effective_sample_size, is_adjusted, num_sure, innovations)
+    return state, track
 
 
 def _templates(state: MonoState, rig: CameraRig, moved: Array, options: MonoConfig) -> tuple[Array, Array]:
@@ -218,7 +220,13 @@ def _adjusted(
 
 
 def _track(
-    system: System, state: MonoState, score: Array, ess: Array, is_adjusted: Array, num_sure: Array
+    system: System,
+    state: MonoState,
+    score: Array,
+    ess: Array,
+    is_adjusted: Array,
+    num_sure: Array,
+    innovations: Array,
 ) -> MonoTrack:
     unknown, face, rig = system[:3]
     lost = state.misses >= PATIENCE
@@ -243,6 +251,7 @@ def _track(
         image_points=known(uv),
         score=score,
         effective_sample_size=ess,
+        innovations=innovations,
         identity=known((state.person.identity - unknown.identity_mean) / unknown.identity_std),
         offset=known(state.person.offset + face.mean - unknown.mean),
         person_index=jnp.where(lost, -1, state.face_index - 1).astype(jnp.int32),

@@ -71,15 +71,15 @@ def _session(place: Setup, settings: HeadConfig) -> HeadSession:
     if points is not None and len(points) > NUM_LANDMARKS:
         points = points[list(FROM_68)]
     try:
-        return HeadSession(place.rig, settings, points)
+        return HeadSession(place.rig, settings, points, focal_log_std=place.focal_log_std)
     except ImportError as error:
         raise InputError(f"--detector {settings.detector}: {error}") from error
 
 
 def _learned(session: HeadSession) -> dict[str, np.ndarray]:
-    """What `track.npz` holds beside the track."""
+    """What `track.npz` holds beside the track, metres."""
     learned = {"status_names": np.asarray(TABLE_STATUS)}
     if session.model is not None:
-        names = ("mean", "basis", "deviation", "templates")
-        learned |= {f"model_{name}": np.asarray(getattr(session.model, name)) for name in names}
+        scales = {"mean": 1e-3, "basis": 1.0, "deviation": 1e-3, "templates": 1.0}
+        learned |= {f"model_{name}": scale * np.asarray(getattr(session.model, name)) for name, scale in scales.items()}
     return learned

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, UInt8
 from jaxfilters._xla.from_host import from_host
 from jaxfilters.models.face import pose as head
 from jaxfilters.models.face import rig as cameras
-from jaxfilters.models.face.landmarks import EYES, MEAN_SHAPE, MOUTH, NAMES, NOSTRILS
+from jaxfilters.models.face.landmarks import EYES, MOUTH, NAMES, NOSTRILS, PEOPLE_SHAPE
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel, rigid
 from jaxfilters.trackers.head.stereo import epipolar
@@ -55,8 +55,7 @@ def register(
 ) -> Registration:
     """Face whose model frame has the axes of the first camera: registered without a rotation.
 
-    Each landmark is matched along its epipolar line in the other images, back again, and triangulated (specification,
-    section 2.3).
+    Each landmark is matched along its epipolar line in the other images, back again, and triangulated.
 
     Args:
         images: Grey, of one moment, without lens distortion.
@@ -98,9 +97,9 @@ def register_monocular(
 ) -> Registration:
     """Face of average depth that has exactly the given projections, for one camera, which sees no depth.
 
-    The average face, its eyes `eyes_apart_mm` apart, is posed so that it projects to the points best and looks into
-    the camera as far as they allow; each landmark then moves to the ray through its pixel, at the depth that it has.
-    All lengths are wrong in proportion to the assumed distance between the eyes.
+    The average face of people, its eyes `eyes_apart_mm` apart, is posed so that it projects to the points best and
+    looks into the camera, from where it is, as far as they allow; each landmark then moves to the ray through its
+    pixel, at the depth that it has. All lengths are wrong in proportion to the assumed distance between the eyes.
 
     Args:
         image: Grey, without lens distortion.
@@ -119,7 +118,8 @@ def register_monocular(
         raise ValueError(f"rig must have one camera; got {rig.num_cameras}.")
     points = _checked(image[None], points, rig)
     rays = np.column_stack([(points - np.asarray(rig.center[0])) / np.asarray(rig.focal[0]), np.ones(len(points))])
-    shape = MEAN_SHAPE * (eyes_apart_mm / EYES_APART)
+    right, left = PEOPLE_SHAPE[list(EYES)].reshape(2, 2, 3).mean(axis=1)
+    shape = PEOPLE_SHAPE * (eyes_apart_mm / np.linalg.norm(left - right))
     R, t, worst = _posed(shape, rays)
     if worst > _WORST_LANDMARK:
         raise RegistrationError(f"the points are no face: one is {worst:.0f} mm from where the average face has it.")
@@ -226,9 +226,10 @@ def _checked(images: np.ndarray, points: np.ndarray, rig: CameraRig) -> Float[np
 
 def _posed(shape: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation and translation of a shape that looks into the camera and lies near the rays, and its worst distance."""
+    sight = _to_camera(rays.mean(axis=0))
 
     def placed(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        R = cv2.Rodrigues(x[3:])[0]
+        R = sight @ cv2.Rodrigues(x[3:])[0]
         posed = shape @ R.T + x[:3]
         return R, (posed[:, :2] - rays[:, :2] * posed[:, 2:])
 
@@ -238,3 +239,10 @@ def _posed(shape: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     fit = scipy.optimize.least_squares(residuals, start)  # imported here, by SciPy: it takes as long as JAX
     R, misplaced = placed(fit.x)
     return R, fit.x[:3], float(np.linalg.norm(misplaced, axis=1).max())
+
+
+def _to_camera(ray: np.ndarray) -> np.ndarray:
+    """Rotation of a head on a ray that looks into the lens: that of the optical axis into the ray, without a roll."""
+    axis = np.cross([0.0, 0.0, 1.0], ray)
+    sine = np.linalg.norm(axis)
+    return cv2.Rodrigues(axis / sine * np.arctan2(sine, ray[2]) if sine > 0 else axis)[0]

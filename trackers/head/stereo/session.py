@@ -15,10 +15,11 @@ from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
-from jaxfilters.trackers.head.common.following import Beginning, Compared, Following
+from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import DOUBTFUL, INITIALISING, LOST, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo import redetection
+from jaxfilters.trackers.head.stereo.claims import with_assumptions
 from jaxfilters.trackers.head.stereo.known_face import pose_of_known_face
 from jaxfilters.trackers.head.stereo.registration import Registration, RegistrationError, register, register_monocular
 from jaxfilters.trackers.head.stereo.tracking import advance, begin
@@ -27,6 +28,8 @@ from jaxfilters.trackers.tracker import checked_times
 
 SAME_FACE_MM = 4.0
 """Root mean square distance between two registered shapes up to which they are of one person."""
+MOST_ASIDE = 1e-5
+"""Of a camera that is the world, in its rotation matrix and in millimetres: what is left of a rig file's rounding."""
 
 
 class _Found(NamedTuple):
@@ -41,21 +44,33 @@ class HeadSession:
     """Tracks one head through frames that are handed over in pieces."""
 
     def __init__(
-        self, rig: CameraRig, options: HeadConfig | None = None, points: Float[np.ndarray, "K 2"] | None = None
+        self,
+        rig: CameraRig,
+        options: HeadConfig | None = None,
+        points: Float[np.ndarray, "K 2"] | None = None,
+        *,
+        focal_log_std: float = 0.0,
     ) -> None:
         """A session before its first frame.
 
         Args:
-            rig: One camera or more.
+            rig: One camera or more; the frame of the first one is the world.
             options: Constants.
             points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
+            focal_log_std: Standard deviation of the logarithm of a single camera's focal length, by which distances
+                are uncertain in proportion; 0 for one that is calibrated.
 
         Raises:
-            ValueError: if `points` are not ten finite pixels.
+            ValueError: if the first camera is not at the origin without a rotation, `points` are not ten finite
+                pixels, or `focal_log_std` is negative, not finite, or given for several cameras.
             ImportError: if the detector of the options is not installed.
         """
+        check_at_origin(rig)
         check_points(points)
-        self._following = Following(_HeadTracker(rig, options or HeadConfig(), points))
+        check_focal_log_std(focal_log_std)
+        if focal_log_std and rig.num_cameras > 1:
+            raise ValueError(f"focal_log_std is for one camera; got {rig.num_cameras} cameras.")
+        self._following = Following(_HeadTracker(rig, options or HeadConfig(), points, focal_log_std))
 
     @property
     def events(self) -> list[tuple[int, str]]:
@@ -104,15 +119,17 @@ def track(
     config: HeadConfig | None = None,
     *,
     points: Float[np.ndarray, "K 2"] | None = None,
+    focal_log_std: float = 0.0,
 ) -> HeadTrack:
     """The head in images in memory; `HeadSession` takes them in pieces.
 
     Args:
         images: Grey, of all cameras at one moment each, without lens distortion.
         times_s: Seconds, strictly increasing.
-        rig: One camera or more.
+        rig: One camera or more; the frame of the first one is the world.
         config: Constants.
         points: The ten landmarks in the first camera's first image, pixels, (u, v); detected where not given.
+        focal_log_std: As for `HeadSession`.
 
     Returns:
         The track: millimetres and radians, NaN where the head is not tracked.
@@ -120,24 +137,55 @@ def track(
     Raises:
         ValueError: as for `HeadSession` and its `process`, and for `checked_times`.
     """
-    return HeadSession(rig, config, points).process(images, checked_times(times_s, len(images)))
+    session = HeadSession(rig, config, points, focal_log_std=focal_log_std)
+    return session.process(images, checked_times(times_s, len(images)))
 
 
-def check_points(points: Float[np.ndarray, "K 2"] | None) -> None:
-    """Whether landmarks given by a person can be used.
+def check_at_origin(rig: CameraRig) -> None:
+    """Whether poses in the frame of the first camera are those in the world.
 
     Raises:
-        ValueError: if they are not ten finite pixels.
+        ValueError: if the first camera is turned or moved.
     """
-    if points is not None and (np.shape(points) != (NUM_LANDMARKS, 2) or not np.all(np.isfinite(points))):
-        raise ValueError(f"points must be ({NUM_LANDMARKS}, 2) finite pixels; got shape {np.shape(points)}.")
+    turned, moved = np.abs(np.asarray(rig.rotation[0]) - np.eye(3)), np.abs(np.asarray(rig.translation[0]))
+    if turned.max() > MOST_ASIDE or moved.max() > MOST_ASIDE:
+        raise ValueError("rig must have its first camera at the origin, without a rotation: its frame is the world.")
+
+
+def check_focal_log_std(focal_log_std: float) -> None:
+    """Whether it is a standard deviation.
+
+    Raises:
+        ValueError: if it is negative or not finite.
+    """
+    if not (math.isfinite(focal_log_std) and focal_log_std >= 0):
+        raise ValueError(f"focal_log_std must be finite and at least 0; got {focal_log_std}.")
+
+
+def check_points(points: Float[np.ndarray, "K 2"] | None, counts: tuple[int, ...] = (NUM_LANDMARKS,)) -> None:
+    """Whether landmarks given by a person can be used.
+
+    Args:
+        points: None where they are to be detected.
+        counts: How many they may be.
+
+    Raises:
+        ValueError: if they are not so many finite pixels.
+    """
+    shapes = [(count, 2) for count in counts]
+    if points is not None and (np.shape(points) not in shapes or not np.all(np.isfinite(points))):
+        expected = " or ".join(map(str, shapes))
+        raise ValueError(f"points must be {expected} finite pixels; got shape {np.shape(points)}.")
 
 
 class _HeadTracker:
     """What `Following` asks of a tracker."""
 
-    def __init__(self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None) -> None:
+    def __init__(
+        self, rig: CameraRig, options: HeadConfig, points: Float[np.ndarray, "K 2"] | None, focal_log_std: float
+    ) -> None:
         self.rig, self.chunk, self.is_live = rig, options.chunk, options.live
+        self._focal_log_std = focal_log_std
         may_compare = VARIANTS[options.variant].may_doubt and rig.num_cameras > 1
         self.compare_every_s = redetection.EVERY_S if may_compare else math.inf
         self._options, self._points = options, points
@@ -152,6 +200,7 @@ class _HeadTracker:
     def search(self, images: np.ndarray, time: float) -> tuple[_Found | None, list[str]]:
         points, self._points = self._points, None
         wrong: list[str] = []
+        is_given = points is not None
         if points is None:
             finder = self._finder
             points = finder.find(images[0])
@@ -161,7 +210,7 @@ class _HeadTracker:
         try:
             return _Found(self._registered(images, points), images, time), wrong
         except RegistrationError as error:
-            return None, [*wrong, str(error)]
+            return None, [*wrong, f"{UNUSED_POINTS}: {error}" if is_given else str(error)]
 
     def _registered(self, images: np.ndarray, points: np.ndarray) -> Registration:
         if self.rig.num_cameras == 1:
@@ -207,7 +256,7 @@ class _HeadTracker:
 
     def reported(self, track: HeadTrack, times: np.ndarray) -> HeadTrack:
         del times
-        return track
+        return with_assumptions(track, self._focal_log_std) if self.rig.num_cameras == 1 else track
 
     def compared(self, state: HeadState, row: HeadTrack, images: np.ndarray, time: float) -> Compared:
         del time
@@ -254,6 +303,7 @@ class _HeadTracker:
             image_points=nothing(self.rig.num_cameras, NUM_LANDMARKS, 2),
             score=nothing(),
             effective_sample_size=np.zeros(count, np.float32),
+            innovations=np.zeros((count, 2), np.int32),
             status=np.full(count, INITIALISING, np.int32),
         )
 

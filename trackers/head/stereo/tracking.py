@@ -22,6 +22,7 @@ from jaxfilters.particle.weighting import ParticleInfo
 from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig
 from jaxfilters.trackers.head.common.estimate import Estimate, around_mode
+from jaxfilters.trackers.head.common.near_mode import pose_corrections
 from jaxfilters.trackers.head.common.recent import nothing_changed
 from jaxfilters.trackers.head.common.search import Searches, at, scattered, score_at
 from jaxfilters.trackers.head.common.search import start as start_search
@@ -179,6 +180,7 @@ def _step(
     num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
     missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
+    innovations = jnp.where(missed, 0, pose_corrections(search, state.belief, moved, belief))
     state = state._replace(registered=registered)
     if variant.keeps_key_frames:
         state = state._replace(key_frames=_key_frames(state, belief, lasting, estimate, score, missed, rig))
@@ -194,7 +196,7 @@ def _step(
         time=jnp.maximum(time, state.time),
         key=key,
     )
-    return state, _track(state, belief, estimate, score, doubt, info.effective_sample_size, deforms, rig)
+    return state, _track(state, belief, estimate, score, doubt, info.effective_sample_size, innovations, deforms, rig)
 
 
 def at_last_good(key: Array, state: Any) -> Any:
@@ -328,6 +330,7 @@ def _track(
     score: Array,
     doubt: Array,
     ess: Array,
+    innovations: Array,
     deforms: Array,
     rig: CameraRig,
 ) -> HeadTrack:
@@ -345,5 +348,6 @@ def _track(
         image_points=known(uv),
         score=score,
         effective_sample_size=ess,
+        innovations=innovations,
         status=jnp.where(lost, LOST, status).astype(jnp.int32),
     )

@@ -7,7 +7,7 @@ import pytest
 from jaxfilters.models.face.rig import nominal
 from jaxfilters.trackers.head.common.drawing import AXIS_COLORS, HEAD_STATUS_COLORS, draw_frame
 from jaxfilters.trackers.head.common.summary import draw_modes, draw_summary, status_shades, write_summary
-from jaxfilters.trackers.head.common.table import STATUS_WORDS
+from jaxfilters.trackers.head.common.table import TABLE_STATUS
 from jaxfilters.trackers.io.errors import OutputError
 
 RIG = nominal()
@@ -45,6 +45,17 @@ def test_nothing_is_drawn_of_a_head_that_is_not_tracked(face_track):
         assert count(picture, HEAD_STATUS_COLORS[track.status[i]]) > 20
 
 
+def test_an_angle_that_rounds_to_zero_has_no_sign(face_track):
+    track, _ = face_track
+    texts = []
+    for angle in (1e-5, -1e-5):
+        pose = track.pose.copy()
+        pose[10, 3:] = angle
+        texts.append(draw_frame([PAPER, PAPER], RIG, track._replace(pose=pose), 10)[:100])
+    np.testing.assert_array_equal(texts[0], texts[1])
+    assert (texts[0] != 90).any()
+
+
 def test_a_missing_image_is_said(face_track):
     track, _ = face_track
     picture = draw_frame([PAPER, None], RIG, track, 20)
@@ -72,7 +83,7 @@ def test_the_status_is_the_paper_of_the_charts(face_track):
     assert shades[-1].end == track.times_s[-1]
     assert all(a.end == b.start for a, b in pairwise(shades))
     np.testing.assert_allclose([shade.start for shade in shades[3:5]], (np.array([20, 21]) - 0.5) / 30)
-    assert len({shade.color for shade in shades}) == len(np.unique(track.status)) == len(STATUS_WORDS) - 1
+    assert len({shade.color for shade in shades}) == len(np.unique(track.status)) == len(TABLE_STATUS) - 1
     assert status_shades(np.zeros(1), np.ones(1, int))[0].color == shades[1].color
 
 

@@ -39,6 +39,7 @@ def chunk(status, modes=2, cameras=2):
         image_points=np.ones((b, cameras, 10, 2)),
         score=np.full(b, 0.75),
         effective_sample_size=np.full(b, 100.0),
+        innovations=np.full((b, 2), (6, 5)),
         status=np.asarray(status, np.int32),
     )
 
@@ -103,14 +104,8 @@ def test_the_longest_stretch_passes_over_skipped_moments(status, expected):
 def test_shares_of_a_run(face_track):
     track, _ = face_track
     message = shares(track)
-    assert message["status"] == {
-        "initialising": 2,
-        "rigid": 13,
-        "deformable": 21,
-        "lost": 3,
-        "doubtful": 0,
-        "skipped": 1,
-    }
+    assert message["status"] == {"searching": 2, "tracking": 34, "lost": 3, "doubtful": 0, "skipped": 1}
+    assert message["frames_deformable"] == 21
     assert message["share_tracked"] == pytest.approx(34 / 39, abs=1e-4)
     # Frames 2 to 29, without the skipped one.
     assert (message["longest_stretch_frames"], message["longest_stretch_s"]) == (27, pytest.approx(27 / 30, abs=1e-3))

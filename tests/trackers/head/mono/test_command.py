@@ -51,6 +51,7 @@ def made_track(means, times, status, face):
         image_points=np.full((b, 1, 10, 2), 5.0),
         score=np.full(b, 0.75),
         effective_sample_size=np.full(b, 100.0),
+        innovations=np.full((b, 2), (6, 5)),
         identity=np.full((b, face.num_identities), 1.5),
         offset=np.zeros((b, 10, 3)),
         person_index=np.where(np.arange(b) < b // 2, -1, 0),
@@ -84,8 +85,9 @@ def fake(monkeypatch):
             index = self.frames + np.arange(len(images))
             self.frames += len(images)
             if self.person is None:
-                self.person = Person(self.face.identity_mean, jnp.zeros((10, 3)))
-                who = (self.face.identity_mean, self.face.identity_covariance, self.person.offset)
+                # A detector that puts the outer corner of an eye 10 mm too far out: the face is the mean one.
+                self.person = Person(self.face.identity_mean, jnp.zeros((10, 3)).at[3, 0].set(10.0))
+                who = (self.face.identity_mean, self.face.identity_covariance, jnp.zeros((10, 3)))
                 self.gallery = Gallery(*(leaf[None] for leaf in who))
                 self.events.append((2, "registered"))
             return made_track(images.mean(axis=(1, 2, 3)), times, np.where(index < 2, 0, 2).astype(np.int32), self.face)
@@ -125,13 +127,15 @@ def test_track_writes_all_results_with_identity(pictures, fake, tmp_path, capsys
     # A lens of 30 mm, of which the diagonal of film is 43.27.
     assert report["focal_length_px"][0] == pytest.approx(30 / FILM_MM * np.hypot(COLS, ROWS))
     assert report["focal_length_log_std"] == fake[0].focal_log_std == 0.25
-    assert 50 < report["eyes_apart_mm"] < 80
+    # Of the mean face of people.
+    assert report["eyes_apart_mm"] == pytest.approx(63.1, abs=0.01)
     assert report["events"] == [{"frame": 2, "what": "registered"}]
     assert report["adjusted_frames"] > 0
     assert "generator" in report["face_model"]["source"]
     with np.load(out / "track.npz") as track:
         assert track["identity"].shape == (FRAMES, 16)
         assert track["person_identity"].shape == (16,)
+        assert track["person_offset"][3, 0] == pytest.approx(0.01)
         assert track["status_names"][int(track["status"][5])] == "tracking"
     captured = capsys.readouterr()
     assert "assumed focal length" in captured.err

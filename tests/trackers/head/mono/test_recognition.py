@@ -65,6 +65,15 @@ def test_a_stranger_is_taken_for_nobody(rig, taught, talking, detected):
     assert session.gallery is not None
 
 
+def test_the_index_of_a_person_is_one_of_the_gallery(rig, face):
+    """Who was followed before a loss is known by the number after those of the gallery, which is nobody's there."""
+    one = Gallery(face.identity_mean[None], face.identity_covariance[None], jnp.zeros((1, 10, 3)))
+    for gallery, expected in ((one, [-1, 0, -1]), (None, [-1, -1, -1])):
+        tracker = MonoSession(rig, face, gallery=gallery)._tracker
+        rows = tracker.empty(3)._replace(person_index=np.array([-1, 0, 1], np.int32))
+        np.testing.assert_array_equal(tracker.reported(rows, np.arange(3) / 30).person_index, expected)
+
+
 @pytest.mark.system
 def test_somebody_who_was_followed_is_recognised_by_a_later_session(rig, face, talking, detected):
     """With what the first session learnt, its size included."""

@@ -226,12 +226,15 @@ def test_what_is_no_face_is_refused_with_its_reason(rig, face):
     session = MonoSession(rig, face, points=scattered)
     track = session.process(np.zeros((2, 1, 480, 640), np.uint8), np.arange(2) / 30)
     assert np.all(track.status == INITIALISING)
-    assert "no face" in said(session)[0]
+    assert said(session)[0].startswith("the landmarks that were given cannot be used: the points are no face's")
 
 
 def test_wrong_arguments_are_named(rig, face):
     with pytest.raises(ValueError, match="rig must have one camera; got 2"):
         MonoSession(nominal(), face)
+    one_lacking = np.where(np.arange(68)[:, None] == 3, np.nan, np.full((68, 2), 200.0))
+    with pytest.raises(ValueError, match=r"points must be \(10, 2\) or \(68, 2\) finite pixels"):
+        MonoSession(rig, face, points=one_lacking)
     fewer = MultilinearFace(**{**face.__dict__, "mean": face.mean[:6], "tensor": face.tensor[:6]})
     with pytest.raises(ValueError, match="face must have 10 landmarks, or the 68 of iBUG; got 6"):
         MonoSession(rig, fewer)

@@ -102,9 +102,14 @@ def test_track_writes_all_results(stereo, fake_head, tmp_path, capsys):
         assert track["image_points"].shape == (FRAMES, 2, 10, 2)
         assert track["status_names"][int(track["status"][10])] == "lost"
         assert track["model_basis"].shape == (30, 5)
+        # Millimetres in the session.
+        np.testing.assert_allclose(track["model_mean"], 1e-3 * np.asarray(fake_head[0].model.mean), rtol=1e-6)
+        np.testing.assert_allclose(track["model_deviation"], 1e-3 * np.asarray(fake_head[0].model.deviation), rtol=1e-6)
         np.testing.assert_allclose(track["times_s"], np.arange(FRAMES) / 30)
     report = json.loads((out / "report.json").read_text())
-    assert report["status"] == {"initialising": 2, "rigid": 4, "deformable": 12, "lost": 2, "doubtful": 0, "skipped": 0}
+    assert report["status"] == {"searching": 2, "tracking": 16, "lost": 2, "doubtful": 0, "skipped": 0}
+    assert report["frames_deformable"] == 12
+    assert report["innovations"]["count"] == 16 * 6
     assert report["longest_stretch_frames"] == 8
     assert report["events"] == [{"frame": 2, "what": "registered"}, {"frame": 12, "what": "learnt"}]
     assert report["explained_contribution"] == 0.75
@@ -232,11 +237,13 @@ def test_one_camera_is_followed_with_an_assumed_focal_length(stereo, fake_head, 
     assert "an assumed focal length of 55 px" in capsys.readouterr().err
     np.testing.assert_allclose(fake_head[0].rig.focal, [[55.4701, 55.4701]], rtol=1e-5)
     np.testing.assert_allclose(fake_head[0].rig.center, [[31.5, 23.5]])
+    assert fake_head[0].focal_log_std == 0.25
     assert [float(row["time_s"]) for row in rows_of(out)] == pytest.approx(np.arange(11) / 10)
     assert "assumed" in json.loads((out / "report.json").read_text())["note"]
     write_camera(tmp_path / "camera.json", (COLS, ROWS), K=K, distortion=np.array([0.1, 0, 0, 0, 0]))
     assert run(stereo[0], "--out", tmp_path / "b", "--camera", tmp_path / "camera.json", "--no-video") == 0
     np.testing.assert_allclose(fake_head[1].rig.focal, [[80, 80]])
+    assert fake_head[1].focal_log_std == 0
     assert "assumed" not in capsys.readouterr().err
 
 

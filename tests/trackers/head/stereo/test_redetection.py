@@ -144,7 +144,7 @@ def test_a_known_face_is_found_by_its_image(video):
 
 def test_which_of_two_poses_is_believed():
     row = lambda status, score, pose=0.0: HeadTrack(
-        *[np.full(POSE, pose)] * 5, score=score, effective_sample_size=1.0, status=status
+        *[np.full(POSE, pose)] * 5, score=score, effective_sample_size=1.0, innovations=np.zeros(2), status=status
     )
     better = lambda other, status, score: module.is_better(row(RIGID, other), row(status, score))
     assert better(LEAST_SCORE, DOUBTFUL, 0.1)

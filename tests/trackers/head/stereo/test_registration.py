@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.correlation import cut, ncc
-from jaxfilters.models.face.landmarks import MEAN_SHAPE, MIRROR, NAMES
+from jaxfilters.models.face.landmarks import MEAN_SHAPE, MIRROR, NAMES, PEOPLE_SHAPE
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig, monocular, nominal, project_shape
 from jaxfilters.models.synthetic.face_sequence import face_sequence, sequence
@@ -212,10 +212,27 @@ def test_one_camera_gives_an_average_face_on_the_given_points(pose):
 
 def test_an_average_face_is_posed_exactly():
     rig = monocular(CAMERA)
-    points = np.asarray(project_shape(rig, jnp.asarray(MEAN_SHAPE, float), jnp.array([5.0, 8, 700, 0, 0, 0]))[0][0])
+    shape = average_face()
+    points = np.asarray(project_shape(rig, jnp.asarray(shape, float), jnp.array([0.0, 0, 700, 0, 0, 0]))[0][0])
     found = register_monocular(np.zeros((480, 640), np.uint8), points, rig)
-    np.testing.assert_allclose(found.pose, [5, 8, 700, 0, 0, 0], atol=0.05)
-    np.testing.assert_allclose(found.model.mean, MEAN_SHAPE, atol=0.05)
+    np.testing.assert_allclose(found.pose, [0, 0, 700, 0, 0, 0], atol=0.05)
+    np.testing.assert_allclose(found.model.mean, shape, atol=0.05)
+
+
+def test_a_face_far_from_the_axis_looks_into_the_camera():
+    """Towards which it is turned by the angle of its line of sight, 21 degrees."""
+    rig = monocular(Pinhole.from_intrinsics(500.0, (319.5, 239.5), (480, 640)))
+    pose = np.array([250.0, 0, 650, 0, np.arctan2(250, 650), 0])
+    points = np.asarray(project_shape(rig, jnp.asarray(average_face(), float), jnp.asarray(pose, float))[0][0])
+    found = register_monocular(np.zeros((480, 640), np.uint8), points, rig)
+    np.testing.assert_allclose(found.pose[:3], pose[:3], atol=3)
+    np.testing.assert_allclose(found.pose[3:], pose[3:], atol=np.radians(0.5))
+
+
+def average_face():
+    """Of people, 62 mm between the middles of the corners of either eye."""
+    right, left = PEOPLE_SHAPE[:2].mean(axis=0), PEOPLE_SHAPE[2:4].mean(axis=0)
+    return PEOPLE_SHAPE * 62 / np.linalg.norm(left - right)
 
 
 def test_one_camera_refuses_what_is_no_face(scene):

@@ -1,6 +1,7 @@
 """Whole sessions on a drawn face before two cameras: starting, following, losing, finding again, and refusing."""
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -313,6 +314,37 @@ def test_images_that_do_not_fit_the_rig_are_refused():
             session.process(images, times(2))
     with pytest.raises(ValueError, match="times must be finite"):
         session.process(good, np.array([0.0, np.nan]))
+
+
+def test_times_that_do_not_grow_are_refused():
+    """Within a piece, and from one piece to the next; what is refused leaves the session as it was."""
+    session, images = HeadSession(nominal()), np.zeros((2, 2, 480, 640), np.uint8)
+    for seconds in ([1.0, 0.5], [0.0, 0.0]):
+        with pytest.raises(ValueError, match="times must grow"):
+            session.process(images, np.array(seconds))
+    session.process(images, times(2))
+    with pytest.raises(ValueError, match="times must grow"):
+        session.process(images, times(2))
+    assert len(session.process(images, times(2, 2)).status) == 2
+
+
+def test_rigs_and_focal_lengths_that_cannot_be_used_are_refused():
+    rig = nominal()
+    for other in (replace(rig, translation=rig.translation + 5), replace(rig, rotation=rig.rotation[..., [1, 0, 2]])):
+        with pytest.raises(ValueError, match="rig must have its first camera at the origin"):
+            HeadSession(other)
+    with pytest.raises(ValueError, match="focal_log_std must be finite and at least 0; got -1"):
+        HeadSession(rig, focal_log_std=-1.0)
+    with pytest.raises(ValueError, match="focal_log_std is for one camera; got 2 cameras"):
+        HeadSession(rig, focal_log_std=0.1)
+
+
+@pytest.mark.system
+def test_given_points_that_cannot_be_used_are_an_event():
+    session = HeadSession(nominal(), points=np.full((10, 2), -50.0))
+    session.process(np.zeros((1, 2, 480, 640), np.uint8), times(1))
+    assert len(said(session)) == 1
+    assert said(session)[0].startswith("the landmarks that were given cannot be used: right eye outer is within")
 
 
 @pytest.mark.parametrize(
