@@ -18,7 +18,9 @@ from jaxfilters.filter import Filter
 from jaxfilters.fit.constraints import free
 from jaxfilters.fit.density import common_random_numbers, over_sequences
 from jaxfilters.fit.maximum import maximize
+from jaxfilters.fit.parametrization import Parametrization
 from jaxfilters.fit.result import Fit
+from jaxfilters.fit.score_errors import with_score_errors
 from jaxfilters.gaussian.arithmetic import KalmanInfo
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.gaussian.correlated import CorrelatedNoise
@@ -105,7 +107,13 @@ def calibrate(
     is drawn over whole recordings.
 
     A recording holds about 1 + T / (2 tau) independent draws of an error that lasts for tau. Recordings that are too
-    short cannot tell a large error from a small one, and are refused.
+    short cannot tell a large error from a small one, and are refused. The number, the checks and their limits are
+    derived in `docs/derivations/correlated_noise.md`, section 7.
+
+    Standard errors by evidence are those of the curvature J of the log evidence. The log scores of frames are
+    correlated, so that standard errors by score are J^-1 K J^-1, with the covariance K of the sum of their derivatives
+    (Godambe 1960; Newey and West 1987), like those of `godambe`. They are asymptotic, and still somewhat too small for
+    a few recordings.
 
     Args:
         key: Random key of the intervals; and of the filter, where it has randomness.
@@ -115,7 +123,8 @@ def calibrate(
         start: Parameters from which to start.
         constraints: As for `maximize`, e.g. `fit.positive`.
         believed: `state -> Gaussian` about the components that `Recording.truth` holds. Needed with truth only.
-        by_score: Whether to maximise the log score of the truth instead of the evidence.
+        by_score: Whether to maximise the log score of the truth instead of the evidence. It tells less of the same
+            parameters if the model is right, and what matters for the claims if it is not.
         min_draws: Least effective number of draws of the slowest error, in all recordings together.
         method: As for `maximize`.
 
@@ -150,6 +159,9 @@ def calibrate(
     believed = None if believed is None else as_pytree(believed)
     density = partial(_density, key, filter_of, believed if by_score else None, data)
     fit = maximize(density(data.mask), start, constraints, method=method)
+    if by_score and believed is not None:
+        score = _Score(filter_of, believed, data, data.mask)
+        fit = with_score_errors(fit, _slopes(score, key, fit.parametrization, fit.search.z), data.mask)
     num_draws = _check_draws(filter_of(fit.theta), data, min_draws)
 
     # One mask a fold: all fits are one program, that of the fit to all recordings.
@@ -226,14 +238,24 @@ class _Score:
     mask: Bool[Array, "t r"]
 
     def __call__(self, key: AnyKey, theta: PyTree) -> Float[Array, ""]:
+        return jnp.sum(self.terms(key, theta))
+
+    def terms(self, key: AnyKey, theta: PyTree) -> Float[Array, "t r"]:
+        """Log density of each frame of each recording."""
         filter = self.filter_of(theta)
 
         def one(observations: PyTree, inputs: PyTree, mask: Array, truth: Array) -> Array:
             _, (states, _) = filters.run(filter, key, observations, inputs, mask=mask)
-            return jnp.sum(jnp.where(mask, _log_densities(self.believed, states, truth), 0.0))
+            return jnp.where(mask, _log_densities(self.believed, states, truth), 0.0)
 
         data = (self.data.observations, self.data.inputs, self.mask, self.data.truth)
-        return jnp.sum(jax.vmap(one, in_axes=-1)(*data))
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(*data)
+
+
+@jax.jit
+def _slopes(score: _Score, key: AnyKey, parametrization: Parametrization, z: Float[Array, " d"]) -> Array:
+    """Derivatives of the terms of the score by the coordinates, (t, r, d)."""
+    return jax.jacfwd(lambda z: score.terms(key, parametrization.constrain(z)))(z)
 
 
 def _log_densities(believed: Callable, states: PyTree, truth: Float[Array, "t d"]) -> Float[Array, " t"]:
@@ -306,7 +328,7 @@ def _evaluated(filter_of: Callable, believed: Callable | None, key: AnyKey, thet
             std = jnp.sqrt(jnp.diagonal(beliefs.covariance, axis1=1, axis2=2))
             known = jnp.isfinite(truth) & mask[:, None]
             within = jnp.where(known, jnp.abs(truth - beliefs.mean) <= 2 * std, jnp.nan)
-            density = jnp.where(mask, _log_densities(believed, states, truth), jnp.nan)
+            density = jnp.where(jnp.any(known, axis=1), _log_densities(believed, states, truth), jnp.nan)
         used = jnp.where(counts & mask[:, None], whitened, jnp.nan)
         return _Folds(infos.log_evidence, info.nis, info.rank, used, within, density)
 

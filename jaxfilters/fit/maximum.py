@@ -9,14 +9,23 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.fit.constraints import free
+from jaxfilters.fit.constraints import Box, free
 from jaxfilters.fit.density import at_step, explain_not_finite, is_noisy
 from jaxfilters.fit.methods import FirstOrder, LeastSquares, Residuals, bfgs
-from jaxfilters.fit.parametrization import Parametrization, check_start, parametrize, with_box_bounds
+from jaxfilters.fit.parametrization import (
+    Parametrization,
+    check_start,
+    parametrize,
+    with_box_bounds,
+    without_box_bounds,
+)
 from jaxfilters.fit.result import Fit
 from jaxfilters.fit.search import Method, SearchState, initial_search, minimize
 from jaxfilters.fit.uncertainty import Errors, ErrorStatus, Uncertainty, intervals, observed_information
 from jaxfilters.typing import as_pytree
+
+_ROUNDING = 16.0
+"""Rounding errors by which two evaluations of one log density may differ, each relative to 1 + its size."""
 
 
 def maximize(
@@ -36,7 +45,8 @@ def maximize(
             `residuals` return. Functions are compared by identity: data belong in a pytree or a `Partial`.
         start: Parameters from which to start, or a `Fit` to continue.
         constraints: A tree of constraints like `start`, or a prefix of it. A `Fit` keeps its own.
-        method: `bfgs()` (default), `lbfgsb()`, `adam()`, `first_order(...)` or `least_squares()`.
+        method: `bfgs()`, `lbfgsb()`, `adam()`, `first_order(...)` or `least_squares()`. By default `bfgs()`, or, if
+            `start` is a `Fit` of a search within bounds, the method of that search.
         errors: `observed_information` or `no_errors`.
 
     Returns:
@@ -54,7 +64,7 @@ def maximize(
         >>> print(fit.theta, fit.standard_errors)
         [3. 3.] [1. 1.]
     """
-    method = bfgs() if method is None else method
+    method = _default_method(start) if method is None else method
     _check_method(method, log_density)
     log_density = as_pytree(log_density)
     if isinstance(start, Fit) and start.method == method:
@@ -62,8 +72,8 @@ def maximize(
         _check_first_step(log_density, found, start.theta)
         return found
     if isinstance(start, Fit):
-        tree = jax.tree.structure(start.theta)
-        start, constraints = start.theta, jax.tree.unflatten(tree, start.parametrization.constraints)
+        kept = start.parametrization if method.supports_bounds else without_box_bounds(start.parametrization)
+        start, constraints = start.theta, jax.tree.unflatten(jax.tree.structure(start.theta), kept.constraints)
     parametrization = parametrize(start, constraints)
     check_start(parametrization)
     parametrization = with_box_bounds(parametrization) if method.supports_bounds else parametrization
@@ -95,9 +105,15 @@ def _start(log_density: Callable, parametrization: Parametrization, method: Meth
 
 @partial(jax.jit, static_argnames="errors")
 def _continue(log_density: Callable, fit: Fit, errors: Errors) -> Fit:
-    loss = _Negative(log_density, fit.parametrization)
-    search = fit.search._replace(failed=jnp.zeros((), bool))
-    return _finished(loss, minimize(fit.method, loss, search, fit.parametrization.bounds()), fit.method, errors)
+    loss, bounds = _Negative(log_density, fit.parametrization), fit.parametrization.bounds()
+    search = fit.search
+    # The method's state holds values and gradients of the log density that was searched; another one starts it anew.
+    now = loss(search.step, search.z)
+    same = jnp.abs(now + fit.log_density) <= _ROUNDING * jnp.finfo(now.dtype).eps * (1 + jnp.abs(now))
+    fresh = fit.method.init(loss, search.z, bounds)
+    state = jax.tree.map(lambda old, new: jnp.where(same, old, new), search.state, fresh)
+    search = search._replace(state=state, failed=jnp.zeros((), bool))
+    return _finished(loss, minimize(fit.method, loss, search, bounds), fit.method, errors)
 
 
 def _finished(loss: _Negative, search: SearchState, method: Method, errors: Errors) -> Fit:
@@ -118,6 +134,12 @@ def _finished(loss: _Negative, search: SearchState, method: Method, errors: Erro
     log_density = -at_last_step(search.z)
     noisy = is_noisy(loss.log_density)
     return Fit(theta, *found, log_density, covariance, search, loss.parametrization, method, noisy)
+
+
+def _default_method(start: PyTree) -> Method:
+    within_bounds = isinstance(start, Fit) and any(isinstance(c, Box) for c in start.parametrization.constraints)
+    # Other methods cannot start on a bound, where such a search may have ended.
+    return start.method if within_bounds else bfgs()
 
 
 def _check_first_step(log_density: Callable, found: Fit, start: PyTree) -> None:

@@ -38,17 +38,17 @@ class Parametrization:
             start = stop
         return jax.tree.unflatten(jax.tree.structure(self.origin), values)
 
-    def log_volume(self, z: Float[Array, " d"]) -> Float[Array, ""]:
+    def log_volume(self, z: Float[Array, " d"], without: type | tuple[type, ...] = ()) -> Float[Array, ""]:
         """Logarithm of the factor by which `constrain` stretches volume about z: the log Jacobian of a density.
 
         Up to a constant, for sets with fewer dimensions than numbers (probabilities, symmetric matrices, quaternions)
         the volume is that of the set itself. It is `-inf` where coordinates do not belong to one value only: rotation
-        vectors longer than half a turn.
+        vectors longer than half a turn. Leaves whose constraint is an instance of `without` are left out.
         """
         total, start = jnp.zeros((), z.dtype), 0
         for constraint, shape, origin in zip(self.constraints, self.shapes, self.leaves, strict=True):
             stop = start + math.prod(shape)
-            if stop > start:
+            if stop > start and not isinstance(constraint, without):
                 total = total + _log_volume(constraint, z[start:stop].reshape(shape), origin)
             start = stop
         return total
@@ -122,6 +122,12 @@ def with_box_bounds(parametrization: Parametrization) -> Parametrization:
     """The same parametrization with intervals as boxes, for methods that support bounds."""
     boxes = [Box(c.lower, c.upper) if isinstance(c, Interval) else c for c in parametrization.constraints]
     return Parametrization(parametrization.origin, tuple(boxes))
+
+
+def without_box_bounds(parametrization: Parametrization) -> Parametrization:
+    """The same parametrization with boxes as intervals: the inverse of `with_box_bounds`."""
+    intervals = [Interval(c.lower, c.upper) if isinstance(c, Box) else c for c in parametrization.constraints]
+    return Parametrization(parametrization.origin, tuple(intervals))
 
 
 def check_start(parametrization: Parametrization, argument: str = "start") -> None:

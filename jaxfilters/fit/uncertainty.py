@@ -107,6 +107,8 @@ def _inverse(S: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, 
     Pivots that are not positive are skipped (J. H. Goodnight, "A tutorial on the SWEEP operator", The American
     Statistician 33(3), 1979).
     """
+    if not S.shape[0]:
+        return S, jnp.zeros(0, S.dtype)
     tolerance = _pivot_tolerance(S.dtype)
 
     def sweep(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -151,7 +153,7 @@ def intervals(parametrization: Parametrization, z: Float[Array, " d"], uncertain
     """Standard errors by the delta method, and the ends of 95 % intervals.
 
     Fixed parameters, and those at a bound, have a standard error of 0. The interval of a parameter with a coordinate of
-    its own is that of the coordinate, mapped; of any other it is symmetric.
+    its own is that of the coordinate, within its bounds, mapped; of any other it is symmetric.
     """
     undetermined = uncertainty.status > ErrorStatus.AT_BOUND
     variance = jnp.diagonal(uncertainty.covariance)
@@ -178,7 +180,8 @@ def intervals(parametrization: Parametrization, z: Float[Array, " d"], uncertain
     errors = list(map(error, jacobians))
     ends = []
     for side in (-1, 1):
-        mapped = jax.tree.leaves(parametrization.constrain(z + side * _QUANTILE * deviation))
+        end = jnp.clip(z + side * _QUANTILE * deviation, *parametrization.bounds())
+        mapped = jax.tree.leaves(parametrization.constrain(end))
         rows = zip(parametrization.constraints, jax.tree.leaves(theta), errors, mapped, strict=True)
         ends.append([end if c.elementwise else leaf + side * _QUANTILE * e for c, leaf, e, end in rows])
     statuses = list(map(status, parametrization.constraints, jacobians))

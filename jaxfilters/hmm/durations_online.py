@@ -1,5 +1,6 @@
 """Hidden semi-Markov models one frame at a time: the exact filter, and a spotter that reports segments."""
 
+from dataclasses import field
 from typing import NamedTuple
 
 import jax
@@ -41,7 +42,7 @@ class SemiMarkovSpotterState(NamedTuple):
     starts: Int32[Array, "q d"]
     """(Q, D): first frame of the current segment."""
     finished: Candidate
-    """Leaves (Q, D): the last segment before it that is not background."""
+    """Leaves (Q, D, patience): the last segments before it that are not background, the latest one first."""
     frame: Int32[Array, ""]
     """The last predicted frame; -1 at the start."""
     reported_end: Int32[Array, ""]
@@ -67,7 +68,7 @@ class SemiMarkovSpotter:
 
     model: SemiMarkovModel
     background: Int32[Array, "..."]
-    patience: Int32[Array, "..."]
+    patience: int = field(metadata={"static": True})
     margin: Float[Array, "..."]
 
 
@@ -100,7 +101,7 @@ def semi_markov_spotter(model: SemiMarkovModel, background: int, *, patience: in
 
     It is the Viterbi recursion, one frame at a time: a segment is reported once the best segmentation of the frames so
     far ended it `patience` frames ago. What is reported is never taken back, and the next segment reported starts
-    later.
+    later. One frame reports one segment, the earliest.
 
     Args:
         model: The model. Observations are those of its emission; without one, log-likelihoods (Q,).
@@ -128,8 +129,8 @@ def semi_markov_spotter(model: SemiMarkovModel, background: int, *, patience: in
         raise ValueError(f"background must be a state of the model, from 0 to {num_states - 1}; got {background}.")
     if patience < 1:
         raise ValueError(f"patience must be at least 1; got {patience}.")
-    whole = jnp.asarray(background, jnp.int32), jnp.asarray(patience, jnp.int32)
-    params = SemiMarkovSpotter(model, *whole, jnp.asarray(margin, model.log_initial.dtype))
+    least_gain = jnp.asarray(margin, model.log_initial.dtype)
+    params = SemiMarkovSpotter(model, jnp.asarray(background, jnp.int32), int(patience), least_gain)
     return Filter(params, _init_spotter, _predict_spotter, _update_spotter)
 
 
@@ -164,11 +165,11 @@ def _update(
 def _init_spotter(spotter: SemiMarkovSpotter, key: AnyKey) -> SemiMarkovSpotterState:
     del key
     scores = started(spotter.model)
-    none, zeros = jnp.full(scores.shape, -1, jnp.int32), jnp.zeros_like(scores)
-    outside = jnp.full((), -1, jnp.int32)
-    return SemiMarkovSpotterState(
-        scores, zeros, jnp.zeros_like(none), Candidate(none, none, none, zeros), outside, outside
-    )
+    zeros, outside = jnp.zeros_like(scores), jnp.full((), -1, jnp.int32)
+    kept = (*scores.shape, spotter.patience)
+    none = jnp.full(kept, -1, jnp.int32)
+    finished = Candidate(none, none, none, jnp.zeros(kept, scores.dtype))
+    return SemiMarkovSpotterState(scores, zeros, zeros.astype(jnp.int32), finished, outside, outside)
 
 
 def _predict_spotter(
@@ -180,22 +181,24 @@ def _predict_spotter(
     ages = jnp.argmax(state.scores + model.log_end, axis=1)
     at = (origin, ages[origin])
     done = Candidate(origin, state.starts[at], jnp.broadcast_to(state.frame, origin.shape), state.gains[at])
-    # What follows a segment remembers it; what follows background remembers what that did.
-    entered = jax.tree.map(
-        lambda own, before: jnp.where(origin == spotter.background, before[at], own), done, state.finished
-    )
+
+    def entered(own: Array, before: Array) -> Array:
+        # What follows a segment adds it to those before; what follows background has those before.
+        added = jnp.concatenate([own[:, None], before[at][:, :-1]], axis=1)
+        return jnp.where((origin == spotter.background)[:, None], before[at], added)
+
     stays = state.scores[:, -2:] + model.log_stay[:, -2:]
     longest = jnp.where(stays[:, 1] > stays[:, 0], -1, -2)
 
     def moved(leaf: Array, first: Array) -> Array:
-        last = jnp.take_along_axis(leaf, longest[:, None] % leaf.shape[1], axis=1)
+        last = leaf[jnp.arange(leaf.shape[0]), longest % leaf.shape[1]][:, None]
         return jnp.concatenate([first[:, None], leaf[:, :-2], last], axis=1)
 
     after = SemiMarkovSpotterState(
         following,
         moved(state.gains, jnp.zeros_like(state.gains[:, 0])),
         moved(state.starts, jnp.broadcast_to(frame, origin.shape)),
-        jax.tree.map(moved, state.finished, entered),
+        jax.tree.map(moved, state.finished, jax.tree.map(entered, done, state.finished)),
         frame,
         state.reported_end,
     )
@@ -219,12 +222,16 @@ def _update_spotter(
         gains=state.gains + gained[:, None],
     )
     best = jnp.unravel_index(jnp.argmax(state.scores), state.scores.shape)
-    found = jax.tree.map(lambda leaf: leaf[best], state.finished)
-    reports = (
-        (found.label >= 0)
-        & (found.start > state.reported_end)
-        & (state.frame - found.end >= spotter.patience)
-        & (found.score >= spotter.margin)
+    finished = jax.tree.map(lambda leaf: leaf[best], state.finished)
+    due = (
+        (finished.label >= 0)
+        & (finished.start > state.reported_end)
+        & (state.frame - finished.end >= spotter.patience)
+        & (finished.score >= spotter.margin)
     )
+    reports = jnp.any(due)
+    # The earliest one that is due; where none is, the latest one.
+    chosen = jnp.max(jnp.where(due, jnp.arange(spotter.patience), 0))
+    found = jax.tree.map(lambda leaf: leaf[chosen], finished)
     state = state._replace(reported_end=jnp.where(reports, found.end, state.reported_end))
     return state, SemiMarkovSpotterInfo(growth, reports, found, best[0].astype(jnp.int32))

@@ -87,9 +87,13 @@ class Codes:
         )
 
     def log_prior(self) -> Float[Array, ""]:
-        """Log density of a symmetric Dirichlet prior with concentration `1 + pseudo_count`, up to a constant."""
-        possible = self.log_probability > -jnp.inf
-        return self.pseudo_count * jnp.sum(jnp.where(possible, self.log_probability, 0.0))
+        """Log density of a symmetric Dirichlet prior with concentration `1 + pseudo_count`, up to a constant.
+
+        It is `-inf` where a probability is zero, unless the pseudo-count is.
+        """
+        if not self.pseudo_count:
+            return jnp.zeros((), self.log_probability.dtype)
+        return self.pseudo_count * jnp.sum(self.log_probability)
 
 
 @pytree_dataclass

@@ -26,8 +26,8 @@ class Training(NamedTuple):
 
     model: HiddenMarkovModel
     objective: Float[Array, " i"]
-    """(max_iterations,): log evidence of all sequences plus log prior before each iteration, which never decreases;
-    after convergence the last value repeats. Impossible sequences are left out."""
+    """(max_iterations,): log evidence of all sequences plus log prior before each iteration; after convergence the last
+    value repeats. Impossible sequences are left out. It decreases only where such a sequence becomes possible."""
     num_iterations: Int32[Array, ""]
     converged: Bool[Array, ""]
     num_impossible: Int32[Array, ""]
@@ -142,15 +142,17 @@ def _baum_welch(model, observations, lengths, mask, *, max_iterations, tolerance
     observations = jax.tree.map(clean, observations)
 
     def improve(state: tuple) -> tuple:
-        model, objectives, i, _, _ = state
+        model, objectives, i, _, num_before = state
         found = _expected(model, observations, observed, lengths)
         possible = found.log_evidence > -jnp.inf
         objective = jnp.sum(jnp.where(possible, found.log_evidence, 0.0)) + _log_prior(model, transition_pseudo_count)
-        before = objectives[jnp.maximum(i - 1, 0)]
-        converged = (i > 0) & (objective - before <= tolerance * jnp.abs(objective))
+        before, num_impossible = objectives[jnp.maximum(i - 1, 0)], jnp.sum(~possible, dtype=jnp.int32)
+        # A sequence that has become possible lowers the objective, from which it was left out.
+        comparable = (i > 0) & (num_impossible == num_before)
+        converged = comparable & (objective - before <= tolerance * jnp.abs(objective))
         objectives = jnp.where(jnp.arange(max_iterations) >= i, objective, objectives)
         better = _maximized(model, found, observations, observed, transition_pseudo_count)
-        return better, objectives, i + 1, converged, jnp.sum(~possible, dtype=jnp.int32)
+        return better, objectives, i + 1, converged, num_impossible
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         _, _, i, converged, _ = state
@@ -200,7 +202,8 @@ def best_of_restarts(
         return baum_welch(with_responsibilities(model, observations, weights), observations, lengths)
 
     trained = jax.vmap(train)(jax.random.split(key, num_restarts))
-    best = jnp.argmax(trained.objective[:, -1])
+    last = trained.objective[:, -1]
+    best = jnp.argmax(jnp.where(jnp.isnan(last), -jnp.inf, last))
     return jax.tree.map(lambda leaf: leaf[best], trained)
 
 

@@ -38,7 +38,8 @@ class PathInfo(NamedTuple):
     """Number of particles whose log-likelihood was NaN or `+inf`, all frames together; they were given weight zero."""
     num_impossible: Int32[Array, ""]
     """Number of frames that no particle explains, or into whose given state `log_transition` lets none of them move,
-    not even its own predecessor. Where it is not 0 the trajectory is no draw from the posterior."""
+    not even its own predecessor, or where that density is NaN or `+inf` for a particle with weight. Where it is not 0
+    the trajectory is no draw from the posterior."""
 
 
 @pytree_dataclass

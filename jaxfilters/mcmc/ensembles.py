@@ -14,7 +14,7 @@ from jaxfilters._struct import pytree_dataclass
 from jaxfilters.fit.parametrization import Parametrization, parametrize
 from jaxfilters.mcmc import checks
 from jaxfilters.mcmc.metropolis import MetropolisInfo, Point, accept
-from jaxfilters.mcmc.proposals import OPTIMAL_SCALE, is_admissible, step_in_chart
+from jaxfilters.mcmc.proposals import OPTIMAL_SCALE, check_floating, is_admissible, step_in_chart
 from jaxfilters.particle.checks import concrete
 from jaxfilters.priors import sample_ensemble
 from jaxfilters.typing import AnyKey, SamplePrior
@@ -87,7 +87,9 @@ def prior_draws(
 ) -> tuple[PyTree, Parametrization]:
     """Parameters from the prior, leaves `(..., n)`, and coordinates about the first of them."""
     theta = jax.tree.map(jnp.asarray, sample_ensemble(key, sample_prior, count))
-    return theta, parametrize(jax.tree.map(lambda leaf: leaf[..., 0], theta), constraints)
+    parametrization = parametrize(jax.tree.map(lambda leaf: leaf[..., 0], theta), constraints)
+    check_floating(theta, parametrization.constraints)
+    return theta, parametrization
 
 
 def points(key: AnyKey, target: Target, theta: PyTree) -> Point:

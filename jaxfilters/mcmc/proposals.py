@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import field
+from functools import reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int32, PyTree
 
 from jaxfilters._struct import pytree_dataclass
-from jaxfilters.fit.constraints import Constraint, Fixed, free
-from jaxfilters.fit.parametrization import Parametrization, parametrize
+from jaxfilters.fit.constraints import Constraint, Fixed, Interval, Rotation, free
+from jaxfilters.fit.parametrization import Parametrization, leaf_names, parametrize
 from jaxfilters.mcmc import checks
 from jaxfilters.particle.checks import check_callables, check_scalar, like
 from jaxfilters.typing import AnyKey, as_pytree
@@ -67,6 +68,7 @@ class RandomWalk:
     def init(self, theta: PyTree) -> tuple[RandomWalkState, Bool[Array, ""]]:
         """Independent steps of the given size in every coordinate."""
         parametrization = parametrize(theta, jax.tree.unflatten(self.structure, self.constraints))
+        check_floating(theta, parametrization.constraints)
         z = parametrization.unconstrain(parametrization.origin)
         scale = OPTIMAL_SCALE / math.sqrt(max(z.size, 1))
         deviation = jnp.broadcast_to(jnp.asarray(self.step, z.dtype), z.shape) / scale
@@ -193,17 +195,34 @@ def proposal(
     return UserProposal(as_pytree(sample), as_pytree(log_density))
 
 
-def is_admissible(parametrization: Parametrization) -> Bool[Array, ""]:
-    """Whether the origin satisfies its constraints: then it is the value of its own coordinates."""
-    again = parametrization.constrain(parametrization.unconstrain(parametrization.origin))
+def check_floating(theta: PyTree, constraints: tuple[Constraint, ...]) -> None:
+    """Reject parameters that a step in their coordinates would round.
 
-    def close(new: Array, old: Array) -> Array:
-        if not jnp.issubdtype(jnp.result_type(old), jnp.inexact):
+    Raises:
+        TypeError: If a leaf of `theta` is not floating-point and its constraint is not `fixed`.
+    """
+    for name, leaf, constraint in zip(leaf_names(theta), jax.tree.leaves(theta), constraints, strict=True):
+        dtype = jnp.result_type(leaf)
+        if not isinstance(constraint, Fixed) and not jnp.issubdtype(dtype, jnp.floating):
+            raise TypeError(f"theta{name} must be floating-point, or fit.fixed; got {dtype}.")
+
+
+def is_admissible(parametrization: Parametrization) -> Bool[Array, ""]:
+    """Whether the origin satisfies its constraints: it is the value of its own coordinates, which are finite."""
+    z = parametrization.unconstrain(parametrization.origin)
+    again = parametrization.constrain(z)
+
+    def close(constraint: Constraint, new: Array, old: Array) -> Array:
+        # Finite logits are within the interval, and leave no relative precision near zero.
+        if isinstance(constraint, Interval) or not jnp.issubdtype(jnp.result_type(old), jnp.inexact):
             return jnp.ones((), bool)
         tolerance = 1e-3 * (jnp.max(jnp.abs(old), initial=0.0) + jnp.finfo(old.dtype).tiny)
         return jnp.all(jnp.abs(new - old) <= tolerance)
 
-    return jax.tree.reduce(jnp.logical_and, jax.tree.map(close, again, parametrization.origin), jnp.ones((), bool))
+    # A value on an open bound has the coordinate -inf or inf, and is its value, too.
+    finite = jnp.all(jnp.isfinite(z))
+    triples = zip(parametrization.constraints, jax.tree.leaves(again), parametrization.leaves, strict=True)
+    return reduce(jnp.logical_and, (close(*triple) for triple in triples), finite)
 
 
 def step_in_chart(
@@ -211,13 +230,15 @@ def step_in_chart(
 ) -> tuple[PyTree, Float[Array, ""]]:
     """A Gaussian step in unconstrained coordinates, and the change of the log volume that they stretch.
 
-    The coordinates are about the origin of `parametrization`, except that fixed values are those of `theta`.
+    The coordinates are about the origin of `parametrization`, except that fixed values are those of `theta`, and that
+    rotations are turned from `theta`: such a step is as likely as the one back, over all turns that lead to the same
+    rotation, so that its volume does not count.
     """
     leaves, structure = jax.tree.flatten(theta)
     triples = zip(parametrization.constraints, leaves, parametrization.leaves, strict=True)
-    origin = [leaf if isinstance(constraint, Fixed) else about for constraint, leaf, about in triples]
+    origin = [leaf if isinstance(constraint, Fixed | Rotation) else about for constraint, leaf, about in triples]
     chart = Parametrization(jax.tree.unflatten(structure, origin), parametrization.constraints)
     z = chart.unconstrain(theta)
     new = z + jnp.matmul(root, jax.random.normal(key, z.shape, z.dtype), precision="highest")
     proposed = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), chart.constrain(new), theta)
-    return proposed, chart.log_volume(new) - chart.log_volume(z)
+    return proposed, chart.log_volume(new, without=Rotation) - chart.log_volume(z, without=Rotation)

@@ -59,14 +59,20 @@ class AncestorSampling(_TracesAncestry):
     def parent(
         self, point: Array, log_weights: Array, particles: PyTree, x_next: PyTree, inputs: PyTree
     ) -> tuple[Array, Array]:
-        """A particle drawn by its weight times the density of the transition to `x_next`."""
+        """A particle drawn by its weight times the density of the transition to `x_next`.
+
+        A density that is NaN or `+inf` counts as none, and the frame as one without a predecessor.
+        """
 
         def log_density(x: PyTree) -> Array:
             return checks.scalar_log_density("log_transition", self.log_transition(x_next, x, inputs))
 
-        joined = log_weights + jax.vmap(log_density, in_axes=-1)(particles)
+        densities = jax.vmap(log_density, in_axes=-1)(particles)
+        invalid = jnp.isnan(densities) | jnp.isposinf(densities)
+        joined = log_weights + jnp.where(invalid, -jnp.inf, densities)
         impossible = ~jnp.any(joined > -jnp.inf)
-        return jnp.where(impossible, 0, _draw_index(joined, point)), impossible
+        affected = jnp.any(invalid & (log_weights > -jnp.inf))
+        return jnp.where(impossible, 0, _draw_index(joined, point)), impossible | affected
 
 
 @pytree_dataclass

@@ -262,7 +262,12 @@ def covariance(
     J = jax.jacfwd(residuals)(flat)
     free = ~active_set(flat, _product(J.T, residuals(flat)), *bounds_of(options or {}, y))
     both = free[:, None] & free
-    return jnp.where(both, jnp.linalg.pinv(jnp.where(both, _product(J.T, J), 0.0), hermitian=True), 0.0)
+    information = jnp.where(both, _product(J.T, J), 0.0)
+    # Scaled to ones on the diagonal: variables have different units, and the pseudo-inverse drops what is small.
+    diagonal = jnp.diagonal(information)
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    inverse = jnp.linalg.pinv(scale[:, None] * information * scale, hermitian=True)
+    return jnp.where(both, scale[:, None] * inverse * scale, 0.0)
 
 
 def huber(residual: Float[Array, "*shape"], scale: float) -> Float[Array, "*shape"]:

@@ -66,6 +66,55 @@ def test_estimates_spread_over_images_as_godambe_says_and_not_as_laplace():
     np.testing.assert_allclose(np.mean(1 / found.magnitude), np.mean(claimed**2 / laplace**2), rtol=0.05)
 
 
+def along(values, axis, matrix):
+    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+
+
+@pytest.mark.system
+def test_certainty_from_a_sequence_of_images_whose_residuals_are_correlated_in_time_too():
+    """A blob that moves through 16 images, with noise of a longer correlation in time than across the image.
+
+    The standard deviation over 500 sequences has an error of 3.2 percent, of which four; the expected matrix with the
+    weights of the lags is computed axis by axis in NumPy.
+    """
+    grid, lengths, lags = (16, 10, 10), (3, 2, 2), (4, 2, 2)
+    t, u, v = np.meshgrid(*(np.linspace(-1, 1, size) for size in grid), indexing="ij")
+    blob = np.exp(-((u - 0.3 * t) ** 2 + v**2) / 0.6)
+    A = np.stack([v * blob, blob], -1)
+    flat = A.reshape(-1, 2)
+    inverse = np.linalg.inv(flat.T @ flat)
+
+    # Means of neighbours, so that the correlation falls linearly to zero at their number.
+    y = np.random.default_rng(4).normal(size=(500, *(n + k - 1 for n, k in zip(grid, lengths, strict=True))))
+    for axis, (n, k) in enumerate(zip(grid, lengths, strict=True), start=1):
+        y = along(y, axis, sum(np.eye(n, n + k - 1, shift) for shift in range(k)) / np.sqrt(k))
+    modes = y.reshape(500, -1) @ flat @ inverse
+    basis = jnp.asarray(A, jnp.float32)
+
+    def variances(pair):
+        y, mode = pair
+        found = jf.fit.godambe(lambda x: -0.5 * (y - basis @ x) ** 2, mode, lags=lags)
+        return jnp.diagonal(found.covariance)
+
+    pairs = jnp.asarray(y, jnp.float32), jnp.asarray(modes, jnp.float32)
+    claimed = np.sqrt(np.mean(jax.lax.map(variances, pairs, batch_size=50), axis=0))
+
+    def sandwich(lags):
+        K = A
+        for axis, (n, k, lag) in enumerate(zip(grid, lengths, lags, strict=True)):
+            distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+            weights = np.maximum(1 - distance / (lag + 1), 0)
+            K = along(K, axis, weights * np.maximum(1 - distance / k, 0))
+        return np.sqrt(np.diag(inverse @ flat.T @ K.reshape(-1, 2) @ inverse))
+
+    whole = sandwich((np.inf, np.inf, np.inf))
+    np.testing.assert_allclose(np.std(modes, axis=0), whole, rtol=0.13)
+    np.testing.assert_allclose(claimed, sandwich(lags), rtol=0.13)
+    assert np.all(whole > 2 * np.sqrt(np.diag(inverse)))
+    # The tolerance tells it from the matrix of images that are independent in time.
+    assert np.all(claimed > 1.2 * sandwich((0, *lags[1:])))
+
+
 def test_windows_are_the_sum_over_pairs_with_weights():
     """Brute force over all pairs of 42 pixels, in float64."""
     rng = np.random.default_rng(1)

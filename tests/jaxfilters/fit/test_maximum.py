@@ -258,3 +258,27 @@ def test_what_is_not_determined_leaves_the_others_their_errors():
     np.testing.assert_allclose(found.standard_errors["a"], 0.5**0.5, rtol=1e-5)
     np.testing.assert_allclose(found.upper["a"], 1 + 1.959964 * 0.5**0.5, rtol=1e-4)
     assert np.isnan(found.standard_errors["b"])
+
+
+def around(centre, x):
+    return -0.5 * (x - centre) ** 2
+
+
+@pytest.mark.system
+def test_a_fit_within_bounds_keeps_them_with_another_method():
+    high, within = jax.tree_util.Partial(around, 3.0), jax.tree_util.Partial(around, 1.9)
+    options = {"constraints": fit.interval(0, 2), "method": fit.lbfgsb(), "errors": fit.no_errors}
+    at_bound, inside = (fit.maximize(log_density, 1.0, **options) for log_density in (high, within))
+    assert at_bound.theta == 2
+    assert fit.maximize(high, at_bound, errors=fit.no_errors).theta == 2
+    assert 1.99 < fit.maximize(high, inside, method=fit.bfgs(), errors=fit.no_errors).theta <= 2
+    # Logits have no value there.
+    with pytest.raises(ValueError, match="start must be between 0 and 2"):
+        fit.maximize(high, at_bound, method=fit.bfgs(), errors=fit.no_errors)
+
+
+def test_a_fit_that_continues_with_another_log_density_finds_its_maximum():
+    first = fit.maximize(density(), START, LIMITS, errors=fit.no_errors)
+    found = fit.maximize(density(YS + 1), first, errors=fit.no_errors)
+    assert found.converged
+    np.testing.assert_allclose([found.theta["mean"], found.theta["std"]], [MEAN + 1, STD], rtol=1e-2)

@@ -96,3 +96,17 @@ def test_a_wrong_gradient_is_noticed_and_shown():
     assert "['x']" in str(check)
     found = fit.maximize(lambda theta: -(theta["x"] ** 2) - theta["y"] ** 2, {"x": 2.0, "y": 1.0})
     assert "agree to 0.3" in fit.report(found, check)
+
+
+def test_intervals_end_at_the_bounds_of_a_search_within_bounds():
+    found = fit.maximize(lambda x: -0.5 * (x - 1.9) ** 2, 1.0, fit.interval(0, 2), method=fit.lbfgsb())
+    np.testing.assert_allclose([found.theta, found.standard_errors], [1.9, 1.0], rtol=1e-3)
+    # 1.9 minus and plus 1.96 are outside.
+    assert (found.lower, found.upper) == (0, 2)
+
+
+def test_with_all_parameters_fixed_there_is_nothing_to_find():
+    found = fit.maximize(lambda theta: -0.5 * (theta["a"] - theta["b"]) ** 2, {"a": 1.0, "b": 2}, fit.fixed)
+    assert (found.theta["a"], found.theta["b"], found.log_density) == (1, 2, -0.5)
+    assert found.covariance.shape == (0, 0)
+    assert str(found).count("fixed") == 2

@@ -134,3 +134,16 @@ def test_frames_that_nothing_explains_are_ignored_by_the_filters():
         state, (_, infos) = jf.run(filter, jax.random.key(0), broken)
         np.testing.assert_array_equal(np.isfinite(infos.log_evidence), np.arange(FRAMES + 1) != 3)
         assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(state))
+
+
+def test_a_segment_is_reported_though_the_next_one_ends_within_its_patience():
+    labels = np.array([0, 0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0])
+    frames = jnp.asarray(np.where(np.eye(3, dtype=bool)[labels], 0.0, -6.0), jnp.float32)
+    between = np.array([[0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
+    own = hmm.semi_markov([1, 0, 0], between, np.array([[0.5, 0.5], [0, 1], [0, 1]]), tail=[0.5, 0, 0])
+    _, (_, infos) = jf.run(hmm.semi_markov_spotter(own, 0, patience=3), jax.random.key(0), frames)
+    at = np.flatnonzero(infos.reports)
+    np.testing.assert_array_equal(at, [4 + 3, 6 + 3])
+    np.testing.assert_array_equal(
+        np.stack([np.asarray(leaf)[at] for leaf in infos.found[:3]], 1), [[1, 3, 4], [2, 5, 6]]
+    )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfilters import hmm
+from jaxfilters._struct import pytree_dataclass
 
 NUM_CODES = 17
 
@@ -169,3 +170,43 @@ def test_what_cannot_be_padded_or_restarted_is_refused():
         hmm.best_of_restarts(jax.random.key(0), code_model(), *hmm.pad(code_sequences()), num_restarts=0)
     with pytest.raises(ValueError, match="no emission"):
         hmm.with_responsibilities(hmm.from_probabilities([1.0], [[1.0]]), jnp.zeros((2, 1)), jnp.ones((2, 1, 1)))
+
+
+@pytree_dataclass
+class WithoutPrior(hmm.Codes):
+    """Codes whose pseudo-counts the objective does not hold."""
+
+    def log_prior(self):
+        return jnp.zeros(())
+
+
+@pytest.mark.parametrize("kind", [hmm.Codes, WithoutPrior])
+def test_training_goes_on_where_pseudo_counts_make_codes_possible(x64, kind):
+    """A code with probability zero, which makes one of two sequences impossible before the first iteration."""
+    probability = jnp.array([[0.7, 0.3, 0.0], [0.3, 0.7, 0.0]])
+    model = hmm.from_probabilities([0.5, 0.5], [[0.9, 0.1], [0.1, 0.9]], kind(jnp.log(probability), 0.1))
+    codes = (np.random.default_rng(0).uniform(size=60) < np.where(np.arange(60) // 15 % 2, 0.1, 0.9)).astype(int)
+    observations, lengths = hmm.pad([codes, np.array([0, 2, 0])])
+    trained = hmm.baum_welch(model, observations, lengths, max_iterations=300, tolerance=1e-9)
+    assert trained.converged
+    assert trained.num_impossible == 0
+    again = hmm.baum_welch(trained.model, observations, lengths, max_iterations=20, tolerance=0.0)
+    assert again.objective[-1] - trained.objective[-1] < 1e-5
+
+
+@pytree_dataclass
+class Ordered(hmm.DiagonalGaussian):
+    """An emission whose prior is NaN for one order of two states."""
+
+    def log_prior(self):
+        return jnp.where(self.mean[0, 0] > self.mean[1, 0], jnp.nan, 0.0)
+
+
+@pytest.mark.system
+def test_the_best_restart_has_a_number_as_its_objective():
+    y = np.where(np.arange(20) // 5 % 2, 5.0, 1.0) + 0.1 * np.random.default_rng(0).normal(size=20)
+    observations, lengths = hmm.pad([y[:, None]])
+    model = hmm.from_topology(hmm.ergodic(2), Ordered(jnp.zeros((2, 1)), jnp.ones((2, 1))))
+    trained = hmm.best_of_restarts(jax.random.key(1), model, observations, lengths, num_restarts=8)
+    assert np.isfinite(trained.objective[-1])
+    assert trained.model.emission.mean[0, 0] < trained.model.emission.mean[1, 0]

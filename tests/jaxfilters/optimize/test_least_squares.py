@@ -244,3 +244,11 @@ def test_the_schur_complement_equals_the_dense_solution():
         dense[rows, rows], dense[:shared, rows], dense[rows, :shared] = V[i], W[i], W[i].T
     x, y = schur(*(jnp.asarray(a) for a in (U, W, V, b, d)))
     assert_allclose(np.concatenate([x, np.ravel(y)]), np.linalg.solve(dense, np.concatenate([b, d.ravel()])), rtol=1e-8)
+
+
+def test_covariance_has_the_variances_of_variables_in_other_units():
+    """A line with the slope per millisecond over ten seconds: the two variances differ by seven orders."""
+    t = np.linspace(0.0, 1e4, 50)
+    design = np.stack([np.ones(50), t], axis=1)
+    found = covariance(lambda p, args: p[0] + p[1] * args, jnp.zeros(2, jnp.float32), jnp.asarray(t, jnp.float32))
+    assert_allclose(found, np.linalg.inv(design.T @ design), rtol=1e-3)
