@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from jaxfilters.models.calibration_checks import FLAT, check_in_front, check_spread, checked_points, is_flat
 from jaxfilters.models.calibration_errors import (
     MOST_OPEN,
     MOST_OPEN_FLOOR,
@@ -23,8 +24,6 @@ from jaxfilters.models.floor_camera import canonical
 
 FEWEST_POINTS, FEWEST_FLOOR_POINTS = 6, 4
 """Of a projection matrix; of a camera over a plane with square pixels around the centre of its image."""
-FLAT = 1e-3
-"""Points whose extents differ by this factor lie in a plane."""
 LEVEL = 0.05
 """Heights that differ by this share of the extent of a floor: the plane still tells about where the camera stands."""
 MOST_OBLONG = 1.5
@@ -92,15 +91,16 @@ def calibrate_dlt(points_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray,
         pixels: (n, 2) undistorted pixels.
 
     Raises:
-        ValueError: wrong shapes, too few or coplanar points, points for which there is no one camera, or points that
-            would lie behind it, as those of a left-handed world.
+        ValueError: wrong shapes, too few or coplanar points, pixels on a line, points for which there is no one camera,
+            or points that would lie behind it, as those of a left-handed world.
     """
-    points_m, pixels = _checked_points(points_m, pixels, FEWEST_POINTS)
-    if _is_flat(points_m):
+    points_m, pixels = checked_points(points_m, pixels, FEWEST_POINTS)
+    if is_flat(points_m):
         raise ValueError(
             "points_m lie in one plane, or nearly: a projection matrix needs points at several heights above it "
             "(points on the floor alone need the camera's intrinsics, or those assumed by calibrate_floor)."
         )
+    check_spread(pixels)
     X, to_world = _normalised(points_m)
     x, to_pixels = _normalised(pixels)
     X = np.column_stack([X, np.ones(len(X))])
@@ -119,7 +119,7 @@ def calibrate_dlt(points_m: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray,
         raise ValueError("points_m and pixels fit no camera at a finite place: the left 3 x 3 block of P is singular.")
     P = canonical(P)
     homogeneous = np.column_stack([points_m, np.ones(len(points_m))]) @ P.T
-    _check_in_front(homogeneous[:, 2])
+    check_in_front(homogeneous[:, 2])
     return P, _rms(homogeneous[:, :2] / homogeneous[:, 2:] - pixels)
 
 
@@ -156,7 +156,7 @@ def refine(points_m: np.ndarray, pixels: np.ndarray, start: Calibration, *, coef
     if not 0 <= coefficients <= _COEFFICIENTS:
         raise ValueError(f"coefficients must be from 0 to {_COEFFICIENTS}; got {coefficients}.")
     unknowns = 10 + coefficients
-    points_m, pixels = _checked_points(points_m, pixels, (unknowns + 1) // 2)
+    points_m, pixels = checked_points(points_m, pixels, (unknowns + 1) // 2)
 
     def intrinsics(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         K = np.array([[x[0], 0, x[2]], [0, x[1], x[3]], [0, 0, 1.0]])
@@ -209,19 +209,25 @@ def calibrate_floor(points_m: np.ndarray, pixels: np.ndarray, image_size: tuple[
         image_size: Columns and rows.
 
     Raises:
-        ValueError: wrong shapes, too few points, points on a line or of several heights, or a view that leaves the
-            focal length open, as one straight down does.
+        ValueError: wrong shapes, too few points, points or pixels on a line, points of several heights, or a view that
+            leaves the focal length open, as one straight down does.
     """
     points_m = np.asarray(points_m, float)
     if points_m.ndim == 2 and points_m.shape[1] == 2:
         points_m = np.column_stack([points_m, np.zeros(len(points_m))])
-    points_m, pixels = _checked_points(points_m, pixels, FEWEST_FLOOR_POINTS)
+    points_m, pixels = checked_points(points_m, pixels, FEWEST_FLOOR_POINTS)
     if not is_level(points_m):
         raise ValueError("points_m must have one height; use calibrate_points for points at several heights.")
-    if _is_flat(points_m[:, :2]):
+    if is_flat(points_m[:, :2]):
         raise ValueError("points_m lie on one line, or nearly: points to the sides of it are needed.")
+    check_spread(pixels)
     middle = (np.asarray(image_size, float) - 1) / 2
     H, _ = cv2.findHomography(points_m[:, :2], pixels - middle)
+    if H is None:
+        raise ValueError(
+            "points_m and pixels fit no view of a plane: four points are needed of which "
+            "no three lie on one line, neither in the world nor in the image."
+        )
     focal = _focal_of_homography(H, float(max(image_size)))
     K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
     start = calibrate_pose(points_m, pixels, K, np.zeros(_COEFFICIENTS))
@@ -238,18 +244,22 @@ def calibrate_pose(points_m: np.ndarray, pixels: np.ndarray, K: np.ndarray, dist
     """A camera of known intrinsics from four or more points, which may lie in one plane.
 
     Raises:
-        ValueError: wrong shapes, too few points, points on a line, or no pose.
+        ValueError: wrong shapes, too few points, points or pixels on a line, or no pose.
     """
-    points_m, pixels = _checked_points(points_m, pixels, FEWEST_FLOOR_POINTS)
+    points_m, pixels = checked_points(points_m, pixels, FEWEST_FLOOR_POINTS)
     if np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)[1] < FLAT * np.ptp(points_m, axis=0).max():
         raise ValueError("points_m lie on one line, or nearly: points to the sides of it are needed.")
+    check_spread(pixels)
     K, distortion = np.asarray(K, float), np.asarray(distortion, float)
-    is_found, turn, t = cv2.solvePnP(points_m, pixels, K, distortion, flags=cv2.SOLVEPNP_SQPNP)
+    try:
+        is_found, turn, t = cv2.solvePnP(points_m, pixels, K, distortion, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        is_found = False
     if not is_found:
         raise ValueError("points_m and pixels fit no pose of a camera with these intrinsics.")
     turn, t = cv2.solvePnPRefineLM(points_m, pixels, K, distortion, turn, t)
     found = Calibration(K, distortion, cv2.Rodrigues(turn)[0], t.ravel(), 0.0)
-    _check_in_front(points_m @ found.R[2] + found.t[2])
+    check_in_front(points_m @ found.R[2] + found.t[2])
     return found._replace(rms_px=_rms(found.project(points_m) - pixels))
 
 
@@ -282,12 +292,6 @@ def distort(x: Float[np.ndarray, "n 2"], coefficients: Float[np.ndarray, " 5"]) 
 def is_level(points_m: np.ndarray) -> bool:
     """Whether the heights of points (n, 3) differ by little, `LEVEL`, next to their extent on the floor."""
     return bool(np.ptp(points_m[:, 2]) <= LEVEL * np.ptp(points_m[:, :2], axis=0).max())
-
-
-def _is_flat(points: np.ndarray) -> bool:
-    """Whether points (n, d) have next to no extent in some direction."""
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extents[-1] < FLAT * extents[0])
 
 
 def _without_skew(P: np.ndarray) -> Calibration:
@@ -332,7 +336,7 @@ def _nearest(
     start_x = np.concatenate([first, np.zeros(6)])
     found = least_squares(errors, start_x, x_scale="jac", method="trf", max_nfev=_MOST_STEPS)
     best = camera(found.x)
-    _check_in_front(points_m @ best.R[2] + best.t[2])
+    check_in_front(points_m @ best.R[2] + best.t[2])
 
     def described(x: np.ndarray) -> np.ndarray:
         near = camera(x)
@@ -361,26 +365,6 @@ def _focal_of_homography(H: np.ndarray, size: float) -> float:
             "wrong): give points at several heights, or calibrate the intrinsics with a board first."
         )
     return size * float(np.sqrt(squared))
-
-
-def _checked_points(points_m: np.ndarray, pixels: np.ndarray, fewest: int) -> tuple[np.ndarray, np.ndarray]:
-    # OpenCV takes no columns of a larger array.
-    points_m, pixels = np.ascontiguousarray(points_m, float), np.ascontiguousarray(pixels, float)
-    if points_m.ndim != 2 or points_m.shape[1] != 3 or pixels.shape != (len(points_m), 2):
-        raise ValueError(f"points_m must be (n, 3) and pixels (n, 2); got {points_m.shape} and {pixels.shape}.")
-    if not (np.isfinite(points_m).all() and np.isfinite(pixels).all()):
-        raise ValueError("points_m and pixels must be finite.")
-    if len(points_m) < fewest:
-        raise ValueError(f"points_m must be {fewest} points or more for this; got {len(points_m)}.")
-    return points_m, pixels
-
-
-def _check_in_front(depth: np.ndarray) -> None:
-    if (depth <= 0).any():
-        raise ValueError(
-            f"points_m and pixels fit only a camera with {int((depth <= 0).sum())} of {len(depth)} points behind it: "
-            "the world must be right-handed with Z up, and pixels u to the right and v down."
-        )
 
 
 def _normalised(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,9 @@
 """Symbols recognised from what a tracker says of fingertips: direction codes 1..17 and numbers of tips, frame by frame.
 
-Models of two kinds do. `learn_codes` makes the published ones (K. Oka, Y. Sato, H. Koike, IEEE CG&A 22(6), 2002;
-specification of fingertips and gestures, section 2.7): states have probabilities of codes and of numbers of tips.
-`learn_paths` makes models of what the path looks like, `stroke.features`, to which codes are a path of steps of equal
-length. It does not matter to these how fast a symbol is drawn, nor that a tip was missed now and then.
+Models of two kinds do. `learn_codes` makes the published ones (K. Oka, Y. Sato, H. Koike, IEEE CG&A 22(6), 2002):
+states have probabilities of codes and of numbers of tips. `learn_paths` makes models of what the path looks like,
+`stroke.features`, to which codes are a path of steps of equal length. It does not matter to these how fast a symbol is
+drawn, nor that a tip was missed now and then.
 """
 
 from collections.abc import Sequence

@@ -91,7 +91,7 @@ def deformation_schedule(
 
 
 def speech_schedule(num_frames: int, *, start: int = 60) -> Float[np.ndarray, "frames 2"]:
-    """Expressions (e1, e2) of a face that is neutral until `start` (one-camera specification, section 4).
+    """Expressions (e1, e2) of a face that is neutral until `start`.
 
     With w a one-second ramp and s the time in seconds, `e1 = w .45 max(0, sin(2 pi .17 s)) sign(sin(2 pi .05 s) + .3)`
     and `e2 = w .6 max(0, sin(2 pi .23 s + 1))`.

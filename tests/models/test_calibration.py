@@ -222,3 +222,45 @@ def test_questions_without_an_answer_are_named():
         refine(floor, camera.project(floor), camera, coefficients=6)
     with pytest.raises(ValueError, match="8 points or more"):
         refine(floor[:7], camera.project(floor)[:7], camera, coefficients=5)
+
+
+def test_pixels_on_one_line_or_repeated_fix_no_camera_and_are_named():
+    """What a person types who reads the same pixel off again and again, or off one edge of the image."""
+    floor = np.array([[0.0, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0], [2, 1, 0]])
+    space = np.vstack([floor, [[1, 1, 2], [3, 2, 1], [0, 1, 1.0]]])
+    K = level_camera().K
+    line = np.linspace([20, 30], [370, 205], 8)
+    for pixels, message in (
+        (line, r"pixels of all \d points lie on one line, or nearly, from \(20, 30\) to"),
+        (np.full((8, 2), 50.0), r"pixels of all \d points lie on one line, or nearly, from \(50, 50\) to \(50, 50\)"),
+    ):
+        for solve in (
+            lambda pixels=pixels: calibrate_floor(floor, pixels[:5], (640, 480)),
+            lambda pixels=pixels: calibrate_pose(floor, pixels[:5], K, np.zeros(5)),
+            lambda pixels=pixels: calibrate_points(space, pixels, (640, 480)),
+        ):
+            with pytest.raises(ValueError, match=message):
+                solve()
+
+
+@pytest.mark.system
+def test_no_points_end_in_another_error_than_one_about_points():
+    """Few points on a coarse grid, which are often the same, on a line or of no camera: OpenCV and NumPy then raise."""
+    messages = []
+    for number in range(300):
+        rng = np.random.default_rng(number)
+        count = int(rng.integers(4, 8))
+        points = rng.integers(0, 3, (count, 3)) * [1.0, 1.0, rng.integers(2)]
+        pixels = rng.integers(0, 3, (count, 2)) * 100.0
+        for solve in (
+            lambda points=points, pixels=pixels: calibrate_floor(points, pixels, (640, 480)),
+            lambda points=points, pixels=pixels: calibrate_pose(points, pixels, level_camera().K, np.zeros(5)),
+            lambda points=points, pixels=pixels: calibrate_points(points, pixels, (640, 480)),
+        ):
+            try:
+                found = solve()
+            except ValueError as error:
+                messages.append(str(error))
+            else:
+                assert np.isfinite(found.P).all()
+    assert [message for message in messages if "points" not in message] == []

@@ -151,13 +151,17 @@ def _from_tsai(options: argparse.Namespace) -> str:
     camera = read_tsai(options.file)
     size = options.image_size or camera.image_size
     options.image_size = size
-    calibration, worst_px = _named(options.file, lambda: calibration_of_tsai(camera, size))
-    return "\n".join(
-        [
-            f"Tsai's distortion as OpenCV's coefficients: within {worst_px:.4f} px all over the image",
-            _written(calibration, options, "the parameters of the file"),
+    fit = _named(options.file, lambda: calibration_of_tsai(camera, size))
+    where = "all over the image"
+    lines: list[str] = []
+    if fit.fitted_share < 1:
+        where = f"over {fit.fitted_share:.1%} of the image"
+        lines = [
+            f"warning: kappa1 = {camera.kappa1:g} folds the image onto itself at its border or near it: "
+            f"{1 - fit.fitted_share:.1%} of the pixels, those farthest from the centre, have no reliable direction"
         ]
-    )
+    described = f"Tsai's distortion as OpenCV's coefficients: within {fit.worst_px:.4f} px {where}"
+    return "\n".join([described, *lines, _written(fit.calibration, options, "the parameters of the file")])
 
 
 def _written(

@@ -11,6 +11,7 @@ from jaxfilters.models.calibration_stereo import StereoPose, calibrate_stereo
 from jaxfilters.trackers.calibration.checked import write_checked
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.images import images_in, read_image
+from jaxfilters.trackers.io.input_files import is_folder
 from jaxfilters.trackers.io.rigs import RigCamera, open_rig, write_rig
 
 WORST_PX = 3.0
@@ -51,7 +52,7 @@ def calibrate_rig(options: argparse.Namespace) -> str:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise InputError(f"{folder}: no such folder; expected one of pictures of the board.")
     return images_in(folder)
 

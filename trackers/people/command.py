@@ -15,6 +15,7 @@ import numpy as np
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.results import versions
 from jaxfilters.trackers.app.stream import RunResult, StreamRun, StreamSpec, check_unused
+from jaxfilters.trackers.innovations import contradiction, innovation_share
 from jaxfilters.trackers.io.cameras import open_camera
 from jaxfilters.trackers.io.detections import read_detections
 from jaxfilters.trackers.io.errors import InputError, as_input_error
@@ -204,6 +205,7 @@ def _report(
     seconds: float,
 ) -> dict[str, Any]:
     rate = result.frames_per_second
+    rows = as_rows(by_frame(tracks))
     return {
         "input": [source.name for source in setup.sources],
         "frames_per_second": round(rate, 2) if rate == rate else None,
@@ -212,6 +214,7 @@ def _report(
         "interrupted": result.interrupt is not None,
         "trouble": result.trouble,
         "mean_error_m": None if setup.demo is None else _demo_error(setup.demo, tracks),
+        "innovations": innovation_share(rows.innovations, rows.frame).report(),
         "background": _foreground_of(setup, options),
         "config": asdict(setup.scene.config),
         "versions": versions(),
@@ -236,6 +239,7 @@ def _summary(report: dict[str, Any], options: argparse.Namespace) -> str:
         + f", {report['people']} people"
         + (f", mean error {report['mean_error_m']:.2f} m" if report["mean_error_m"] is not None else "")
         + (", interrupted" if report["interrupted"] else "")
+        + contradiction(report["innovations"])
         + f"\nresults in {options.out}: track.csv, track.npz, report.json, summary.png"
         + (", overlay.mp4" if options.video else "")
         + (", tracks_mot.txt" if options.mot else "")

@@ -17,6 +17,8 @@ from jaxfilters.trackers.people.state import PeopleScene
 
 OUTLINE_POINTS = 64
 """Of an outline, from which the box in the video follows."""
+BLOCK = 4096
+"""Boxes that are computed in one call: the points of their outlines take 20 MB."""
 
 
 def write_mot(path: Path, scene: PeopleScene, undistortion: Undistortion, tracks: dict[int, list[Sighting]]) -> None:
@@ -79,15 +81,23 @@ def _boxes(
     length = 1 << (len(everyone) - 1).bit_length()
     means = np.stack([sighting.mean for _, sighting in everyone] + [everyone[0][1].mean] * (length - len(everyone)))
     shown = jax.device_get(_outlines(scene, jnp.asarray(means, jnp.float32)))
+    visible = np.flatnonzero(shown.code[: len(everyone)] == VISIBLE)
+    found: list[tuple[int, Sighting, np.ndarray]] = []
+    for some in np.split(visible, range(BLOCK, len(visible), BLOCK)):
+        boxes = _boxes_around(undistortion, shown.center[some], shown.shape[some])
+        found += [(*everyone[i], box) for i, box in zip(some, boxes, strict=True)]
+    return found
+
+
+def _boxes_around(undistortion: Undistortion, center: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """(n, 4) left, top, width and height of ellipses (n, 2) and (n, 2, 2), in pixels with the lens distortion."""
+    if not len(center):
+        return np.zeros((0, 4))
     turns = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     circle = np.stack([np.cos(turns), np.sin(turns)])
-    found = []
-    for (identity, sighting), code, center, shape in zip(everyone, shown.code, shown.center, shown.shape, strict=False):
-        if code == VISIBLE:
-            points = undistortion.distorted(center + (_root(shape) @ circle).T)
-            low, high = points.min(axis=0), points.max(axis=0)
-            found.append((identity, sighting, np.concatenate([low, high - low])))
-    return found
+    points = undistortion.distorted(center[:, None] + (_roots(shape) @ circle).swapaxes(1, 2))
+    low, high = points.min(axis=1), points.max(axis=1)
+    return np.concatenate([low, high - low], axis=1)
 
 
 @jax.jit
@@ -98,10 +108,10 @@ def _outlines(scene: PeopleScene, means: Array) -> Outline:
     return jax.vmap(one)(means)
 
 
-def _root(shape: np.ndarray) -> np.ndarray:
-    """A square root of the matrix of an ellipse, symmetric so that points at right angles are its extremes."""
-    values, vectors = np.linalg.eigh(np.asarray(shape, float))
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+def _roots(shapes: np.ndarray) -> np.ndarray:
+    """Square roots of the matrices (n, 2, 2) of ellipses, symmetric so that points at right angles are extremes."""
+    values, vectors = np.linalg.eigh(np.asarray(shapes, float))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ vectors.swapaxes(1, 2)
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -201,6 +201,20 @@ def test_pictures_that_do_not_fit_are_named(tmp_path, capsys):
     assert "none.png: not a complete image" in capsys.readouterr().err
 
 
+def test_parameters_that_fold_the_corners_are_converted_with_a_warning(tmp_path, capsys):
+    """Values as in view 7 of PETS 2009: the file is read back, and the message has the share that is left out."""
+    (tmp_path / "view.xml").write_text(
+        '<Camera><Geometry width="720" height="576" dpx="0.00465" dpy="0.00465"/>'
+        '<Intrinsic focal="3.69" kappa1="-0.062" cx="436" cy="258" sx="1"/>'
+        '<Extrinsic tx="8600" ty="-450" tz="14600" rx="1.77" ry="0.36" rz="0.09"/></Camera>'
+    )
+    assert calibrate("tsai", tmp_path / "view.xml", "--out", tmp_path / "camera.json") == 0
+    text = capsys.readouterr().out
+    assert "px over 96." in text
+    assert "warning: kappa1 = -0.062 folds the image" in text
+    assert open_camera(tmp_path / "camera.json").undistortion.distortion.any()
+
+
 @pytest.mark.data
 def test_parameters_of_pets(data_dir, tmp_path, capsys):
     folder, out = data_dir / "pets09_s2l1_view001", tmp_path / "camera.json"
@@ -215,3 +229,12 @@ def test_parameters_of_pets(data_dir, tmp_path, capsys):
     x = (np.stack([u.ravel(), v.ravel()], axis=-1) - middle) / focal
     ours, expected = (distort(x, np.asarray(k)) for k in (opened.undistortion.distortion, theirs["opencv_distCoeffs"]))
     np.testing.assert_allclose(ours * focal, expected * focal, atol=0.01)
+
+
+def test_pixels_on_one_line_are_named_with_their_file(tmp_path, capsys):
+    file = tmp_path / "points.csv"
+    file.write_text("x_m,y_m,z_m,u,v\n0,0,0,50,50\n4,0,0,50,50\n4,3,0,50,50\n0,3,0,50,50\n")
+    assert calibrate("points", file, "--image-size", SIZE, "--out", tmp_path / "a.json") == FAILURE
+    line = capsys.readouterr().err.strip()
+    assert line.startswith(f"jaxfilters: error: {file}: pixels of all 4 points lie on one line")
+    assert not (tmp_path / "a.json").exists()
