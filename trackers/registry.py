@@ -1,7 +1,8 @@
 """The tracking systems, by the names of their commands.
 
 A system is a package with `options.add_options(parser)`, which imports nothing that computes, `command.track(options)`,
-which runs it for the command line, and `track`, which runs it from Python.
+which runs it for the command line, and `track`, which runs it from Python. What `track` calls is one of two
+interfaces, of which `jaxfilters.trackers.tracker` tells when each is used.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,15 @@
-"""The interface between a tracking system and the application that runs it, and a tracker run from Python."""
+"""The interface between a tracking system and the application that runs it, and a tracker run from Python.
+
+There are two such interfaces. The hands in depth images and in features are a `Tracker`: all that happens to a frame is
+one compiled program, so a chunk of frames is one call, and the state is a pytree of arrays. Heads, people and
+fingertips are a `jaxfilters.trackers.app.stream.Session`, an object with a method for the next frames. They also follow
+live cameras, several of them at different rates, of which some have no image at a moment; and between their compiled
+parts they work on images on the host, with OpenCV: undistortion, background subtraction, connected components,
+detectors of faces and hands. What these find decides which program is next, and how many rows a frame has. As a pure
+function a session would be one program that calls back to the host in every frame, which compiles for longer and gains
+nothing. The price is that a session names what it saves (`saved`, `restore`), and that tests, not types, ensure that a
+row depends on no later frame and that a run which was continued equals one that was not interrupted.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
@@ -29,7 +40,12 @@ class Tracker(NamedTuple):
     with the random key in it: it is saved and restored as it is."""
     step: Callable[..., tuple[Any, Any]]
     """`(state, frames, times_s) -> (state, track)` for a chunk of frames: pytrees whose leaves have the frame axis
-    first. Row i of the track depends on frames 0 to i, and on what the tracker was built with, alone."""
+    first. Row i of the track depends on frames 0 to i, and on what the tracker was built with, alone.
+
+    How a track becomes columns is not said by metadata of its fields but by `jaxfilters.trackers.app.results.Columns`:
+    a field of 22 numbers is 22 columns, some columns are computed (standard deviations from a covariance, those along a
+    line of sight from the cameras as well), and names and units depend on the model (fingers, expressions, pixels or
+    metres). Fields of a named tuple have no metadata either."""
 
 
 class HandTrack(NamedTuple):
@@ -41,6 +57,9 @@ class HandTrack(NamedTuple):
     """Standard deviations in the tangent space: position (metres), rotation vector (radians), angles (radians)."""
     joints: Float[Array | np.ndarray, "b 21 3"]
     """Metres: wrist, thumb 1-4, index, middle, ring, little, base to tip."""
+    innovations: Int[Array | np.ndarray, "b 2"]
+    """How many coordinates of the pose the frame has corrected, and how many of these by less than 1.96 of the standard
+    deviations that the filter claims for a correction: 95 % if it is right."""
     effective_sample_size: Float[Array | np.ndarray, " b"]
     """Effective number of particles, from 1 to their number; 0 where too little was read to compare the hand with, NaN
     while it is searched for."""

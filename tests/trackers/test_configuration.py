@@ -6,7 +6,7 @@ from typing import Annotated
 
 import pytest
 
-from jaxfilters.trackers.app.options import add_config, config_from_args
+from jaxfilters.trackers.app.options import _lowered, add_config, config_from_args
 from jaxfilters.trackers.configuration import OneOf, check, settings_of
 
 
@@ -51,6 +51,17 @@ def test_options_that_are_not_given_keep_the_defaults():
 def test_options_reach_their_fields():
     given = _parser().parse_args(["--method", "exact", "--rows", "3", "--gain", "2", "--no-smooth"])
     assert config_from_args(Config(), given) == Config("exact", 3, 2.0, False)
+
+
+def test_lines_of_help_begin_with_a_small_letter_unless_they_begin_with_a_name():
+    for text, expected in (
+        ("Degrees of freedom.", "degrees of freedom."),
+        ("Rao-Blackwellized filter.", "Rao-Blackwellized filter."),
+        ("RGB images.", "RGB images."),
+        ("A", "a"),
+        ("", ""),
+    ):
+        assert _lowered(text) == expected
 
 
 def test_the_help_is_made_of_docstrings_and_defaults():

@@ -7,9 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from jaxfilters.trackers import hand_depth
+from jaxfilters.models.synthetic.hand import kinect_v2, simulate_sequence
+from jaxfilters.trackers import articulated, hand_depth
 from jaxfilters.trackers.app.cli import main
 from jaxfilters.trackers.fingertips.images import estimate_user
+from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.registry import SYSTEMS
 from jaxfilters.trackers.tracker import step_chunk, track_frames
 
@@ -29,6 +31,38 @@ def test_the_same_seed_gives_the_same_track_by_command_and_from_python(npz_file,
     assert main(arguments) == 0
     frames, config = list(recording), hand_depth.HandDepthConfig(seed=3)
     found = hand_depth.track(frames, recording.times_s, recording.camera, config)
+    with np.load(tmp_path / "out" / "track.npz") as saved:
+        for name, array in found._asdict().items():
+            np.testing.assert_array_equal(saved[name], array, err_msg=name)
+
+
+def depth_from_python(folder):
+    """Arguments of the command for eight frames of a moving hand, and their track from Python."""
+    made = simulate_sequence(jax.random.key(1), "B", num_frames=8)
+    file = folder / "hand.npz"
+    np.savez(file, depth_mm=made.depth_mm, K=np.asarray(kinect_v2().matrix(), float), t_us=33_333 * np.arange(8))
+    recording = open_depth(file)
+    config = hand_depth.HandDepthConfig(num_particles=64, seed=3)
+    found = hand_depth.track(list(recording), recording.times_s, recording.camera, config)
+    return ["hand-depth", str(file), "--particles", "64"], found
+
+
+def articulated_from_python(folder):
+    """Arguments of the command for its synthetic sequence, and the track of it from Python."""
+    del folder
+    return ["articulated"], articulated.track_sequence(
+        articulated.synthetic_sequence(3), articulated.ArticulatedConfig(seed=3)
+    )
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("track", [depth_from_python, articulated_from_python])
+def test_the_trackers_themselves_give_the_same_track_by_command_and_from_python(track, tmp_path, monkeypatch):
+    """Of the trackers as they are, bit for bit: the test above has a stand-in whose rows need no search of the hand."""
+    monkeypatch.setenv("XLA_FLAGS", "")  # `main` sets it
+    arguments, found = track(tmp_path)
+    assert main(["track", *arguments, "--seed", "3", "--no-video", "--out", str(tmp_path / "out")]) == 0
+    assert np.isin(found.status, (1, 3)).all()
     with np.load(tmp_path / "out" / "track.npz") as saved:
         for name, array in found._asdict().items():
             np.testing.assert_array_equal(saved[name], array, err_msg=name)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from jaxfilters.trackers.app.argument_types import image_size, seed
 from jaxfilters.trackers.app.compiled import keep_compiled_programs
-from jaxfilters.trackers.app.devices import collect_rarely, keep_freed_memory, use_all_cores
+from jaxfilters.trackers.app.devices import collect_rarely, keep_freed_memory, silence_decoders, use_all_cores
 from jaxfilters.trackers.app.endings import Terminated, ended_by_signals, unforeseen
 from jaxfilters.trackers.app.options import add_picture_options
-from jaxfilters.trackers.app.output_folder import check_free
+from jaxfilters.trackers.app.output_folder import check_file, check_free
 from jaxfilters.trackers.batch.options import add_batch
 from jaxfilters.trackers.calibration.options import add_calibrate
 from jaxfilters.trackers.fitting.options import add_fit
@@ -24,6 +24,8 @@ from jaxfilters.trackers.registry import SYSTEMS, system
 
 FAILURE, UNFORESEEN, INTERRUPTED, TERMINATED = 2, 70, 130, 143
 """Exit codes: wrong input or a full disk; an error of the program itself; Ctrl-C; SIGTERM."""
+_LONGEST = 1000
+"""Characters of an error."""
 
 
 def command() -> int:
@@ -33,6 +35,8 @@ def command() -> int:
     """
     if sys.argv[1:2] != ["bench"] and (trouble := keep_compiled_programs()):
         print(f"jaxfilters: {trouble}.", file=sys.stderr)
+    if "--debug" not in sys.argv:
+        silence_decoders()
     keep_freed_memory()
     collect_rarely()
     return main()
@@ -49,13 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with ended_by_signals():
             import_module("jaxfilters.trackers.app.opencv").check_version()
-            if options.command in ("track", "demo"):
-                check_free(options.out)
-                if options.rerun is not None:
-                    import_module("jaxfilters.trackers.app.rerun_log").check_log(options.rerun)
+            _check_output(options)
             print(_command_of(options)(options))
     except (InputError, OutputError, CheckpointError) as error:
-        print(f"jaxfilters: error: {error}", file=sys.stderr)
+        print(f"jaxfilters: error: {_shortened(str(error))}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt as interrupt:
         word = "terminated" if isinstance(interrupt, Terminated) else "interrupted"
@@ -67,6 +68,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxfilters: error: {unforeseen(error, getattr(options, 'out', None))}", file=sys.stderr)
         return UNFORESEEN
     return 0
+
+
+def _check_output(options: argparse.Namespace) -> None:
+    """Refuse results that cannot be written before anything is read or compiled.
+
+    Raises:
+        InputError: `--rerun` cannot be used.
+        OutputError: nobody can write the results, or another run writes into their folder.
+    """
+    if options.command in ("track", "demo", "batch"):
+        check_free(options.out)
+    else:
+        for path in (options.out, getattr(options, "remember", None)):
+            if path is not None:
+                check_file(path)
+    if getattr(options, "rerun", None) is not None:
+        import_module("jaxfilters.trackers.app.rerun_log").check_log(options.rerun)
+
+
+def _shortened(text: str) -> str:
+    """A message without its middle where it is very long: names of files may be, and what is wrong stands last."""
+    half = _LONGEST // 2
+    return text if len(text) <= _LONGEST else f"{text[:half]}...{text[-half:]}"
 
 
 def _command_of(options: argparse.Namespace) -> Callable[[argparse.Namespace], str]:

@@ -1,4 +1,4 @@
-"""What this machine computes with: one host device per core, chosen before JAX starts, for programs alone."""
+"""Settings of the whole process, for programs alone: a host device per core, memory, and what decoders write."""
 
 import ctypes
 import gc
@@ -6,6 +6,8 @@ import os
 import platform
 from pathlib import Path
 
+_QUIET = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_LOG_LEVEL": "SILENT"}
+"""Settings that OpenCV reads when it is imported; -8 is FFmpeg's AV_LOG_QUIET."""
 _FLAG = "--xla_force_host_platform_device_count"
 _MALLOC = {-3: 32 << 20, -1: 512 << 20, -2: 16 << 20}
 """Of glibc's `mallopt`, bytes: from what size on an array is mapped on its own (the largest allowed), how much free
@@ -37,6 +39,16 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         for parameter, size in _MALLOC.items():
             mallopt(parameter, size)
+
+
+def silence_decoders() -> None:
+    """Let FFmpeg and OpenCV write nothing to standard error: a command says in one line of its own what is wrong.
+
+    Without effect once `cv2` is imported, and where the environment has these settings already. What libpng says of a
+    damaged image cannot be switched off.
+    """
+    for name, value in _QUIET.items():
+        os.environ.setdefault(name, value)
 
 
 def collect_rarely() -> None:

@@ -1,5 +1,6 @@
 """How a command ends before its time: by a signal, or by an error that nobody foresaw."""
 
+import os
 import signal
 import tempfile
 import threading
@@ -46,11 +47,13 @@ def unforeseen(error: Exception, out: Path | None) -> str:
     """
     text = "".join(traceback.format_exception(error))
     report = f"jaxfilters {__version__}\n{text}"
-    places = [] if out is None else [out if out.is_dir() else out.parent]
+    # Not `Path.is_dir`, which raises for a name that is too long.
+    places = [] if out is None else [out if os.path.isdir(out) else out.parent]
     for folder in [*places, Path(tempfile.gettempdir())]:
         path = folder / ERROR_FILE
         try:
-            path.write_text(report)
+            # Names of files may hold bytes that are no text.
+            path.write_text(report, encoding="utf-8", errors="backslashreplace")
         except OSError:
             continue
         break

@@ -42,7 +42,7 @@ def add_config(parser: argparse.ArgumentParser, config: type, *names: str) -> No
     settings = settings_of(config)
     for setting in (settings[name] for name in names):
         flags = [f"--{setting.name.replace('_', '-')}", *filter(None, [_SHORT.get(setting.name)])]
-        text = (setting.meaning[:1].lower() + setting.meaning[1:]).removesuffix(".").replace("%", "%%")
+        text = _lowered(setting.meaning).removesuffix(".").replace("%", "%%")
         if setting.kind is bool:
             parser.add_argument(
                 *flags,
@@ -55,6 +55,12 @@ def add_config(parser: argparse.ArgumentParser, config: type, *names: str) -> No
         parser.add_argument(
             *flags, type=setting.kind, choices=setting.choices or None, metavar=metavar, help=text + default
         )
+
+
+def _lowered(text: str) -> str:
+    """A sentence with a small letter first, as in lines of help, unless it begins as "Rao-Blackwellized" does."""
+    word = text.split(maxsplit=1)[0] if text else ""
+    return text if any(letter.isupper() for letter in word[1:]) else text[:1].lower() + text[1:]
 
 
 def add_recording(parser: argparse.ArgumentParser, what: str) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tempfile
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -43,12 +44,49 @@ def check_free(path: Path) -> None:
     Raises:
         OutputError: Another run writes into it, or nobody can.
     """
-    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-        why = "no permission" if nearest.is_dir() else f"{nearest} is not a folder"
-        raise OutputError(f"cannot write into {path}: {why}.")
-    if (path / LOCK).exists():
+    _check_writable(path, f"cannot write into {path}")
+    if os.path.exists(path / LOCK):
         OutputFolder(path).close()
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file that cannot be written, before what goes into it is computed; neither it nor a folder is made.
+
+    Raises:
+        OutputError: Nobody can write it, or it is a folder.
+    """
+    refused = f"cannot write {path}"
+    if os.path.isdir(path):
+        raise OutputError(f"{refused}: it is a folder.")
+    if not os.path.exists(path):
+        _check_writable(path.parent, refused, path.name)
+    elif os.path.isfile(path):
+        # Pipes and devices are left alone: opening one may wait for whoever reads it.
+        try:
+            with path.open("ab"):
+                pass
+        except OSError as error:
+            raise OutputError(f"{refused}: {reason(error)}.") from None
+
+
+def _check_writable(path: Path, refused: str, *names: str) -> None:
+    """Make a folder of this name, and folders with further `names` in it, where nothing is in their way; remove them.
+
+    Asking for permissions is not enough: all are granted to the superuser, also where a file system takes no files.
+
+    Raises:
+        OutputError: The folder cannot be made, or nothing can be made in it; the message begins with `refused`.
+    """
+    nearest = next(folder for folder in (path, *path.absolute().parents) if os.path.exists(folder))
+    if not os.path.isdir(nearest):
+        raise OutputError(f"{refused}: {nearest} is not a folder.")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".jaxfilters-", dir=nearest) as trial:
+            Path(trial, path.absolute().relative_to(nearest.absolute()), *names).mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError:
+        raise OutputError(f"{refused}: no files can be made in {nearest}.") from None
+    except OSError as error:
+        raise OutputError(f"{refused}: {reason(error)}.") from None
 
 
 def reason(error: OSError) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxfilters.trackers.app.options import VIEWER
-from jaxfilters.trackers.app.output_folder import reason
+from jaxfilters.trackers.app.output_folder import check_file, reason
 from jaxfilters.trackers.app.results import TrackTable
 from jaxfilters.trackers.io.errors import InputError, OutputError
 
@@ -31,8 +31,7 @@ class RerunLog:
             table: Whose columns become time series; those of places and their standard deviations become ellipsoids.
 
         Raises:
-            InputError: as for `check_log`.
-            OutputError: the file cannot be written, or the viewer cannot be started.
+            InputError, OutputError: as for `check_log`, or the viewer cannot be started.
         """
         check_log(to)
         self._rerun: Any = import_module("rerun")
@@ -117,6 +116,7 @@ def check_log(to: str) -> None:
 
     Raises:
         InputError: rerun-sdk is not installed, or the name of the file is not one of the viewer.
+        OutputError: the file cannot be written.
     """
     if to != VIEWER and Path(to).suffix != ".rrd":
         raise InputError(f"--rerun {to}: expected a file whose name ends in .rrd, or nothing for the viewer.")
@@ -124,6 +124,8 @@ def check_log(to: str) -> None:
         import_module("rerun")
     except ImportError:
         raise InputError("--rerun: needs rerun-sdk: pip install 'jaxfilters[viz]'.") from None
+    if to != VIEWER:
+        check_file(Path(to))
 
 
 def open_log(options: argparse.Namespace, table: TrackTable) -> RerunLog | None:

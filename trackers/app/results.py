@@ -86,7 +86,7 @@ class TrackWriter:
         self.frames = self.frames_saved = sum(part.frames for part in done)
         """How many frames were appended so far, and how many of them are in a checkpoint."""
         rows = [("frame", "time_s", *table.columns, "status")]
-        self._write_rows(rows + [row for part in done for row in table.rows(part.first, part.track)], "w")
+        self._write_rows(rows + [row for part in done for row in _rows_of(self._path, part, table)], "w")
 
     @property
     def results(self) -> Any:
@@ -294,6 +294,18 @@ def _read_part(folder: Path, first: int, table: TrackTable) -> _Part:
     if len(lengths) != 1 or frames.ndim or (has_row_a_frame and lengths != {int(frames)}):
         raise CheckpointError(f"{path}: expected rows of {frames} frames in all arrays; got {lengths}.")
     return _Part(first, int(frames), track)
+
+
+def _rows_of(folder: Path, part: _Part, table: TrackTable) -> list[tuple[Any, ...]]:
+    """Rows of `track.csv` of what a file of the checkpoint holds.
+
+    Raises:
+        CheckpointError: shapes or types from which no rows of this table can be made.
+    """
+    try:
+        return list(table.rows(part.first, part.track))
+    except (IndexError, TypeError, ValueError):
+        raise CheckpointError(f"{_part_path(folder, part.first)}: arrays of another tracker.") from None
 
 
 def _joined(tracks: list[Any]) -> Any:

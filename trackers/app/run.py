@@ -16,6 +16,7 @@ from jaxfilters.trackers.app.chunks import Progress, track_recording
 from jaxfilters.trackers.app.progress import ProgressLine
 from jaxfilters.trackers.app.rerun_log import RerunLog, open_log
 from jaxfilters.trackers.app.results import TrackTable, TrackWriter, open_writer, versions
+from jaxfilters.trackers.innovations import contradiction, innovation_share
 from jaxfilters.trackers.io.errors import InputError, OutputError
 from jaxfilters.trackers.io.recording import Recording
 from jaxfilters.trackers.tracker import STATUS_NAMES, Tracker
@@ -125,6 +126,7 @@ def _report(spec: RunSpec, results: Any, errors: Errors, rate: float, seconds: f
         "seconds": round(seconds, 2),
         "status": {name: counts[name] for name in STATUS_NAMES},
         "log_evidence": evidence if math.isfinite(evidence) else None,
+        "innovations": innovation_share(results.innovations).report(),
         **errors,
         "config": dataclasses.asdict(spec.config),
         "versions": versions(),
@@ -138,6 +140,7 @@ def _summary(report: dict[str, Any], errors: Errors, options: argparse.Namespace
         + (f" ({speed:.0f} frames/s once compiled)" if speed else "")
         + "".join(f", {report['status'][name]} {name}" for name in ("lost", "searching"))
         + "".join(f", {_in_words(name, value)}" for name, value in errors.items() if value is not None)
+        + contradiction(report["innovations"])
         + f"\nresults in {options.out}: track.csv, track.npz, report.json, summary.png"
         + (", overlay.mp4" if options.video else "")
     )

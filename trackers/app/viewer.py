@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from jaxfilters.trackers.io.errors import InputError, OutputError
-from jaxfilters.trackers.io.input_files import read_text
+from jaxfilters.trackers.app.output_folder import reason
+from jaxfilters.trackers.io.errors import InputError, OutputError, shown
+from jaxfilters.trackers.io.input_files import exists, read_text
 from jaxfilters.trackers.io.json_files import parse_json
 
 TABLE = "track.csv"
@@ -25,6 +26,8 @@ MOST_PICTURES, MOST_WIDTH, QUALITY = 900, 720, 60
 _UNIT = re.compile(r"_((?:m|mm|rad|px|s)(?:_per_(?:frame|s))?|per_frame)$")
 _NOT_DRAWN = {"frame", "time_s", "hand", "id", "slot"}
 _FALLBACK_FPS = 30.0
+_MOST_FRAMES = 4_000_000
+"""Of a page, which has a time for each: a day and a half of video."""
 
 
 class _Rows(NamedTuple):
@@ -44,6 +47,8 @@ class _Rows(NamedTuple):
 def view(options: argparse.Namespace) -> str:
     """Write the page of a folder of results, open it in a browser if wanted, and say where it is.
 
+    The folder that it is written into is made if need be.
+
     Raises:
         InputError: The folder holds no results, or damaged ones.
         OutputError: The page cannot be written.
@@ -51,9 +56,10 @@ def view(options: argparse.Namespace) -> str:
     out = options.out or options.folder / "view.html"
     text = page_of(options.folder)
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"cannot write {out}: {error.strerror}.") from None
+        raise OutputError(f"cannot write {out}: {reason(error)}.") from None
     if options.open:
         webbrowser.open_new_tab(out.resolve().as_uri())
     return f"{out}: {len(text) / 1e6:.1f} MB"
@@ -90,7 +96,7 @@ def page_of(folder: Path) -> str:
 
 def _read_rows(folder: Path) -> _Rows:
     found, wanted = folder / TABLE, f"expected a folder of results, with {TABLE}"
-    if not found.is_file():
+    if not exists(found):
         raise InputError(f"{folder}: {wanted}.")
     try:
         table = list(csv.reader(read_text(found, wanted).splitlines(), strict=True))
@@ -102,10 +108,13 @@ def _read_rows(folder: Path) -> _Rows:
 
 
 def _integers(rows: _Rows, name: str) -> list[int]:
-    try:
-        return [int(cell) for cell in rows.column(name)]
-    except ValueError as error:
-        raise InputError(f"{name}: expected whole numbers in the table of results; {error}.") from None
+    wanted = f"{name}: expected whole numbers from 0 to {_MOST_FRAMES} in the table of results"
+    found = []
+    for cell in rows.column(name):
+        if not re.fullmatch(r"\d{1,18}", cell, re.ASCII) or int(cell) > _MOST_FRAMES:
+            raise InputError(f"{wanted}; got {shown(cell)}.")
+        found.append(int(cell))
+    return found
 
 
 def _overlays(folder: Path) -> list[tuple[Path, int, int, float]]:
@@ -217,7 +226,7 @@ def _title(stem: str, unit: str, lines: Sequence[dict[str, Any]]) -> str:
 def _report(folder: Path) -> list[list[str]]:
     """Names and values of `report.json`, nested ones with dots; empty while a run goes on."""
     path = folder / "report.json"
-    if not path.is_file():
+    if not exists(path):
         return []
     wanted = "expected the report of a run"
     report = parse_json(read_text(path, wanted), str(path), wanted)

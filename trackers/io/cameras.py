@@ -31,6 +31,9 @@ _WANTED = (
 _ORTHONORMAL = 1e-4
 _HIGHEST_M = 200.0
 """Above the floor: no camera shows people from higher up, and one whose lengths are millimetres stands there."""
+_USUAL_M = (1.0, 20.0)
+"""Heights of cameras, from a tripod to a lamp post or a roof, by which the unit of a file is guessed."""
+_UNITS = {"centimetres": 100.0, "millimetres": 1000.0}
 _WANTED_XML = "expected XML with Geometry, Intrinsic and Extrinsic, parameters of Tsai's model"
 
 
@@ -194,8 +197,15 @@ def _check_height(camera: FloorCamera, path: Path) -> None:
     if not 0 < height_m <= _HIGHEST_M:
         raise InputError(
             f"{path}: the camera stands {height_m:.4g} m above the floor, expected at most {_HIGHEST_M:g} m; P and t "
-            "must be in metres (are they in millimetres?)."
+            f"must be in metres{_likely_unit(height_m)}."
         )
+
+
+def _likely_unit(height: float) -> str:
+    """The question whether lengths are in a smaller unit, of those in which a camera stands at a usual height."""
+    low_m, high_m = _USUAL_M
+    units = [name for name, of_a_metre in _UNITS.items() if low_m <= height / of_a_metre <= high_m]
+    return f" (are they in {' or '.join(units)}?)" if units else ""
 
 
 def _projection(settings: dict[str, Any], K: np.ndarray | None, path: Path) -> np.ndarray:

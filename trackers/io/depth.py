@@ -10,7 +10,7 @@ from jaxfilters.trackers.hand_depth.recording import DepthSequence
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.frame_numbers import frames_of, times_of
 from jaxfilters.trackers.io.images import check_num_pixels, read_image
-from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
+from jaxfilters.trackers.io.input_files import LARGEST, check_rate, exists, is_folder, too_large
 from jaxfilters.trackers.io.json_files import check_intrinsics, read_json, refuse_unknown
 from jaxfilters.trackers.io.npz import ArrayStream, names_in_npz, read_npz
 from jaxfilters.trackers.io.video_input import DEFAULT_FPS
@@ -34,9 +34,9 @@ def open_depth(path: str | Path, *, fps: float | None = None) -> DepthSequence:
     path = Path(path)
     if fps is not None:
         check_rate(fps)
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such file or folder.")
-    if path.is_dir():
+    if is_folder(path):
         return _open_folder(path, fps)
     if path.suffix == ".npz":
         return _open_npz(path, fps)
@@ -79,7 +79,7 @@ def _frame_order(file: Path) -> tuple[int, str]:
 
 def _read_camera_json(file: Path) -> dict[str, Any]:
     wanted = 'expected {"fx", "fy", "cx", "cy"} or {"K"}, in pixels'
-    if not file.exists():
+    if not exists(file):
         raise InputError(f"{file}: missing; {wanted}.")
     settings = read_json(file, wanted)
     refuse_unknown(settings, _CAMERA_KEYS, file)

@@ -7,7 +7,9 @@ deviation of a coordinate from image to image in millimetres across the line of 
 
     {"format": "jaxfilters detector errors", "version": 1, "units": "mm", "detectors": [names], "parameters": {...}}
 
-`jaxfilters fit face-detector` writes them.
+`jaxfilters fit face-detector` writes them. The file of the package was measured on rendered people of the ICT face
+model (Copyright (c) 2020 USC Institute for Creative Technologies, MIT License); it contains statistics and no part of
+that model. The notice of its licence is in the file `NOTICE`.
 """
 
 import json

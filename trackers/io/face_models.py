@@ -134,10 +134,10 @@ def with_sizes(face: MultilinearFace, size_std: float) -> MultilinearFace:
     product = lambda a, b: jnp.matmul(a, b, precision="highest")
     # The same numbers in single and double precision: files of people say which model they are of.
     single = lambda a: np.asarray(a, np.float32).astype(float)
-    mean, tensor, who, expression = map(single, (face.mean, face.tensor, face.identity_mean, face.expression_mean))
+    mean, tensor, identity, expression = map(single, (face.mean, face.tensor, face.identity_mean, face.expression_mean))
     # Of all expressions, a sum of parameters that is about 1 whatever the expression: with it the mean scales as well.
     alike = expression / np.sum(expression**2)
-    scaling = np.einsum("kdsa,s->kda", tensor, who) + mean[..., None] * alike
+    scaling = np.einsum("kdsa,s->kda", tensor, identity) + mean[..., None] * alike
     slope = jax.grad(lambda identity: log_size(face, identity))(face.identity_mean)
     # Whatever size the other parameters change is taken back by the new one.
     joined = jnp.concatenate([jnp.eye(face.num_identities, dtype=slope.dtype), -slope[None]])

@@ -16,7 +16,7 @@ from jaxfilters.trackers.articulated.recording import (
 from jaxfilters.trackers.io import keypoints as keypoint_files
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.images import check_num_pixels
-from jaxfilters.trackers.io.input_files import LARGEST, are_finite, check_rate, too_large
+from jaxfilters.trackers.io.input_files import LARGEST, are_finite, check_rate, exists, is_folder, too_large
 from jaxfilters.trackers.io.npz import names_in_npz, read_npz
 
 FPS = 30.0
@@ -48,12 +48,12 @@ def open_features(
         InputError: an unreadable file, wrong names, shapes, times or noise, or nothing measured.
     """
     path = Path(path)
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such file or folder.")
     if fps is not None:
         check_rate(fps)
     shape = None if image_size is None else (image_size[1], image_size[0])
-    if path.suffix == ".npz" and not path.is_dir():
+    if path.suffix == ".npz" and not is_folder(path):
         return _open_npz(path, shape, noise_px, fps)
     detections = keypoint_files.read(path, hand, fps or FPS)
     points = detections.points

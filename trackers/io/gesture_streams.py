@@ -28,7 +28,7 @@ from jaxfilters.models.gesture.poses import RATE_HZ, PoseTemplate, num_features
 from jaxfilters.models.gesture.streams import Stream, StreamModel
 from jaxfilters.trackers.io.checkpoint import write_npz
 from jaxfilters.trackers.io.errors import InputError, OutputError, shown
-from jaxfilters.trackers.io.input_files import too_large
+from jaxfilters.trackers.io.input_files import LARGEST, is_folder, too_large
 from jaxfilters.trackers.io.npz import read_header, read_npz
 
 FORMAT, VERSION = "jaxfilters gestures in streams", 1
@@ -37,6 +37,7 @@ _WANTED_MODEL = "expected an .npz of `jaxfilters fit gestures --stream`"
 _ARRAYS = ("points", "delta_1e5", "length", "annotations", "seq_id", "gesture", "fps", "names")
 _UNIT = 1e-5
 _CHAIN = ("log_initial", "log_transition", "log_end", "log_stay")
+_FASTEST_HZ = 1e4
 _ROUNDING = 1e-3
 """By which probabilities of a model may miss what they sum to."""
 _NUM_LEAVES = 2 + 2 * len(DILATIONS) + 2
@@ -57,7 +58,7 @@ def read_streams(path: Path) -> StreamSet:
     Raises:
         InputError: a file that cannot be read or does not fit the others, or a folder without one.
     """
-    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    files = sorted(path.glob("*.npz")) if is_folder(path) else [path]
     if not files:
         raise InputError(f"{path}: no file .npz in this folder; {_WANTED}.")
     parts = [_read(file) for file in files]
@@ -75,15 +76,16 @@ def _read(path: Path) -> tuple[list[Stream], list[str]]:
     arrays = read_npz(path, _WANTED, _ARRAYS)
     points = _points(arrays, path)
     lengths = np.atleast_1d(arrays.get("length", np.array(len(points))))
-    if lengths.dtype.kind not in "iu" or lengths.ndim != 1 or np.any(lengths < 1) or lengths.sum() != len(points):
-        raise InputError(f"{path}: length must be frames of streams, {len(points)} together; got {lengths.sum()}.")
+    is_whole = lengths.dtype.kind in "iu" and lengths.ndim == 1
+    # As Python's integers, which do not overflow.
+    if not is_whole or np.any(lengths < 1) or sum(lengths.tolist()) != len(points):
+        got = shown(lengths.tolist())
+        raise InputError(f"{path}: length must be frames of streams, {len(points)} together; got {got}.")
     firsts = np.cumsum(lengths) - lengths
     pieces = [points[first : first + length] for first, length in zip(firsts, lengths, strict=True)]
     if "points" not in arrays:
         pieces = [_UNIT * np.cumsum(piece, axis=0) for piece in pieces]
-    rate = float(np.asarray(arrays.get("fps", RATE_HZ)).reshape(-1)[0])
-    if not 0 < rate < 1e4:
-        raise InputError(f"{path}: fps must be frames a second, above 0; got {rate}.")
+    rate = _rate(arrays.get("fps", np.asarray(RATE_HZ)), path)
     rows = _annotations(arrays, lengths, path)
     numbers = sorted({row[1] for row in rows})
     words = [str(word) for word in np.atleast_1d(arrays.get("names", np.array([])))]
@@ -109,7 +111,21 @@ def _points(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
         raise InputError(f"{path}: without points; {_WANTED}.")
     if points.dtype.kind not in "iuf" or points.ndim != 3 or points.shape[2] not in (2, 3) or not points.size:
         raise InputError(f"{path}: points must be numbers (F, J, 2 or 3); got {points.shape} {points.dtype}.")
+    if (wrong := too_large(points)).any():
+        got = points[wrong][0]
+        raise InputError(f"{path}: points must be numbers of at most {LARGEST:g}, or NaN; got {got}.")
     return points.astype(float)
+
+
+def _rate(fps: np.ndarray, path: Path) -> float:
+    """Frames a second, the same of all streams."""
+    rates = np.unique(fps)
+    if fps.dtype.kind not in "iuf" or len(rates) != 1 or not 0 < rates[0] < _FASTEST_HZ:
+        got = shown(fps.tolist())
+        raise InputError(
+            f"{path}: fps must be one number of frames a second, above 0, below {_FASTEST_HZ:g}; got {got}."
+        )
+    return float(rates[0])
 
 
 def _annotations(arrays: dict[str, np.ndarray], lengths: np.ndarray, path: Path) -> list[tuple[int, int, int, int]]:
@@ -117,10 +133,12 @@ def _annotations(arrays: dict[str, np.ndarray], lengths: np.ndarray, path: Path)
     if "annotations" in arrays:
         table = arrays["annotations"]
         numbers = arrays.get("seq_id", np.arange(len(lengths)))
-        if table.ndim != 2 or table.shape[1] != 4 or table.dtype.kind not in "iu" or numbers.shape != lengths.shape:
+        are_whole = table.dtype.kind in "iu" and numbers.dtype.kind in "iu"
+        if table.ndim != 2 or table.shape[1] != 4 or not are_whole or numbers.shape != lengths.shape:
             raise InputError(
                 f"{path}: annotations must be integers (m, 4), rows of stream, gesture, first and last frame; "
-                f"got {table.shape} {table.dtype}, of {len(lengths)} streams and seq_id {numbers.shape}."
+                f"got {table.shape} {table.dtype}, of {len(lengths)} streams and seq_id {numbers.shape} "
+                f"{numbers.dtype}."
             )
         place = {int(number): i for i, number in enumerate(numbers)}
         rows = [(place[int(s)], int(g), int(a), int(b)) for s, g, a, b in table if int(s) in place]

@@ -23,9 +23,12 @@ def images_in(folder: Path) -> list[Path]:
     """The pictures of a folder in the order of their names.
 
     Raises:
-        InputError: there are none.
+        InputError: there are none, or the folder cannot be read.
     """
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    try:
+        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); expected a folder of images.") from None
     if not files:
         raise InputError(f"{folder}: no images in it ({', '.join(sorted(_SUFFIXES))}).")
     return files

@@ -1,6 +1,7 @@
 """The content of files of unknown origin: regular files only, and none larger than what is expected."""
 
 import math
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,6 +12,16 @@ from jaxfilters.trackers.io.errors import InputError
 MOST_BYTES = 256 * 2**20
 LARGEST = 1e12
 """Of any number that is read: products of three remain finite in single precision."""
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a file or a folder; False for names that no file system takes, at which `Path.exists` raises."""
+    return os.path.exists(path)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether the path is a folder; False for names that no file system takes, at which `Path.is_dir` raises."""
+    return os.path.isdir(path)
 
 
 def check_regular(path: Path, wanted: str) -> int:

@@ -95,8 +95,12 @@ def numbers_of(settings: dict[str, Any], entry: str, shape: tuple[int, ...], pla
     except (TypeError, ValueError):
         got = shown(settings[entry])
         raise InputError(f"{place}: {entry} must be numbers of shape {shape}; got {got}.") from None
-    if value.shape != shape or not np.isfinite(value).all():
+    if value.shape != shape:
         raise InputError(f"{place}: {entry} must be finite numbers of shape {shape}; got shape {value.shape}.")
+    wrong = np.argwhere(~np.isfinite(value))
+    if len(wrong):
+        where = "".join(f"[{i}]" for i in wrong[0])
+        raise InputError(f"{place}: {entry} must be finite numbers; got {value[tuple(wrong[0])]} at {entry}{where}.")
     if not are_finite(value):
         raise InputError(f"{place}: {entry} must be numbers of at most {LARGEST:g}; got {np.abs(value).max():.3g}.")
     return value

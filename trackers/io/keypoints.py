@@ -17,7 +17,7 @@ import numpy as np
 from jaxfilters.trackers.articulated.recording import NUM_KEYPOINTS
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
 from jaxfilters.trackers.io.frame_numbers import frames_of, times_of
-from jaxfilters.trackers.io.input_files import LARGEST, check_rate, too_large
+from jaxfilters.trackers.io.input_files import LARGEST, check_rate, is_folder, too_large
 from jaxfilters.trackers.io.json_files import read_json_value
 from jaxfilters.trackers.io.tables import Columns, read_table
 
@@ -61,7 +61,7 @@ def read(path: Path, hand: str, fps: float) -> Detections:
         InputError: the file is damaged or of another form, or shows several hands at once.
     """
     check_rate(fps)
-    if path.is_dir():
+    if is_folder(path):
         return _read_openpose(path, hand, fps)
     readers: dict[str, Callable[[Path, float], Detections]] = {".json": _read_mediapipe, ".csv": _read_table}
     if path.suffix not in readers:
@@ -98,7 +98,7 @@ def read_hands(path: Path, fps: float) -> HandDetections:
         InputError: the file is damaged or of another form, or shows no hand.
     """
     check_rate(fps)
-    if path.is_dir():
+    if is_folder(path):
         files, numbers = _openpose_files(path)
         frames = [[hand for side in ("right", "left") for hand in _openpose_hands(file, side)] for file in files]
         values = _stacked(frames)

@@ -9,7 +9,7 @@ landmarks). Without it they are taken to be so already.
 
 A folder holds one CSV file for each person, with the columns `expression,name,x_mm,y_mm,z_mm` and a row for each
 landmark of each expression that there is; names are those of the ten landmarks, or numbers from 0 to 67. An expression
-called `neutral` is the one that faces are aligned to.
+called `neutral`, in capital letters or small ones, is the one that faces are aligned to.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from jaxfilters.models.face.landmarks import FROM_68, NAMES
 from jaxfilters.models.face.mirroring import PAIRS, PAIRS_68, Pairs, mirror_map
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
-from jaxfilters.trackers.io.input_files import too_large
+from jaxfilters.trackers.io.input_files import exists, is_folder, too_large
 from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.io.tables import exactly, read_table
 
@@ -56,9 +56,9 @@ def read_landmark_sets(path: Path) -> LandmarkSets:
         InputError: an unreadable file, wrong shapes, names or numbers, faces of which only a part is there, or
             landmarks of which left and right are not known.
     """
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such file or folder.")
-    sets = _of_folder(path) if path.is_dir() else _of_npz(path)
+    sets = _of_folder(path) if is_folder(path) else _of_npz(path)
     shapes = sets.shapes
     partly = np.isnan(shapes).any(axis=(2, 3)) & ~np.isnan(shapes).all(axis=(2, 3))
     if partly.any() or too_large(shapes).any():
@@ -143,7 +143,7 @@ def _of_folder(folder: Path) -> LandmarkSets:
     for person, points in enumerate(people):
         for (expression, name), point in points.items():
             shapes[person, expressions.index(expression), names.index(name)] = point
-    neutral = expressions.index("neutral") if "neutral" in expressions else None
+    neutral = next((i for i, name in enumerate(expressions) if name.casefold() == "neutral"), None)
     return LandmarkSets(shapes, names, pairs, neutral)
 
 

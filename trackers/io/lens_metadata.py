@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.images import images_in
-from jaxfilters.trackers.io.input_files import open_bytes
+from jaxfilters.trackers.io.input_files import is_folder, open_bytes
 
 QUICKTIME_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 """In a video's or a track's metadata: an integer, or text such as `26.00mm` (Apple, "QuickTime metadata keys")."""
@@ -43,7 +43,7 @@ def equivalent_focal_mm(path: Path) -> float | None:
         path: A video (MP4 or QuickTime), a picture (JPEG or TIFF), or a folder of pictures, of which the first counts.
     """
     try:
-        file = images_in(path)[0] if path.is_dir() else path
+        file = images_in(path)[0] if is_folder(path) else path
         with open_bytes(file, "expected a video or a picture") as stream:
             start = stream.read(12)
             stream.seek(0)

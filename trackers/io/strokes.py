@@ -25,7 +25,7 @@ from jaxfilters.models.gesture.codes import MOST_TIPS
 from jaxfilters.models.gesture.stroke import Drawn
 from jaxfilters.trackers.io import inkml, stroke_json
 from jaxfilters.trackers.io.errors import InputError, shortened, shown
-from jaxfilters.trackers.io.input_files import LARGEST, too_large
+from jaxfilters.trackers.io.input_files import LARGEST, exists, is_folder, too_large
 from jaxfilters.trackers.io.npz import read_npz
 from jaxfilters.trackers.io.tables import Columns, Table, read_table
 from jaxfilters.trackers.io.unipen import SUFFIXES, read_unipen
@@ -137,9 +137,9 @@ def _fault(pieces: Sequence[np.ndarray], name: str, path: str, place: Callable[[
 
 
 def _read(path: Path) -> StrokeSet:
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such file or folder.")
-    if path.is_dir():
+    if is_folder(path):
         return _of_folder(path)
     if path.suffix.lower() == ".npz":
         return _of_npz(path)

@@ -14,11 +14,13 @@ import numpy as np
 
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.images import check_num_pixels, images_in, read_image
-from jaxfilters.trackers.io.input_files import check_rate, check_regular
+from jaxfilters.trackers.io.input_files import check_rate, check_regular, exists, is_folder
 
 DEFAULT_FPS = 30.0
 _Item = TypeVar("_Item")
 _SLOWEST_FPS, _FASTEST_FPS = 1e-3, 1e6
+_MOST_DIGITS = 4
+"""Of a live camera's number: OpenCV's largest ones, which begin with that of a backend, have as many."""
 SILENT_S = 2.0
 """A live camera that delivers nothing for so long has stopped."""
 
@@ -49,7 +51,7 @@ def open_video(place: str, *, fps: float | None = None) -> VideoSource:
     """A video file, a folder of images, or the number of a live camera.
 
     Args:
-        place: A path, or a number such as 0.
+        place: A path, or a number such as 0. Longer numbers, such as times, name files and folders.
         fps: Frames per second of a recording, in place of what it says of itself.
 
     Raises:
@@ -57,13 +59,14 @@ def open_video(place: str, *, fps: float | None = None) -> VideoSource:
     """
     if fps is not None:
         check_rate(fps)
-    if place.isdecimal():
+    if re.fullmatch(rf"\d{{1,{_MOST_DIGITS}}}", place, re.ASCII):
         return LiveCamera(int(place))
     path = Path(place)
-    if path.is_dir():
+    if is_folder(path):
         return ImageFolder(path, fps or DEFAULT_FPS)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; a live camera is given by its number, as in 0.")
+    if not exists(path):
+        number = f"its number, of at most {_MOST_DIGITS} digits, as in 0"
+        raise InputError(f"{path}: no such file or folder; a live camera is given by {number}.")
     return VideoFile(path, fps)
 
 
@@ -200,8 +203,8 @@ class LiveCamera:
     def __init__(self, number: int):
         self.name = f"camera {number}"
         self._capture = cv2.VideoCapture(number)
-        there, image = self._capture.read()
-        if not there:
+        image = _next_image(self._capture)
+        if image is None:
             self._capture.release()
             raise InputError(f"{self.name}: cannot be opened, or delivers no image.")
         self.image_size = (image.shape[1], image.shape[0])
@@ -232,8 +235,8 @@ class LiveCamera:
 
     def _follow(self) -> None:
         while not self._over.is_set():
-            there, image = self._capture.read()
-            if not there:
+            image = _next_image(self._capture)
+            if image is None:
                 time.sleep(0.05)
                 continue
             with self._lock:

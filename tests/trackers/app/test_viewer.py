@@ -71,7 +71,12 @@ def test_people_have_a_plan_and_a_line_each(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", [None, "", "a,b\n1,2", "frame,x_m\n0", "frame,x_m\n0.5,1", 'frame,x_m\n0,"1'], ids=lambda text: repr(text)
+    "text",
+    [
+        *(None, "", "a,b\n1,2", "frame,x_m\n0", "frame,x_m\n0.5,1", 'frame,x_m\n0,"1'),
+        *("frame,x_m\n-1,1", "frame,x_m\n999999999999,1", f"frame,x_m\n{'9' * 5000},1"),
+    ],
+    ids=range(9),
 )
 def test_what_holds_no_results_is_refused(text, tmp_path, capsys):
     if text is not None:
@@ -80,6 +85,19 @@ def test_what_holds_no_results_is_refused(text, tmp_path, capsys):
     message = capsys.readouterr().err
     assert (code, message.count("\n")) == (2, 1), message
     assert not (tmp_path / "view.html").exists()
+
+
+def test_the_folder_of_a_page_is_made(tmp_path):
+    page = tmp_path / "new" / "deeper" / "a.html"
+    assert main(["view", str(write_results(tmp_path / "run")), "--no-open", "--out", str(page)]) == 0
+    assert data_of(page.read_text())["title"] == "run"
+
+
+def test_a_folder_whose_name_is_too_long_holds_no_results(capsys):
+    assert main(["view", "n" * 3000, "--no-open"]) == 2
+    message = capsys.readouterr().err
+    assert message.endswith("nnn: expected a folder of results, with track.csv.\n")
+    assert len(message) < 1100
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

@@ -89,8 +89,14 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, capsys):
         ({"annotations": [[0, 5, 0, 10]]}, "gestures from 0 to 1"),
         ({"annotations": [[0, 1, 200, 210]]}, "lie in their streams"),
         ({"annotations": [[0, 1, 2]]}, "annotations must be integers"),
-        ({"fps": 0}, "fps"),
+        ({"length": np.array([2**63 - 1, 2**63 - 1])}, "length must be frames"),
+        ({"fps": 0}, "fps must be one number"),
+        ({"fps": []}, "fps must be one number"),
+        ({"fps": "abc"}, "fps must be one number"),
+        ({"fps": [20.0, 30.0]}, "fps must be one number"),
+        ({"seq_id": [0.5, np.nan]}, "annotations must be integers"),
         ({"points": np.zeros((300, 4))}, "points must be numbers"),
+        ({"points": np.full((300, 1, 2), np.inf)}, "points must be numbers of at most 1e"),
     ],
 )
 def test_a_file_of_streams_that_fits_nothing_is_refused(tmp_path, changed, words):

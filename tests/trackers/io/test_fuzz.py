@@ -2,6 +2,10 @@
 
 A file is made from a valid one by `mutated`, with a generator of random numbers that its format and its number seed:
 `mutated_file(name, number)` makes the same file again.
+
+Not by hypothesis: what is mutated is the structure of a file (entries of an archive, headers of arrays, words of a
+line), which would have to be written all the same; a number names a file without a database of examples, whatever is
+installed; and what hypothesis adds, smaller examples, is worth little where a traceback names the line that fails.
 """
 
 import io
@@ -23,12 +27,21 @@ import jax
 import numpy as np
 import pytest
 
+from jaxfilters.hmm import SemiMarkovModel
+from jaxfilters.models.gesture.frame_classifier import DILATIONS, KERNEL, FrameClassifier
+from jaxfilters.models.gesture.poses import PoseTemplate, num_features
+from jaxfilters.models.gesture.streams import StreamModel
 from jaxfilters.models.tsai import calibration_of_tsai
+from jaxfilters.trackers.app import results
+from jaxfilters.trackers.app.results import Columns, TrackTable
+from jaxfilters.trackers.app.viewer import page_of
+from jaxfilters.trackers.batch.manifest import read_manifest
 from jaxfilters.trackers.calibration.command import read_room_points
 from jaxfilters.trackers.io import checkpoint
 from jaxfilters.trackers.io.cameras import open_camera, open_intrinsics, read_tsai
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.detections import read_detections
+from jaxfilters.trackers.io.detector_errors import DetectorErrors, load_detector_errors, save_detector_errors
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
 from jaxfilters.trackers.io.errors import CheckpointError, InputError
 from jaxfilters.trackers.io.face_models import DEFAULT_FILE as FACE_MODEL
@@ -36,10 +49,12 @@ from jaxfilters.trackers.io.face_models import default_face_model, load_face_mod
 from jaxfilters.trackers.io.features import open_features
 from jaxfilters.trackers.io.gesture_models import DEFAULT_FILE as SYMBOLS
 from jaxfilters.trackers.io.gesture_models import read_symbols
+from jaxfilters.trackers.io.gesture_streams import read_stream_model, read_streams, write_stream_model
 from jaxfilters.trackers.io.ict import open_ict
 from jaxfilters.trackers.io.images import read_image
 from jaxfilters.trackers.io.landmark_sets import read_landmark_sets
 from jaxfilters.trackers.io.landmarks import read_landmarks
+from jaxfilters.trackers.io.lens_metadata import QUICKTIME_KEY, equivalent_focal_mm
 from jaxfilters.trackers.io.points import read_points
 from jaxfilters.trackers.io.rigs import open_rig
 from jaxfilters.trackers.io.scenes import open_scene
@@ -217,6 +232,152 @@ def ict_files(folder: Path) -> list[Path]:
     return [folder / "ict_face9409.npz", folder / "ict_landmarks68.npz"]
 
 
+PYRAMID = {
+    "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvn 0 0 1\nf 1 2 3\nf 1//1 2//1 4//1\nf 2 3 4\n",
+    "off": "OFF\n4 3 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n3 1 2 3\n",
+    "ply": "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n3 1 2 3\n",
+}
+
+
+def scene_with(name: str, content: bytes) -> Callable[[Path], list[Path]]:
+    """A scene of one mesh, of which the file of the mesh is mutated; the reader is given the scene beside it."""
+
+    def write(folder: Path) -> list[Path]:
+        (folder / "scene.json").write_text(json.dumps({"floor": [[0, 0], [5, 0], [5, 4], [0, 4]], "meshes": [name]}))
+        (folder / name).write_bytes(content)
+        return [folder / name]
+
+    return write
+
+
+def binary_ply() -> bytes:
+    header = PYRAMID["ply"].replace("ascii", "binary_little_endian").partition("end_header\n")
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4").tobytes()
+    return (
+        (header[0] + header[1]).encode()
+        + vertices
+        + b"".join(struct.pack("<Biii", 3, *face) for face in ((0, 1, 2), (0, 1, 3), (1, 2, 3)))
+    )
+
+
+def binary_stl() -> bytes:
+    corners = np.array([[0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]], "<f4")
+    return bytes(80) + struct.pack("<I", 2) + b"".join(one.tobytes() + bytes(2) for one in corners)
+
+
+def box(kind: bytes, *content: bytes) -> bytes:
+    body = b"".join(content)
+    return struct.pack(">I4s", 8 + len(body), kind) + body
+
+
+def phone_video(folder: Path) -> list[Path]:
+    """The boxes of a video that says its lens; no images are needed for that."""
+    keys = box(b"keys", struct.pack(">II", 0, 1), box(b"mdta", QUICKTIME_KEY))
+    item = box(struct.pack(">I", 1), box(b"data", struct.pack(">II", 22, 0), struct.pack(">I", 26)))
+    meta = box(b"meta", box(b"hdlr", bytes(24)), keys, box(b"ilst", item))
+    (folder / "a.mp4").write_bytes(
+        box(b"ftyp", b"mp42", bytes(4)) + box(b"mdat", bytes(40)) + box(b"moov", box(b"trak", meta))
+    )
+    return [folder / "a.mp4"]
+
+
+def exif_picture(folder: Path) -> list[Path]:
+    """A TIFF structure whose first directory names that of EXIF, in which the lens is."""
+    entry = lambda tag, kind, value: struct.pack("<HHIHH", tag, kind, 1, value, 0)
+    content = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 1) + entry(0x8769, 4, 26) + bytes(4)
+    (folder / "a.tif").write_bytes(content + struct.pack("<H", 1) + entry(0xA405, 3, 28) + bytes(4))
+    return [folder / "a.tif"]
+
+
+def exif_jpeg(folder: Path) -> list[Path]:
+    (jpeg,) = pictures(".jpg")(folder)
+    (exif,) = exif_picture(folder)
+    body = b"Exif\0\0" + exif.read_bytes()
+    data = jpeg.read_bytes()
+    jpeg.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(body)) + body + data[2:])
+    return [jpeg]
+
+
+def detector_errors(folder: Path) -> list[Path]:
+    root = np.random.default_rng(2).normal(0, 1, (30, 30))
+    errors = DetectorErrors(np.ones((10, 3)), root @ root.T, np.full(10, 0.5), np.eye(6)[:, :3])
+    save_detector_errors(folder / "a.npz", {"own": errors}, {"people": 3})
+    return [folder / "a.npz"]
+
+
+def stream_model(folder: Path) -> list[Path]:
+    """A model of two gestures of three points with weights of zero."""
+    template = PoseTemplate(np.eye(3), np.full(3, 1 / 3), np.array([1, 2]), 1.0, 1.0, 1.0)
+    inputs, width, classes = num_features(template), 4, 3
+    layers = tuple(
+        (np.zeros((KERNEL, inputs if i == 0 else width, width)), np.zeros(width)) for i in range(len(DILATIONS))
+    )
+    classifier = FrameClassifier(
+        np.zeros(inputs), np.ones(inputs), layers, (np.zeros((width, classes)), np.zeros(classes))
+    )
+    halves = np.full((classes, 5), np.log(0.5))
+    durations = SemiMarkovModel(
+        np.full(classes, -np.log(3)), np.full((classes, classes), -np.log(3)), halves, halves.copy()
+    )
+    write_stream_model(folder / "a.npz", StreamModel(("a", "b"), template, classifier, durations), "test")
+    return [folder / "a.npz"]
+
+
+MANIFEST = [
+    {"name": "one", "tracker": "hand-depth", "input": "a.npz", "options": "--particles 64 --seed 3"},
+    {"name": "two", "tracker": "people", "input": ["a.mp4", "b.mp4"], "options": ["--scene", "scene.json"]},
+]
+
+
+class Rows(NamedTuple):
+    """Of one object in the plane."""
+
+    times_s: np.ndarray
+    xy: np.ndarray
+    std: np.ndarray
+    status: np.ndarray
+
+
+ROWS = Rows(np.arange(6) / 30, np.ones((6, 2)), np.full((6, 2), 0.1), np.array([0, 1, 1, 2, 3, 1]))
+ROWS_TABLE = TrackTable(
+    Rows, (Columns(("x_m", "y_m"), lambda rows: rows.xy), Columns(("x_std_m", "y_std_m"), lambda rows: rows.std))
+)
+
+
+def interrupted_run(folder: Path) -> list[Path]:
+    writer = results.begin(folder, {"seed": 1}, ROWS_TABLE, overwrite=True)
+    for part in (slice(0, 4), slice(4, 6)):
+        rows = Rows(*(column[part] for column in ROWS))
+        writer.append_rows(len(rows.times_s), rows)
+        writer.checkpoint(np.zeros(2))
+    writer.close()
+    return sorted((folder / "checkpoint").glob("rows_*.npz"))
+
+
+def resumed_rows(path: Path) -> Any:
+    """As `--resume` reads them; a track may hold any numbers."""
+    writer, _ = results.resume(path.parents[1], {"seed": 1}, ROWS_TABLE)
+    try:
+        return str(writer.results)
+    finally:
+        writer.close()
+
+
+def finished_run(folder: Path) -> list[Path]:
+    writer = results.begin(folder, {"seed": 1}, ROWS_TABLE, overwrite=True)
+    writer.append_rows(6, ROWS)
+    writer.finish({"input": "a", "status": {"lost": 1}, "rate": None, "seconds": 1.5})
+    writer.close()
+    return [*[folder / "track.csv"] * 3, folder / "report.json"]
+
+
+def page_numbers(path: Path) -> Any:
+    page = page_of(path.parent)
+    return json.loads(page.partition('<script id="data" type="application/json">')[2].partition("</script>")[0])
+
+
 def camera_numbers(path: Path) -> Any:
     _, camera, undistortion = open_camera(path)
     return camera.P, np.asarray(camera.P, np.float32), undistortion.K, undistortion.distortion
@@ -230,6 +391,10 @@ def rig_numbers(path: Path) -> Any:
 def scene_numbers(path: Path) -> Any:
     scene = open_scene(path)
     return np.asarray(scene.floor, np.float32), scene.patches, [mesh.vertices for mesh in scene.meshes], scene.outlines
+
+
+def mesh_numbers(path: Path) -> Any:
+    return [np.asarray(mesh.vertices) for mesh in open_scene(path.with_name("scene.json")).meshes]
 
 
 def scene_files(folder: Path) -> list[Path]:
@@ -371,6 +536,45 @@ FORMATS = {
     "tiff": Format(pictures(".tiff"), read_image),
     "avi": Format(video(".avi", "MJPG"), lambda path: [list(open_video(str(path)).images())]),
     "mp4": Format(video(".mp4", "mp4v"), lambda path: [list(open_video(str(path)).images())]),
+    "gesture streams": Format(
+        npz_file(
+            points=RNG.normal(size=(12, 3, 2)),
+            length=np.array([5, 7]),
+            annotations=np.array([[0, 1, 0, 3], [1, 0, 2, 6]]),
+            names=np.array(["right", "up"]),
+            fps=np.asarray(20.0),
+        ),
+        lambda path: [stream.points for stream in read_streams(path).streams],
+        may_lack=True,
+    ),
+    "gesture differences": Format(
+        npz_file(
+            delta_1e5=RNG.integers(-99, 99, (3, 4, 12)).astype(np.int32),
+            length=np.array([5, 7]),
+            seq_id=np.array([3, 8]),
+            gesture=np.array([1, 2]),
+        ),
+        lambda path: [stream.points for stream in read_streams(path).streams],
+    ),
+    "stream model": Format(stream_model, lambda path: read_stream_model(path)[1:3]),
+    "lens of a video": Format(phone_video, equivalent_focal_mm),
+    "lens of a tiff": Format(exif_picture, equivalent_focal_mm),
+    "lens of a jpeg": Format(exif_jpeg, equivalent_focal_mm),
+    "detector errors": Format(detector_errors, load_detector_errors),
+    "manifest.json": Format(json_file("a.json", MANIFEST), read_manifest),
+    "manifest.csv": Format(
+        table(
+            "name,tracker,input,options", [("one", "hand-depth", "a.npz", "--seed 3"), ("two", "articulated", "", "")]
+        ),
+        read_manifest,
+    ),
+    "mesh.obj": Format(scene_with("a.obj", PYRAMID["obj"].encode()), mesh_numbers),
+    "mesh.off": Format(scene_with("a.off", PYRAMID["off"].encode()), mesh_numbers),
+    "mesh.ply": Format(scene_with("a.ply", PYRAMID["ply"].encode()), mesh_numbers),
+    "binary mesh.ply": Format(scene_with("a.ply", binary_ply()), mesh_numbers),
+    "binary mesh.stl": Format(scene_with("a.stl", binary_stl()), mesh_numbers),
+    "rows": Format(interrupted_run, resumed_rows),
+    "page of results": Format(finished_run, page_numbers),
     # A state may hold any numbers; it is read as it was written.
     "checkpoint": Format(saved_state, lambda path: str(checkpoint.load(path))),
 }
@@ -443,7 +647,8 @@ def mutated_json(rng: np.random.Generator, data: bytes) -> bytes:
 
 def mutated_text(rng: np.random.Generator, data: bytes) -> bytes:
     """Words of lines replaced, lines removed, repeated and swapped; words end at spaces, commas and quotation marks."""
-    lines = data.decode().split("\n")
+    # Meshes may have a header of lines before numbers that are no text.
+    lines = data.decode(errors="surrogateescape").split("\n")
     for _ in range(rng.integers(1, 4)):
         i = int(rng.integers(len(lines)))
         match rng.integers(8):
@@ -459,7 +664,7 @@ def mutated_text(rng: np.random.Generator, data: bytes) -> bytes:
                 words = lines[i].split(mark)
                 words[int(rng.integers(len(words)))] = TOKENS[int(rng.integers(len(TOKENS)))]
                 lines[i] = mark.join(words)
-    return "\n".join(lines).encode()
+    return "\n".join(lines).encode(errors="surrogateescape")
 
 
 def mutated_array(rng: np.random.Generator, array: np.ndarray) -> np.ndarray:
@@ -556,6 +761,9 @@ MUTATIONS = {
     ".xml": mutated_text,
     ".unipen": mutated_text,
     ".stl": mutated_text,
+    ".obj": mutated_text,
+    ".off": mutated_text,
+    ".ply": mutated_text,
     ".png": mutated_png,
 }
 """By the format's structure; a third of the files, and those of other suffixes, have their bytes changed."""

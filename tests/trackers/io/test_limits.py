@@ -5,6 +5,8 @@ import os
 import re
 import struct
 import threading
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +17,9 @@ from jaxfilters.trackers.io.checkpoint import load_meta
 from jaxfilters.trackers.io.depth import open_depth
 from jaxfilters.trackers.io.errors import CheckpointError, InputError, shortened, shown
 from jaxfilters.trackers.io.features import open_features
+from jaxfilters.trackers.io.gesture_streams import read_streams
 from jaxfilters.trackers.io.images import read_image
+from jaxfilters.trackers.io.landmark_sets import read_landmark_sets
 from jaxfilters.trackers.io.landmarks import read_landmarks
 from jaxfilters.trackers.io.paired_input import PairedInput
 from jaxfilters.trackers.io.points import read_points
@@ -40,7 +44,13 @@ def described(tmp_path, settings, name="a.json"):
     [
         ({"image_size": [40000, 40000]}, "image_size: 40000x40000 pixels; at most 128 million"),
         ({"image_size": [True, 120]}, "two positive integers"),
-        ({"t": [1000, 3500, 1200]}, r"stands 3520 m above the floor, expected at most 200 m.*millimetres\?"),
+        (
+            {"t": [1000, 3500, 1200]},
+            r"stands 3520 m above the floor, expected at most 200 m.*[(]are they in millimetres\?",
+        ),
+        ({"t": [100, 350, 120]}, r"stands 352 m above the floor.*[(]are they in centimetres\?"),
+        ({"t": [500, 1750, 600]}, r"stands 1760 m above the floor.*[(]are they in centimetres or millimetres\?"),
+        ({"t": [1e5, 3.5e5, 1.2e5]}, r"P and t must be in metres\.$"),
         ({"t": [0, 0, 1e30]}, "t must be numbers of at most 1e[+]12; got 1e[+]30"),
         ({"K": [[1e8, 0, 80], [0, 1e8, 60], [0, 0, 1]]}, "fx and fy must be from 1 to 1e[+]06 pixels"),
         ({"K": [[1e-320, 0, 80], [0, 139, 60], [0, 0, 1]]}, "fx and fy must be from 1"),
@@ -302,6 +312,59 @@ def test_a_sample_keeps_few_images_whatever_the_header_claims(long_video, monkey
     assert [int(image[0, 0, 0]) for image in sample] == [
         every[i] % 200 for i in np.linspace(0, len(every) - 1, 20).round().astype(int)
     ]
+
+
+@pytest.mark.parametrize("number", ["9" * 30, "9" * 5000, "12345", "\u0663"], ids=len)
+def test_a_camera_number_that_no_camera_has_is_a_name_of_nothing(number):
+    with pytest.raises(InputError, match="no such file or folder; a live camera is given by its number, of at most 4"):
+        open_video(number)
+
+
+def test_a_camera_that_opencv_refuses_is_named(monkeypatch):
+    def refuse(number):
+        return SimpleNamespace(read=lambda: cv2.VideoCapture("a", "b"), release=lambda: None)
+
+    real = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *place: real(*place) if len(place) > 1 else refuse(*place))
+    with pytest.raises(InputError, match="camera 7: cannot be opened, or delivers no image"):
+        open_video("7")
+
+
+def test_times_name_a_folder_of_images_and_no_camera(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "1403636579763555584").mkdir()
+    assert cv2.imwrite("1403636579763555584/1.png", np.zeros((4, 6, 3), np.uint8))
+    assert open_video("1403636579763555584").image_size == (6, 4)
+
+
+LONG = "n" * 3000
+"""Longer than any file system takes, at which `Path.exists` raises."""
+OPENERS = {
+    "video": lambda: open_video(LONG),
+    "depth": lambda: open_depth(LONG),
+    "features": lambda: open_features(LONG),
+    "strokes": lambda: read_strokes(Path(LONG)),
+    "landmark sets": lambda: read_landmark_sets(Path(LONG)),
+    "streams": lambda: read_streams(Path(LONG)),
+    "points": lambda: read_points(Path(LONG), 30.0),
+    "camera": lambda: open_camera(Path(LONG)),
+}
+
+
+@pytest.mark.parametrize("name", OPENERS)
+def test_a_name_that_is_too_long_is_that_of_no_file(name):
+    with pytest.raises(InputError, match=r"no such file or folder|File name too long"):
+        OPENERS[name]()
+
+
+@pytest.mark.parametrize(
+    ("number", "got"), [("Infinity", "inf at K[0][2]"), ("NaN", "nan at K[0][2]"), ("1e999", "inf at K[0][2]")]
+)
+def test_numbers_that_are_not_finite_are_named_with_their_place(tmp_path, number, got):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(CAMERA).replace("79.5", number))
+    with pytest.raises(InputError, match=re.escape(f"{path}: K must be finite numbers; got {got}")):
+        open_camera(path)
 
 
 def test_messages_show_little_of_what_was_found():
