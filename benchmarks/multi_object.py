@@ -108,8 +108,8 @@ def floor_tracks(
         raise ValueError(f"xy_m must be finite; frame {worst} is not.")
     pairs, repeats = np.unique(np.stack([rows.frame, rows.identity]), axis=1, return_counts=True)
     if (repeats > 1).any():
-        at, who = pairs[:, np.argmax(repeats > 1)]
-        raise ValueError(f"identity {who} stands twice in frame {at}.")
+        at, identity = pairs[:, np.argmax(repeats > 1)]
+        raise ValueError(f"identity {identity} stands twice in frame {at}.")
     return rows
 
 
@@ -178,9 +178,9 @@ def match(truth: FloorTracks, estimate: FloorTracks, *, gate_m: float = GATE_M) 
         people, found = rows_of_truth[frame], rows_of_estimate[frame]
         distance = cdist(truth.xy_m[people], estimate.xy_m[found])
         for i, j in _pairs_of_frame(truth.identity[people], estimate.identity[found], distance, gate_m, last):
-            who, name = int(truth.identity[people[i]]), int(estimate.identity[found[j]])
-            pairs.append((people[i], found[j], last.get(who, name) != name))
-            last[who] = name
+            person, name = int(truth.identity[people[i]]), int(estimate.identity[found[j]])
+            pairs.append((people[i], found[j], last.get(person, name) != name))
+            last[person] = name
     columns = np.array(pairs, np.int64).reshape(-1, 3).T
     return Matches(columns[0], columns[1], columns[2].astype(bool))
 
@@ -195,8 +195,8 @@ def _rows_by_frame(rows: FloorTracks) -> dict[int, np.ndarray]:
 def _pairs_of_frame(people, names, distance, gate_m, last) -> list[tuple[int, int]]:
     place = {int(name): j for j, name in enumerate(names)}
     kept: dict[int, int] = {}
-    for i, who in enumerate(people.tolist()):
-        j = place.get(last.get(who, -1)) if who in last else None
+    for i, person in enumerate(people.tolist()):
+        j = place.get(last.get(person, -1)) if person in last else None
         if j is not None and j not in kept.values() and distance[i, j] <= gate_m:
             kept[i] = j
     free_i = [i for i in range(len(people)) if i not in kept]
@@ -220,11 +220,11 @@ def _identified(truth: FloorTracks, estimate: FloorTracks, gate_m: float) -> int
         people, found = rows_of_truth[frame], rows_of_estimate[frame]
         for i, j in np.argwhere(cdist(truth.xy_m[people], estimate.xy_m[found]) <= gate_m):
             common[int(truth.identity[people[i]]), int(estimate.identity[found[j]])] += 1
-    who = {identity: i for i, identity in enumerate(np.unique(truth.identity).tolist())}
+    row_of = {identity: i for i, identity in enumerate(np.unique(truth.identity).tolist())}
     name = {identity: j for j, identity in enumerate(np.unique(estimate.identity).tolist())}
-    counts = np.zeros((len(who), len(name)), np.int64)
+    counts = np.zeros((len(row_of), len(name)), np.int64)
     for (person, identity), number in common.items():
-        counts[who[person], name[identity]] = number
+        counts[row_of[person], name[identity]] = number
     return int(counts[linear_sum_assignment(counts, maximize=True)].sum())
 
 
@@ -233,9 +233,9 @@ def _transfers(truth: FloorTracks, estimate: FloorTracks, matches: Matches) -> i
     last: dict[int, int] = {}
     transfers = 0
     for row, found, is_switch in zip(matches.truth, matches.estimate, matches.is_switch, strict=True):
-        who, name = int(truth.identity[row]), int(estimate.identity[found])
-        transfers += last.get(name, who) != who and not is_switch
-        last[name] = who
+        person, name = int(truth.identity[row]), int(estimate.identity[found])
+        transfers += last.get(name, person) != person and not is_switch
+        last[name] = person
     return transfers
 
 
@@ -243,7 +243,7 @@ def _coverage(truth: FloorTracks, matches: Matches) -> tuple[np.ndarray, int]:
     """Share of their frames in which people are matched, and how often they are lost in between."""
     is_matched = np.zeros(len(truth.frame), bool)
     is_matched[matches.truth] = True
-    histories = [is_matched[truth.identity == who] for who in np.unique(truth.identity)]
+    histories = [is_matched[truth.identity == identity] for identity in np.unique(truth.identity)]
     losses = 0
     for history in histories:
         observed = np.flatnonzero(history)

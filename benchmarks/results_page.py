@@ -6,6 +6,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxfilters.benchmarks.claims_page import claims_tables
 from jaxfilters.benchmarks.metrics import shown_better
 
 _GROUPS = (
@@ -244,10 +245,12 @@ def results_page(documents: Sequence[Mapping[str, Any]], descriptions: Mapping[s
         if machine.get("backend", "cpu") != "cpu":
             name = f"{name} on {machine['device']}"
         parts.append(f"## {name}\n\n{described}. {_conditions(machine)}\n")
-        ordered = sorted(document["metrics"].items(), key=lambda item: _group(item[0]))
-        for index, metrics in groupby(ordered, key=lambda item: _group(item[0])):
+        tables, metrics = claims_tables(name, document["metrics"])
+        parts += [tables] if tables else []
+        ordered = sorted(metrics.items(), key=lambda item: _group(item[0]))
+        for index, group in groupby(ordered, key=lambda item: _group(item[0])):
             title, _, note = _GROUPS[index]
-            parts.append(f"### {title}: {name}\n" + (f"\n{note}\n" if note else "") + f"\n{_table(dict(metrics))}")
+            parts.append(f"### {title}: {name}\n" + (f"\n{note}\n" if note else "") + f"\n{_table(dict(group))}")
     return "\n".join(parts)
 
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 FRAMES = (90, 300, 400)
-FACE = (slice(76, 436), slice(180, 540))
+FACE = (slice(96, 456), slice(150, 510))
 """Rows and columns of one camera's image."""
-MODES = (slice(800, 1044), slice(0, 745))
-"""Rows and columns of the first modes in `summary.png`."""
+MODES = (slice(800, 1044), slice(0, 720))
+"""Rows and columns of the first three of five modes in `summary.png`, 240 columns each."""
 
 
 def main(results: Path, picture: Path) -> None:

@@ -55,6 +55,16 @@ def test_the_licence_is_the_one_that_is_stated():
     assert "END OF TERMS AND CONDITIONS" in text
 
 
+def test_licences_of_what_is_derived_from_others_travel_with_the_package():
+    """The MIT License asks for its copyright notice and its permission notice."""
+    assert PYPROJECT["project"]["license-files"] == ["LICENSE", "NOTICE"]
+    text = (ROOT / "NOTICE").read_text()
+    assert "Copyright (c) 2020 USC Institute for Creative Technologies" in text
+    assert "Permission is hereby granted, free of charge" in text
+    assert (ROOT / "trackers" / "io" / "detector_errors.npz").exists()
+    assert "trackers/io/detector_errors.npz" in text
+
+
 def test_extras_repeat_no_requirement_of_the_library():
     core = {requirement.split(">")[0] for requirement in PYPROJECT["project"]["dependencies"]}
     for extra in PYPROJECT["project"]["optional-dependencies"].values():

@@ -34,6 +34,11 @@ PRIVATE_WORDS = re.compile(
 )
 """The field says observed, estimated, reported, person, unknown, anew, outlying, model variance; papers are cited so
 that a reader can find them."""
+PRIVATE_NAMES = {
+    *("Followed", "Job", "Moment", "Past", "Place", "Told", "Way", "Ways"),
+    *("admitted", "after_meetings", "left_behind", "looseness", "refusing", "seen_from", "stranger", "told", "who"),
+}
+"""Of variables, arguments, attributes, functions and classes, where the field has another word."""
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -116,6 +121,14 @@ def private_words(path):
     ]
 
 
+def private_names(path):
+    """Names of `PRIVATE_NAMES`, with or without a leading underscore."""
+    by_kind = {ast.Name: "id", ast.arg: "arg", ast.Attribute: "attr", ast.FunctionDef: "name", ast.ClassDef: "name"}
+    nodes = [node for node in ast.walk(parsed(path)) if type(node) in by_kind]
+    names = [(node.lineno, getattr(node, by_kind[type(node)])) for node in nodes]
+    return [f"line {line}: {name}" for line, name in sorted(names) if name.lstrip("_") in PRIVATE_NAMES]
+
+
 def test_a_random_key_comes_first_and_has_no_default():
     assert not (found := offenders(SOURCES, misplaced_keys)), found
 
@@ -134,6 +147,7 @@ def test_public_names_have_a_docstring():
 
 def test_words_are_those_of_the_field():
     assert not (found := offenders(SOURCES, private_words)), found
+    assert not (found := offenders(SOURCES, private_names)), found
 
 
 def test_files_and_functions_can_be_read():
@@ -345,6 +359,9 @@ def test_the_rules_for_functions_and_files_notice_what_they_forbid(tmp_path):
     words = '"""A docstring.\n\nAs the specification says [P14]."""\nseen = 1  # told\nf"{seen} wildly Learnt {seen}"'
     found = private_words(written(tmp_path, "words.py", words))
     assert found == ["line 3: the specification", "line 3: [P14]", "line 4: told", "line 5: Learnt"]
+    names = "class _Way:\n    def refusing(self, who):\n        self.told = seen_from\n        return whose"
+    found = private_names(written(tmp_path, "names.py", names))
+    assert found == ["line 1: _Way", "line 2: refusing", "line 2: who", "line 3: seen_from", "line 3: told"]
 
 
 def test_the_rules_for_imports_notice_what_they_forbid(tmp_path, monkeypatch):

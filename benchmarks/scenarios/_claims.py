@@ -14,6 +14,8 @@ import jaxfilters as jf
 from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric, aligned
 
 SIGMAS = (1.0, 2.0, 3.0)
+WITHIN = (0.683, WITHIN_TWO_SIGMA, 0.997)
+"""Shares of a normal distribution within them."""
 INTERVAL_KEY = 0
 
 
@@ -79,6 +81,8 @@ class Scores(NamedTuple):
     """In the unit of the coordinate."""
     sharpness: Float[np.ndarray, " d"]
     """Root mean square of the claims over that of the errors; 1 is right."""
+    rmse: Float[np.ndarray, " d"]
+    """Root mean square error, in the unit of the coordinate."""
     transforms: Float[np.ndarray, " n"]
     """Probability integral transforms of all errors, for a picture."""
 
@@ -109,33 +113,59 @@ def judge(claims: Claims) -> Scores | None:
         _log_score(errors, np.broadcast_to(constant, errors.shape)),
         np.mean(np.asarray(jf.diagnostics.crps(jnp.asarray(errors), 0.0, jnp.asarray(deviations))), axis=0),
         np.sqrt(np.mean(deviations**2, axis=0)) / constant,
+        constant,
         np.asarray(jf.diagnostics.pit(jnp.asarray(errors), 0.0, jnp.asarray(deviations))).ravel(),
     )
 
 
 def metrics_of(claims: Claims, scores: Scores) -> dict[str, Metric]:
-    """By name, with the system and the data in it."""
-    name = f"{claims.system}_{claims.data}"
+    """By name: a kind of metric, then the system, the data and, for those of one coordinate, the coordinate.
+
+    What is unknown, such as the interval over a single recording, is left out. A system whose coordinates have one unit
+    has a root mean square error over all of them.
+    """
+    name, d = f"{claims.system}_{claims.data}", len(claims.coordinates)
+    units = [coordinate.rpartition("_")[2] for coordinate in claims.coordinates]
+    low, high = scores.nees_band
     found = {
-        f"coverage2_{name}": Metric(100 * float(np.mean(scores.coverage[1])), "%", 100 * WITHIN_TWO_SIGMA),
-        f"nees_{name}": Metric(scores.nees / len(claims.coordinates), "", 1.0),
+        **_coverages(name, np.mean(scores.coverage, axis=1)),
+        f"nees_{name}": Metric(scores.nees / d, "", 1.0),
+        f"lower_nees_{name}": Metric(low / d, "", 1.0),
+        f"upper_nees_{name}": Metric(high / d, "", 1.0),
+        f"log_score_{name}": Metric(scores.log_score, "nats", "lower"),
         f"log_score_gain_{name}": Metric(scores.log_score_of_constant - scores.log_score, "nats", "higher"),
         f"effective_frames_{name}": Metric(scores.effective_frames, "", "higher"),
     }
-    for i, coordinate in enumerate(claims.coordinates):
-        found[f"coverage2_{name}_{coordinate}"] = Metric(
-            100 * float(scores.coverage[1, i]), "%", 100 * WITHIN_TWO_SIGMA
-        )
-        found[f"sharpness_{name}_{coordinate}"] = Metric(float(scores.sharpness[i]), "", 1.0)
-        found[f"crps_{name}_{coordinate}"] = Metric(float(scores.crps[i]), coordinate.rpartition("_")[2], "lower")
-    return found
+    if len(set(units)) == 1:
+        found[f"rmse_{name}"] = Metric(float(np.sqrt(np.mean(scores.rmse**2))), units[0], "lower")
+    for i, (coordinate, unit) in enumerate(zip(claims.coordinates, units, strict=True)):
+        of = f"{name}_{coordinate}"
+        lower, upper = 100 * scores.interval[:, i]
+        found |= {
+            **_coverages(of, scores.coverage[:, i]),
+            f"lower_coverage2_{of}": Metric(float(lower), "%", 100 * WITHIN_TWO_SIGMA),
+            f"upper_coverage2_{of}": Metric(float(upper), "%", 100 * WITHIN_TWO_SIGMA),
+            f"autocorrelation_{of}": Metric(float(scores.autocorrelation[i]), "", "lower"),
+            f"sharpness_{of}": Metric(float(scores.sharpness[i]), "", 1.0),
+            f"crps_{of}": Metric(float(scores.crps[i]), unit, "lower"),
+            f"rmse_{of}": Metric(float(scores.rmse[i]), unit, "lower"),
+        }
+    return {key: metric for key, metric in found.items() if math.isfinite(metric.value)}
+
+
+def _coverages(name: str, shares: Float[np.ndarray, " 3"]) -> dict[str, Metric]:
+    return {
+        f"coverage{sigma:.0f}_{name}": Metric(100 * float(share), "%", 100 * right)
+        for sigma, share, right in zip(SIGMAS, shares, WITHIN, strict=True)
+    }
 
 
 def table(evaluated: list[tuple[Claims, Scores]]) -> str:
     """One line a coordinate, and above those of a system what is of all its coordinates."""
-    header = ("coordinate", "1 sigma %", "2 sigma %", "95 % interval", "3 sigma %", "autocorr.", "sharpness", "crps")
+    shares = ("1 sigma %", "2 sigma %", "95 % interval", "3 sigma %")
+    header = ("coordinate", *shares, "autocorr.", "sharpness", "crps", "rmse")
     rows = [row for claims, scores in evaluated for row in _by_coordinate(claims, scores)]
-    head, line, *lines = aligned([header, *rows], numbers=range(1, 8)).splitlines()
+    head, line, *lines = aligned([header, *rows], numbers=range(1, 9)).splitlines()
     shown = [head, line]
     for claims, scores in evaluated:
         low, high = scores.nees_band
@@ -158,7 +188,7 @@ def _by_coordinate(claims: Claims, scores: Scores) -> list[tuple[str, ...]]:
         interval = "-" if np.isnan(low) else f"{low:.0f} .. {high:.0f}"
         phi = scores.autocorrelation[i]
         correlation = "-" if np.isnan(phi) else f"{phi:.2f}"
-        sizes = (f"{scores.sharpness[i]:.2g}", f"{scores.crps[i]:.3g}")
+        sizes = (f"{scores.sharpness[i]:.2g}", f"{scores.crps[i]:.3g}", f"{scores.rmse[i]:.3g}")
         rows.append((f"  {coordinate}", one, two, interval, three, correlation, *sizes))
     return rows
 

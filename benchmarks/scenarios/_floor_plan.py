@@ -42,10 +42,10 @@ def draw_floor_plan(path: Path, truth: FloorTracks, estimate: FloorTracks, area:
     for rows_of_one in _by_identity(truth):
         cv2.polylines(picture, [at(piece) for piece in _pieces(rows_of_one)], False, TRUTH_COLOR, 5, cv2.LINE_AA)
     for rows_of_one in _by_identity(estimate):
-        who = int(rows_of_one.identity[0])
-        color = _color(who)
+        identity = int(rows_of_one.identity[0])
+        color = _color(identity)
         cv2.polylines(picture, [at(piece) for piece in _pieces(rows_of_one)], False, color, 2, cv2.LINE_AA)
-        cv2.putText(picture, str(who), at(rows_of_one.xy_m[0]).tolist(), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, 2)
+        cv2.putText(picture, str(identity), at(rows_of_one.xy_m[0]).tolist(), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, 2)
     caption = f"grey: truth; colours: tracks; squares of {GRID_M:g} m"
     cv2.putText(picture, caption, (12, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
     if not cv2.imwrite(str(path), picture):
@@ -58,7 +58,9 @@ def _line(picture: np.ndarray, ends: np.ndarray) -> None:
 
 
 def _by_identity(tracks: FloorTracks) -> list[FloorTracks]:
-    return [FloorTracks(*(rows[tracks.identity == who] for rows in tracks)) for who in np.unique(tracks.identity)]
+    return [
+        FloorTracks(*(rows[tracks.identity == identity] for rows in tracks)) for identity in np.unique(tracks.identity)
+    ]
 
 
 def _pieces(one: FloorTracks) -> list[np.ndarray]:

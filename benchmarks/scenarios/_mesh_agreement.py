@@ -63,7 +63,10 @@ def turns(meshes: Float[np.ndarray, "t V 3"]) -> Rotation:
 
 
 def compared(one: Rotation, other: Rotation) -> dict[str, Metric]:
-    """How two courses of rotations agree, each about its own mean; angles about the axes of the camera."""
+    """How two courses of rotations agree, each about its own mean; angles about the axes of the camera.
+
+    The slope is how much the first turns for each degree of the other.
+    """
     first, second = (np.degrees((turn * turn.mean().inv()).as_euler("ZYX")) for turn in (one, other))
     metrics: dict[str, Metric] = {}
     for i, axis in enumerate(AXES):
@@ -72,8 +75,19 @@ def compared(one: Rotation, other: Rotation) -> dict[str, Metric]:
             f"{axis}_correlation": Metric(float(np.corrcoef(first[:, i], second[:, i])[0, 1]), "", "higher"),
             f"{axis}_rms": Metric(float(np.std(apart)), "deg", "lower"),
             f"{axis}_range": Metric(float(np.ptp(second[:, i])), "deg", "higher"),
+            f"{axis}_slope": Metric(_slope(second[:, i], first[:, i]), "", 1.0),
         }
     return metrics
+
+
+def _slope(x: Float[np.ndarray, " t"], y: Float[np.ndarray, " t"]) -> float:
+    """Slope of y over x by total least squares: the first principal axis of the points (K. Pearson 1901).
+
+    Ordinary least squares takes x for exact, and its slope shrinks with the errors of x. Here x and y are two estimates
+    of one angle that both have errors; the two regressions of y on x and of x on y enclose this slope.
+    """
+    (x_variance, both), (_, y_variance) = np.cov(x, y)
+    return float(np.tan(0.5 * np.arctan2(2 * both, x_variance - y_variance)))
 
 
 def _aligned(shapes: np.ndarray, mean: np.ndarray, weights: np.ndarray) -> Rotation:

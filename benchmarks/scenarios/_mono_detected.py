@@ -1,4 +1,4 @@
-"""Modelled people from their images alone, beside `solvePnP`.
+"""Modelled people from their images alone, at several distances too, beside `solvePnP`.
 
 Nothing is known of a person or of where the landmarks are: the detectors find them, as for a user. The same detections
 go to the simplest things that could work: the landmarks to OpenCV's `solvePnP` with the mean face of the same model,
@@ -38,6 +38,8 @@ SUFFIXES = {"cascades": "", "mediapipe": "_mediapipe"}
 """Of the metrics, by detector."""
 WORN: dict[str, dict[str, Any]] = {"glasses": {"has_glasses": True}, "beard": {"beard": 0.9}}
 """What the same people wear besides, in runs of their own with the model of the package."""
+DISTANCES_MM, DISTANCE_FRAMES = (300, 650, 1500), 150
+"""Of the same people in runs of their own, with the model of the package; 150 frames are five seconds."""
 AXES = {"x": 0, "y": 1, "z": 2, "roll": 3, "yaw": 4, "pitch": 5}
 EVERY = 3
 """Frames from one in which landmarks are detected for `solvePnP` to the next."""
@@ -99,8 +101,33 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     return metrics
 
 
-def filming(quick: bool, seed: int) -> Callable[..., IctSequence]:
-    """`(person, stretch, **worn) -> sequence`: people who turn and speak as recorded, before one camera.
+def distance_metrics(quick: bool, seed: int) -> dict[str, Metric]:
+    """Errors of both detectors with the model of the package, for people at each of `DISTANCES_MM`.
+
+    In all but the distance they are those of `people_metrics`, for a shorter time.
+
+    Raises:
+        RecordingError: if a recording is missing.
+    """
+    film, face, detectors = filming(quick, seed, DISTANCE_FRAMES), people_face_model().model, available_detectors()
+    runs: dict[str, list[DetectedRun]] = {}
+    for person, stretch in PEOPLE[: 1 if quick else None]:
+        for distance in DISTANCES_MM:
+            made = film(person, stretch, distance_mm=float(distance))
+            for name, detector in detectors.items():
+                one = detected_run(made, face, detector, person + seed)
+                runs.setdefault(f"modelled_at_{distance}mm{SUFFIXES[name]}", []).append(one)
+                sys.stderr.write(f"  person {person}, {distance} mm, {name}: {len(one.errors)} frames judged\n")
+    metrics: dict[str, Metric] = {}
+    for name, of_people in runs.items():
+        metrics |= detected_metrics(name, of_people)
+    return metrics
+
+
+def filming(quick: bool, seed: int, num_frames: int = NUM_FRAMES) -> Callable[..., IctSequence]:
+    """`(person, stretch, **how) -> sequence`: people who turn and speak as recorded, before one camera.
+
+    `how` is the distance, or what they wear; see `filmed`.
 
     Raises:
         RecordingError: if a recording is missing.
@@ -108,10 +135,10 @@ def filming(quick: bool, seed: int) -> Callable[..., IctSequence]:
     model = read_ict(recording_folder("ict_face_model"))
     turns = read_biwi(recording_folder("biwi_head_rotation"))
     speech = read_livelink(recording_folder("livelinkface_take"), model.names)
-    num_frames = QUICK_NUM_FRAMES if quick else NUM_FRAMES
+    num_frames = QUICK_NUM_FRAMES if quick else num_frames
 
-    def film(person: int, stretch: int, **worn: Any) -> IctSequence:
-        return filmed(model, turns[stretch], speech, person + seed, num_frames, **worn)
+    def film(person: int, stretch: int, **how: Any) -> IctSequence:
+        return filmed(model, turns[stretch], speech, person + seed, num_frames, **how)
 
     return film
 

@@ -148,10 +148,17 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
 
 
 def filmed(
-    model: IctModel, turns: np.ndarray, speech: np.ndarray, person: int, num_frames: int, **worn: Any
+    model: IctModel,
+    turns: np.ndarray,
+    speech: np.ndarray,
+    person: int,
+    num_frames: int,
+    *,
+    distance_mm: float = MONOCULAR_PLACE_MM[2],
+    **worn: Any,
 ) -> IctSequence:
-    """A person that turns and speaks as recorded, before one camera; `worn` as in `ict_sequence`."""
-    poses = biwi_course(turns, num_frames, place_mm=MONOCULAR_PLACE_MM)
+    """A person that turns and speaks as recorded, at a distance from one camera; `worn` as in `ict_sequence`."""
+    poses = biwi_course(turns, num_frames, place_mm=(*MONOCULAR_PLACE_MM[:2], distance_mm))
     expressions = livelink_course(speech, num_frames)
     key = jax.random.key(FIRST_PERSON + person)
     return ict_sequence(key, model, poses, rig=camera(), expressions=expressions, **worn)

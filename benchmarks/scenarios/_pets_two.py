@@ -12,6 +12,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, evaluate, floor_tracks
 from jaxfilters.benchmarks.recordings import RecordingError
+from jaxfilters.benchmarks.scenarios._pets import merged, merged_metrics
 from jaxfilters.trackers.io.cameras import open_camera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
@@ -32,6 +33,8 @@ QUICK_FRAMES = 40
 def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool) -> dict[str, Metric]:
     """Scores with both cameras, and of the better one alone (the one of larger MOTA), for each calibration.
 
+    `_merged` metrics count people who return under another identity as the same (`_pets.RETURNED_AS`).
+
     Args:
         folder: `pets09_s2l1_two_views`.
         truth_folder: `pets09_s2l1_view001`, whose annotations hold for all views.
@@ -45,14 +48,16 @@ def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool) -> dict[s
     annotated = _annotated(truth_folder / "gt_0_399.csv", area, frames)
     metrics: dict[str, Metric] = {}
     for suffix, calibration in itertools.islice(CALIBRATIONS.items(), 1 if quick else None):
-        scores = {
-            views: evaluate(annotated, follow(folder, views, calibration, area, frames))
-            for views in (VIEWS, *((view,) for view in VIEWS))
+        tracks = {
+            views: follow(folder, views, calibration, area, frames) for views in (VIEWS, *((view,) for view in VIEWS))
         }
+        scores = {views: evaluate(annotated, found) for views, found in tracks.items()}
         for views, found in scores.items():
             sys.stderr.write(f"  views {views}, {calibration}: {found}\n")
-        better = max((scores[(view,)] for view in VIEWS), key=lambda found: found.mota)
-        metrics |= _metrics(scores[VIEWS], f"_two{suffix}") | _metrics(better, f"_one{suffix}")
+        better = max(((view,) for view in VIEWS), key=lambda views: scores[views].mota)
+        for views, name in ((VIEWS, "_two"), (better, "_one")):
+            metrics |= _metrics(scores[views], f"{name}{suffix}")
+            metrics |= merged_metrics(evaluate(merged(annotated), tracks[views]), f"{name}{suffix}")
     return metrics
 
 
@@ -87,7 +92,9 @@ def follow(
         images = [file.undistortion.apply(image) for file, (_, image) in zip(files, moment, strict=True)]
         session.process(images, i / FRAMES_PER_SECOND)
     rows = [
-        (first + one.frame, who, *one.mean[:2]) for who, track in session.tracks.smoothed().items() for one in track
+        (first + one.frame, identity, *one.mean[:2])
+        for identity, track in session.tracks.smoothed().items()
+        for one in track
     ]
     table = np.array(rows, float).reshape(-1, 4)
     inside = np.all((table[:, 2:] >= area[0]) & (table[:, 2:] <= area[1]), axis=-1)

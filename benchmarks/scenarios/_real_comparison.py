@@ -9,18 +9,19 @@ signed-rank test over the recordings.
 import sys
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios import _real_hands
 from jaxfilters.benchmarks.scenarios._accuracy import p_value_better
-from jaxfilters.benchmarks.scenarios._real_hands import HandRecording
+from jaxfilters.benchmarks.scenarios._real_hands import CLOSE_MM, HandRecording
 from jaxfilters.models.hand.registration import PosePrior, RegistrationConfig, register, target_from_image
 from jaxfilters.models.hand.skeleton import forward_kinematics
 from jaxfilters.trackers.hand_depth import tracker as hand_depth
@@ -56,8 +57,18 @@ HIDDEN_MARGIN_PX = 12
 """Of the hidden rectangle about the joints of the fingers beyond the first."""
 SIX_STEPS = RegistrationConfig(widths=(0.03,) * 2 + (0.015,) * 4)
 
-Follow = Callable[[HandRecording, int], float]
-"""`(recording, seed) -> mean joint error in millimetres`."""
+
+class RunErrors(NamedTuple):
+    """What one way makes of a recording."""
+
+    mm: float
+    """Mean joint error in millimetres."""
+    wrong: int
+    """Frames whose mean joint error is `CLOSE_MM` or more under the status `tracking`; 0 of a way without a status."""
+
+
+Follow = Callable[[HandRecording, int], RunErrors]
+"""`(recording, seed) -> RunErrors`."""
 
 
 def real_metrics(num_particles: int, quick: bool, kept: Finished) -> dict[str, Metric]:
@@ -77,14 +88,17 @@ def real_metrics(num_particles: int, quick: bool, kept: Finished) -> dict[str, M
     of_cases = {"": recordings}
     of_cases |= {f"_every_{every}": _recordings(quick, every) for every in (QUICK_EVERY if quick else EVERY)}
     of_cases["_hidden"] = _hidden(quick)
-    cases = {case: _errors_of_all(num_particles, of_case, seeds, case, kept) for case, of_case in of_cases.items()}
+    results = {case: _results_of_all(num_particles, of_case, seeds, case, kept) for case, of_case in of_cases.items()}
+    cases = {case: {name: each["mm"] for name, each in of_ways.items()} for case, of_ways in results.items()}
     found: dict[str, Metric] = {}
     for case, errors in (cases | {"_all_cases": _over_all(cases)}).items():
         found |= _metrics(errors, case)
+    for case, of_ways in results.items():
+        found |= _extreme_metrics(of_ways, case)
     for count in QUICK_COUNTS if quick else COUNTS:
         follow = partial(tracker_error, "rbpf", count)
         name = f"rbpf_n{count}"
-        each = cases[""]["rbpf"] if count == num_particles else _errors(follow, recordings, seeds, name, kept)
+        each = cases[""]["rbpf"] if count == num_particles else _results(follow, recordings, seeds, name, kept)["mm"]
         found[f"errors_by_n_real_rbpf_n{count}"] = Metric(float(each.mean()), "mm", "lower")
     return found
 
@@ -117,15 +131,15 @@ def with_hidden_fingers(recording: HandRecording) -> HandRecording:
     return recording._replace(depth=depth, joints=np.where(hidden[:, None, None], recording.joints, np.nan))
 
 
-def _errors_of_all(
+def _results_of_all(
     num_particles: int, recordings: list[HandRecording], seeds: range, case: str, kept: Finished
-) -> dict[str, np.ndarray]:
+) -> dict[str, dict[str, np.ndarray]]:
     ways: dict[str, Follow] = {
         "rbpf": partial(tracker_error, "rbpf", num_particles),
         "pf": partial(tracker_error, "pf", num_particles),
         "registration": registration_error,
     }
-    return {name: _errors(follow, recordings, seeds, f"{name}{case}", kept) for name, follow in ways.items()}
+    return {name: _results(follow, recordings, seeds, f"{name}{case}", kept) for name, follow in ways.items()}
 
 
 def _metrics(errors: dict[str, np.ndarray], case: str) -> dict[str, Metric]:
@@ -141,31 +155,53 @@ def _metrics(errors: dict[str, np.ndarray], case: str) -> dict[str, Metric]:
     return found
 
 
-def _errors(follow: Follow, recordings: list[HandRecording], seeds: range, name: str, kept: Finished) -> np.ndarray:
-    """(recordings,) millimetres, the mean over the seeds; kept with the name and the number of the recording."""
+def _extreme_metrics(results: dict[str, dict[str, np.ndarray]], case: str) -> dict[str, Metric]:
+    """Median and largest error over the recordings, and frames with a wrong status, the mean over the seeds."""
+    found: dict[str, Metric] = {}
+    for name, each in results.items():
+        found[f"median_joint_error_mm_real{case}_{name}"] = Metric(float(np.median(each["mm"])), "mm", "lower")
+        found[f"largest_joint_error_mm_real{case}_{name}"] = Metric(float(np.max(each["mm"])), "mm", "lower")
+        if name != "registration":
+            found[f"wrong_frames_real{case}_{name}"] = Metric(float(np.sum(each["wrong"])), "frames", "lower")
+    return found
+
+
+def _results(
+    follow: Follow, recordings: list[HandRecording], seeds: range, name: str, kept: Finished
+) -> dict[str, np.ndarray]:
+    """`mm` and `wrong`, (recordings,) each, the mean over the seeds; kept with the name and the recording's number."""
 
     def of_seeds(recording: HandRecording) -> dict[str, np.ndarray]:
-        return {"mm": np.array([follow(recording, seed) for seed in seeds])}
+        followed = [follow(recording, seed) for seed in seeds]
+        return {part: np.array([getattr(one, part) for one in followed], float) for part in RunErrors._fields}
 
     each = [kept.arrays(f"real_{name}_{i}", partial(of_seeds, one)) for i, one in enumerate(recordings)]
-    return np.array([errors["mm"].mean() for errors in each])
+    return {part: np.array([found[part].mean() for found in each]) for part in RunErrors._fields}
 
 
-def tracker_error(filter: str, num_particles: int, recording: HandRecording, seed: int) -> float:
+def tracker_error(filter: str, num_particles: int, recording: HandRecording, seed: int) -> RunErrors:
     """Of the tracker as users run it, given nothing but the recording."""
     config = HandDepthConfig(filter=filter, num_particles=num_particles, seed=seed)
     track = hand_depth.track(iter(recording.depth), recording.times_s, recording.camera, config)
-    return _joint_error(np.asarray(track.joints), recording)
+    errors = _joint_errors(np.asarray(track.joints), recording)
+    return RunErrors(float(np.nanmean(errors)), num_wrong(errors, np.asarray(track.status)))
 
 
-def registration_error(recording: HandRecording, seed: int) -> float:
+def num_wrong(errors: Float[np.ndarray, "t j"], status: Int[np.ndarray, " t"]) -> int:
+    """Frames whose joints with a known truth are `CLOSE_MM` or more off in the mean under the status `tracking`."""
+    known = np.isfinite(errors).any(axis=1)
+    far = np.nanmean(errors[known], axis=1) >= CLOSE_MM
+    return int(np.sum(far & (status[known] == hand_depth.TRACKING)))
+
+
+def registration_error(recording: HandRecording, seed: int) -> RunErrors:
     """Of registration alone, from the start that the tracker finds."""
     config = HandDepthConfig(num_particles=64, seed=seed, guide=False)  # particles near the start that is found
     state = hand_depth.build(recording.camera, config).init(jax.random.key(seed), recording.depth[0])
     setup = hand_depth.set_up(recording.camera, config).compiled()  # one program for all seeds
     elapsed = np.diff(recording.times_s, prepend=recording.times_s[0] - np.float32(FRAME_INTERVAL))
     _, joints = registered(setup, state, jnp.asarray(recording.depth), jnp.asarray(elapsed))
-    return _joint_error(np.asarray(joints), recording)
+    return RunErrors(float(np.nanmean(_joint_errors(np.asarray(joints), recording))), 0)
 
 
 @jax.jit
@@ -190,11 +226,11 @@ def registered(setup: Setup, state: TrackState, frames: Array, elapsed: Array) -
     return jax.lax.scan(follow, start, (frames, elapsed))[1]
 
 
-def _joint_error(joints: np.ndarray, recording: HandRecording) -> float:
-    """Mean over all joints whose truth is known, millimetres; `MISSING_MM` where there is no estimate."""
+def _joint_errors(joints: np.ndarray, recording: HandRecording) -> Float[np.ndarray, "t j"]:
+    """Millimetres, `MISSING_MM` where there is no estimate, NaN where the truth is not known."""
     apart = 1e3 * np.linalg.norm(joints - recording.joints, axis=-1)
     known = np.isfinite(recording.joints).all(axis=-1)
-    return float(np.mean(np.where(np.isfinite(apart), apart, MISSING_MM)[known]))
+    return np.where(known, np.where(np.isfinite(apart), apart, MISSING_MM), np.nan)
 
 
 def _recordings(quick: bool, every: int = 1) -> list[HandRecording]:

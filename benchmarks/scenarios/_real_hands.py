@@ -6,7 +6,7 @@ truth for what is rendered of it, and is not the shape of the tracker's model. T
 depth, whose joints are a fit of another model.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -29,8 +29,11 @@ RATE = 30.0
 """Frames a second of the motions."""
 NOISE_M, WALL_M = 0.0015, 1.5
 """Standard deviation of a reading, and the distance of what is behind the hand."""
-_SPLIT = 6
-"""Parts of a triangle's side at whose corners it is sampled: a pixel or less."""
+CLOSE_MM = 25.0
+"""Mean joint error below which a pose is right: hands of the other side, or turned over, are 60 to 80 off."""
+_SPLIT, _SPLIT_NEARER = 6, 8
+"""Parts of a triangle's side at whose corners it is sampled: a pixel or less where the motions were recorded, and at
+any distance from 0.3 m on."""
 PALM = [0, 5, 9, 17]
 """Joints whose middle is that of the palm."""
 _DIGITS = (4, 3, 2, 1, 0)
@@ -50,6 +53,10 @@ class HandRecording(NamedTuple):
     """+1 for a right hand, -1 for a left one."""
 
 
+PalmPath = Callable[[Float[np.ndarray, "t 3"]], Float[np.ndarray, "t 3"]]
+"""Where the middle of a palm is to be in each frame, of where it was recorded; metres, camera frame."""
+
+
 def load(
     name: str,
     num_frames: int = NUM_FRAMES,
@@ -57,6 +64,8 @@ def load(
     every: int = 1,
     evenly: bool = False,
     turned_deg: tuple[float, float] = (0.0, 0.0),
+    palm_at_m: PalmPath | None = None,
+    wall_m: float = WALL_M,
 ) -> HandRecording:
     """One of `DEVELOPMENT` or `HELD`: the frames in the middle of a motion, the first ones of a camera's recording.
 
@@ -67,6 +76,8 @@ def load(
         evenly: The frames of a motion are spread over all of it, so that the times are no longer those of the motion.
         turned_deg: A motion is turned by this about the x and then the y axis of the camera, in each frame about the
             middle of the palm.
+        palm_at_m: A motion is moved such that the middle of the palm is there.
+        wall_m: Distance of what is behind the hand of a motion.
 
     Raises:
         RecordingError: the data are not there.
@@ -84,12 +95,16 @@ def load(
     spread = np.linspace(0, len(motion) - 1, num_frames).round().astype(int)
     motion = motion[spread] if evenly else motion[first : first + every * num_frames : every]
     lengths = _tip_lengths(recording_folder("tzionas_hand_motion") / f"Model_Hand_{side}.SKEL")
+    palm = _joints(motion, hand, lengths, side)[:, PALM].mean(axis=1)
     if any(turned_deg):
-        motion = _turned(motion, 1000 * _joints(motion, hand, lengths, side)[:, PALM].mean(axis=1), turned_deg)
+        motion = _turned(motion, 1000 * palm, turned_deg)
+    if palm_at_m is not None:
+        motion = motion + np.pad(1000 * (palm_at_m(palm) - palm)[:, None, :, None], ((0, 0), (0, 0), (0, 0), (3, 0)))
     shape, rng = (480, 640), np.random.default_rng(int(sequence))
-    depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape) for vertices in _skinned(motion, hand)])
+    parts = _SPLIT if palm_at_m is None else _SPLIT_NEARER
+    depth = np.stack([_rendered(vertices, hand["faces"], matrix, shape, parts) for vertices in _skinned(motion, hand)])
     depth = np.round(depth + NOISE_M * rng.normal(size=depth.shape), 3)
-    depth = np.where(np.isfinite(depth), depth, WALL_M).astype(np.float32)
+    depth = np.where(np.isfinite(depth), depth, wall_m).astype(np.float32)
     camera = Pinhole.from_matrix(matrix, shape)
     times = np.arange(len(motion), dtype=np.float32) * np.float32(every / RATE)
     return HandRecording(camera, times, depth, _joints(motion, hand, lengths, side), 1.0 if side == "R" else -1.0)
@@ -134,11 +149,15 @@ def _square(transforms: Float[np.ndarray, "b 3 4"]) -> Float[np.ndarray, "b 4 4"
 
 
 def _rendered(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], matrix: np.ndarray, shape: tuple[int, int]
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    matrix: np.ndarray,
+    shape: tuple[int, int],
+    parts: int = _SPLIT,
 ) -> Float[np.ndarray, "rows cols"]:
     """Depth in metres of a dense surface, by points of its triangles; `inf` beside it."""
-    corners = [(i, j, _SPLIT - i - j) for i, j in product(range(_SPLIT + 1), repeat=2) if i + j <= _SPLIT]
-    points = np.einsum("kc,fcx->fkx", np.array(corners) / _SPLIT, vertices[faces]).reshape(-1, 3)
+    corners = [(i, j, parts - i - j) for i, j in product(range(parts + 1), repeat=2) if i + j <= parts]
+    points = np.einsum("kc,fcx->fkx", np.array(corners) / parts, vertices[faces]).reshape(-1, 3)
     pixels = points @ matrix.T
     u, v = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(int).T
     inside = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])

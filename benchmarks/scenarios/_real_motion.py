@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
+from jaxfilters.benchmarks.scenarios._exact_tilt import tilt_metrics
 from jaxfilters.benchmarks.scenarios._real_markers import MarkedHand, Marker, marked_hand
 from jaxfilters.benchmarks.scenarios._real_mocap import mocap_metrics
 from jaxfilters.gaussian.gaussian_sum import map_component
@@ -133,11 +134,16 @@ class Lifted(NamedTuple):
     seconds: float
     tracked: float
     """Share of the frames."""
+    hypotheses: float = 1.0
+    """Mean number after a frame."""
 
 
 def real_motion_metrics(data_dir: Path, quick: bool) -> dict[str, Metric]:
-    """Errors on whichever of the recordings lie in `data_dir`; `quick` takes their first frames and one network."""
-    metrics: dict[str, Metric] = {}
+    """Errors on whichever of the recordings lie in `data_dir`, and those of the palm where keypoints are exact.
+
+    `quick` takes the first frames of the recordings and one network.
+    """
+    metrics = tilt_metrics(quick)
     for name, chosen in SETS.items():
         if (data_dir / "handpose_tracks" / chosen.file).exists():
             for network in chosen.networks[: 1 if quick else None]:
@@ -219,8 +225,9 @@ def filtered(variant: str, *, known_size: bool = False) -> Callable[[HandSet, De
         start = time.perf_counter()
         _, track = jax.block_until_ready(tracker.step(state, frames, times))
         seconds = time.perf_counter() - start
-        points = jax.lax.map(hand.marker_points, jnp.asarray(track.mean))
-        return Lifted(1e3 * np.asarray(points), seconds, float(np.mean(np.asarray(track.status) == TRACKING)))
+        points = 1e3 * np.asarray(jax.lax.map(hand.marker_points, jnp.asarray(track.mean)))
+        tracked = np.asarray(track.status) == TRACKING
+        return Lifted(points, seconds, float(np.mean(tracked)), float(np.mean(np.asarray(track.num_hypotheses))))
 
     return lift
 
@@ -286,6 +293,7 @@ def lifting_metrics(name: str, suffix: str, chosen: HandSet, detections: Detecti
     metrics[f"{name}_reduction_percent{suffix}"] = Metric(reduction, "%", "higher")
     unaided = 100 * (1 - plain["recommended"] / plain["backprojection_estimated_depth"])
     metrics[f"{name}_reduction_estimated_depth_percent{suffix}"] = Metric(unaided, "%", "higher")
+    metrics[f"{name}_mean_hypotheses{suffix}"] = Metric(lifted.hypotheses, "", "higher")
     metrics[f"{name}_tracked_share{suffix}"] = Metric(lifted.tracked, "", "higher")
     metrics[f"{name}_frames_per_second{suffix}"] = Metric(len(lifted.points) / lifted.seconds, "frames/s", "higher")
     return metrics

@@ -116,12 +116,12 @@ def followed_blobs(
         places = np.asarray(camera.floor_points(jnp.asarray(feet.reshape(-1, 2)))[0], float)
         here = {}
         for place in places:
-            near = {who: np.linalg.norm(place - at) for who, at in last.items() if who not in here}
-            who = min(near, key=near.__getitem__, default=-1)
-            if who < 0 or near[who] > GATE_M:
-                who, next_identity = next_identity, next_identity + 1
-            here[who] = place
-            rows.append((index, who, float(place[0]), float(place[1])))
+            near = {identity: np.linalg.norm(place - at) for identity, at in last.items() if identity not in here}
+            identity = min(near, key=near.__getitem__, default=-1)
+            if identity < 0 or near[identity] > GATE_M:
+                identity, next_identity = next_identity, next_identity + 1
+            here[identity] = place
+            rows.append((index, identity, float(place[0]), float(place[1])))
         last = here
     return rows
 

@@ -112,7 +112,7 @@ def desk(xy: Float[Array, " 2"]) -> Float[Array, "5 3 3"]:
     return jnp.stack([jnp.stack(side) for side in sides])
 
 
-class Look(NamedTuple):
+class Appearance(NamedTuple):
     """How people appear: what they are made of, and what is wrong with their silhouettes."""
 
     is_ellipsoid: bool = False
@@ -125,12 +125,12 @@ class Look(NamedTuple):
     """A second silhouette as large as the first, somewhere else, that is nobody."""
 
 
-LOOKS = {
-    "ellipsoid": Look(True),
-    "body": Look(),
-    "holes": Look(flaws=Flaws()),
-    "shadow": Look(flaws=Flaws(), with_shadow=True),
-    "taller": Look(taller=1.05),
+APPEARANCES = {
+    "ellipsoid": Appearance(True),
+    "body": Appearance(),
+    "holes": Appearance(flaws=Flaws()),
+    "shadow": Appearance(flaws=Flaws(), with_shadow=True),
+    "taller": Appearance(taller=1.05),
 }
 """The columns of table 1 of Kato et al. (1999); `shadow` has holes too."""
 
@@ -157,7 +157,7 @@ def simulate(
     key: AnyKey,
     calibration: Calibration,
     truth: Float[np.ndarray, "runs frames people 2"],
-    look: Look,
+    appearance: Appearance,
     *,
     sizes_m: tuple[tuple[float, float], ...] = (BODY_M,),
     start_offset_m: Callable[[AnyKey, tuple[int, ...]], Array] = near_start,
@@ -167,9 +167,9 @@ def simulate(
 
     Args:
         key: Random key; a run depends on it and its number alone.
-        calibration: Who looks.
+        calibration: Of the camera.
         truth: Where people are.
-        look: How they appear.
+        appearance: How they appear.
         sizes_m: Height and width of each.
         start_offset_m: `(key, shape) -> offsets` of where the trackers start.
         with_desk: Whether there is a desk before the first of them.
@@ -183,9 +183,9 @@ def simulate(
         if desks is not None:
             before = sight._replace(furniture=patch_depth(sight.camera, jnp.asarray(desks[number])))
         starts.append(run[0] + np.asarray(start_offset_m(start_key, run[0].shape)))
-        sizes = jnp.asarray(sizes_m) * jnp.array([look.taller, 1.0])
-        switches = (look.is_ellipsoid, look.with_shadow, look.with_blob)
-        masks.append(np.asarray(_masks(mask_key, before, jnp.asarray(run), sizes, look.flaws, *switches)))
+        sizes = jnp.asarray(sizes_m) * jnp.array([appearance.taller, 1.0])
+        switches = (appearance.is_ellipsoid, appearance.with_shadow, appearance.with_blob)
+        masks.append(np.asarray(_masks(mask_key, before, jnp.asarray(run), sizes, appearance.flaws, *switches)))
     return Runs(truth, np.stack(starts), np.stack(masks), None if desks is None else np.stack(desks))
 
 

@@ -4,7 +4,9 @@ The paper's sequence of 55 frames (Shimada et al., figures 12 to 16) for two han
 same start, by three filters: `unconstrained`, `literal` (the paper's) and `recommended`. Then the authors' open
 problem, `held_*`: one pose repeated for 500 frames, of which only the first few can teach anything. Where
 JAXFILTERS_DATA names the folder of recordings, real hands follow. Errors are over all seeds; `nees` is a mean over
-them, to be compared with its band. A folder given with `--out` receives the curves of the held pose.
+them, to be compared with its band; `drawn_*` are of starts that are samples of the prior, also seed by seed, with the
+quantiles and the share within the chi-squared band, and again (`_in_mode`) without the seeds that end in another mode
+of the posterior. A folder given with `--out` receives the curves of the held pose.
 """
 
 import os
@@ -14,6 +16,7 @@ from pathlib import Path
 import cv2
 import jax
 import numpy as np
+from scipy import stats
 
 from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Direction, Metric
 from jaxfilters.benchmarks.recordings import VARIABLE
@@ -27,6 +30,9 @@ NUM_SEEDS, QUICK_NUM_SEEDS = 50, 6
 NUM_HELD_SEEDS, QUICK_NUM_HELD_SEEDS = 20, 2
 HELD_FRAMES, QUICK_HELD_FRAMES = 500, 60
 ROUNDS, QUICK_ROUNDS = 15, 3
+BAND = 0.95
+"""Probability of the band of the NEES of one seed."""
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 RIGHT: dict[str, Direction | float] = {"coverage": WITHIN_TWO_SIGMA, "nees": 6.0}
 """Values of consistent filters, of six lengths."""
 COLORS = {"literal": (40, 120, 230), "recommended": (200, 110, 30)}
@@ -85,24 +91,51 @@ def _evaluated(runs: paper.Runs) -> dict[str, float]:
 
 
 def drawn_metrics(seeds: range) -> dict[str, Metric]:
-    """Consistency of the recommended filter's lengths where starts are samples of what is believed of them.
+    """Consistency of the recommended filter's lengths, seed by seed, where starts are samples of what is believed.
 
-    A mean over seeds is that of the few that end in another mode, so the median stands beside it: 5.35 if consistent.
+    The mean over all seeds is that of the few that end in another mode, so that figures without those stand beside it.
     """
     metrics: dict[str, Metric] = {}
     for shape in SHAPES:
         runs = paper.run_drawn("recommended", shape, seeds)
-        errors, covariances = runs.length_errors[:, -1], runs.length_covariances[:, -1]
-        nees = paper.nees(errors, covariances)
-        found = {
-            "diverged_share": Metric(float(paper.diverged(runs).mean()), "", "lower"),
-            "coverage_2sigma": Metric(paper.coverage(errors, covariances), "", WITHIN_TWO_SIGMA),
-            "nees_lengths_mean": Metric(float(np.mean(nees)), "", 6.0),
-            "nees_lengths_median": Metric(float(np.median(nees)), "", 5.35),
-        }
+        found = _drawn(runs)
         _say(f"  drawn starts, shape {shape}: " + "  ".join(f"{name} {found[name].value:.3g}" for name in found))
+        nees, other = paper.nees(runs.length_errors[:, -1], runs.length_covariances[:, -1]), paper.in_other_mode(runs)
+        each = "  ".join(f"{value:.3g}{'*' * bool(lost)}" for value, lost in zip(nees, other, strict=True))
+        _say(f"    NEES of 6 lengths by seed, * in another mode: {each}")
         metrics |= {f"drawn_{name}_recommended_shape{shape}": metric for name, metric in found.items()}
     return metrics
+
+
+def _drawn(runs: paper.Runs) -> dict[str, Metric]:
+    errors, covariances = runs.length_errors[:, -1], runs.length_covariances[:, -1]
+    nees, other = paper.nees(errors, covariances), paper.in_other_mode(runs)
+    low, high = stats.chi2(6).interval(BAND)
+    found = {
+        "diverged_share": Metric(float(paper.diverged(runs).mean()), "", "lower"),
+        "other_mode_share": Metric(float(other.mean()), "", "lower"),
+        "coverage_2sigma": Metric(paper.coverage(errors, covariances), "", WITHIN_TWO_SIGMA),
+        "nees_lengths_mean": Metric(float(np.mean(nees)), "", 6.0),
+        "nees_lengths_in_band_share": Metric(float(np.mean((nees > low) & (nees < high))), "", BAND),
+    }
+    for quantile in QUANTILES:
+        name = "median" if quantile == 0.5 else f"quantile{100 * quantile:.0f}"
+        right = float(stats.chi2(6).ppf(quantile))
+        found[f"nees_lengths_{name}"] = Metric(float(np.quantile(nees, quantile)), "", right)
+    if not other.all():
+        one = nees[~other]
+        below, above = paper.band(6, len(one))
+        found |= {
+            "nees_lengths_mean_in_mode": Metric(float(np.mean(one)), "", 6.0),
+            "nees_lengths_mean_in_mode_band_low": Metric(below, "", 6.0),
+            "nees_lengths_mean_in_mode_band_high": Metric(above, "", 6.0),
+            "nees_lengths_median_in_mode": Metric(float(np.median(one)), "", float(stats.chi2(6).median())),
+            "nees_lengths_in_band_share_in_mode": Metric(float(np.mean((one > low) & (one < high))), "", BAND),
+            "coverage_2sigma_in_mode": Metric(
+                paper.coverage(errors[~other], covariances[~other]), "", WITHIN_TWO_SIGMA
+            ),
+        }
+    return found
 
 
 def held_metrics(seeds: range, num_frames: int, out: Path | None) -> dict[str, Metric]:

@@ -105,11 +105,11 @@ def _error_by_chance(confidence: Float[np.ndarray, " n"]) -> float:
 def _by_warping(recorded: StrokeSet, people: list[str], most: int | None, every: int) -> float:
     """Percent of the strokes of each person that are as the nearest of the others' by dynamic time warping."""
     paths = [np.concatenate(pieces) for pieces, _ in recorded.strokes]
-    labels, who = np.array(recorded.labels), np.array(recorded.people)
+    labels, writers = np.array(recorded.labels), np.array(recorded.people)
     right = []
     for person in people:
-        known = shown_of_others(labels, who, person, most)
-        own = np.flatnonzero(who == person)[::every]
+        known = shown_of_others(labels, writers, person, most)
+        own = np.flatnonzero(writers == person)[::every]
         near = nearest_by_warping([paths[i] for i in known], labels[known].tolist(), [paths[i] for i in own])
         right.append(np.array(near) == labels[own])
     return 100 * float(np.concatenate(right).mean())

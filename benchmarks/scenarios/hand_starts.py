@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfilters.benchmarks.metrics import Direction, Metric
-from jaxfilters.benchmarks.scenarios._real_hands import HELD, HandRecording, load
+from jaxfilters.benchmarks.scenarios._real_hands import CLOSE_MM, HELD, HandRecording, load
 from jaxfilters.models.hand.observation import crop, window_stride
 from jaxfilters.models.hand.skeleton import anatomical_hand, forward_kinematics
 from jaxfilters.models.hand.start import NUM_REGISTERED, Start, costs_of
@@ -34,8 +34,6 @@ TURNS = ((30.0, -30.0), (-30.0, 30.0), (50.0, 0.0), (0.0, -55.0), (20.0, 45.0))
 development turned by (40, 0), (-40, 0), (0, 40), (0, -40), (30, 30) and (-30, -30); that the middle of the palm may be
 deeper was found on images from the middle of motion 17 as it is, which is one of the eleven."""
 NUM_IMAGES, QUICK_MOTIONS = 2, 2
-CLOSE_MM = 25.0
-"""Mean joint error below which a pose is right: hands of the other side, or turned over, are 60 to 80 off."""
 
 Outcome = tuple[float, int]
 """Mean joint error in millimetres, NaN without an estimate, and the status."""

@@ -14,7 +14,8 @@ landmarks. Starts are judged by how widely the five heads are turned. Modelled p
 faces, by one of them also from 68 landmarks, `modelled_68_`. Metrics that end in `_modelled` are of the same people
 from their images alone, as a detector finds their landmarks, beside `solvePnP` on the same landmarks (`pnp_`); in
 `_modelled_rendered` with the model of the package, in `_mediapipe` with MediaPipe's mesh where it is installed, in
-`_modelled_glasses` and `_modelled_beard` with the model of the package and what these people then wear. They need
+`_modelled_glasses` and `_modelled_beard` with the model of the package and what these people then wear, in
+`_modelled_at_300mm` and the like with this model, at other distances, for 150 frames each. They need
 `ict_face_model`, `biwi_head_rotation` and `livelinkface_take` in the folder JAXFILTERS_DATA, the videos
 `talking_face_video`; what is missing is said and left out. All of it takes hours: with `--out`, a run that was cut off
 goes on after the last user and the last part that it had finished.
@@ -31,7 +32,7 @@ import numpy as np
 from jaxfilters.benchmarks.finished import Finished
 from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import RecordingError
-from jaxfilters.benchmarks.scenarios._mono_detected import people_metrics
+from jaxfilters.benchmarks.scenarios._mono_detected import distance_metrics, people_metrics
 from jaxfilters.benchmarks.scenarios._mono_floor import modelled_rotation_metrics, modelled_size_metrics, size_errors
 from jaxfilters.benchmarks.scenarios._mono_real import cross_model, modelled_metrics, video_metrics
 from jaxfilters.benchmarks.scenarios._mono_runs import (
@@ -86,6 +87,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
         "speed": lambda: speed_metrics(seed, 3 if quick else 25),
         "modelled": lambda: modelled_metrics(quick, seed),
         "detected": lambda: people_metrics(quick, seed),
+        "distances": lambda: distance_metrics(quick, seed),
         "videos": lambda: video_metrics(quick, seed),
     }
     for name, part in parts.items():

@@ -1,14 +1,14 @@
 """Heads before two cameras, rendered with known truth: the published errors, deformation, occlusion, speed.
 
-Tables 3 and 4 of Oka, Sato et al. (2006) and section 3.4 of Sugano's thesis (2007), as sections 5.1 and 5.2 of the
-specification have them. Faces are registered by the tracker's own stereo matching from the true landmarks of the first
-left image. Names without a suffix are the modern tracker's with a rigid model, adaptive diffusion `A = I, b = 1`, and
-1000 particles; `_learning` may deform and `_online_diffusion` goes on learning `A` and `b`; `_50_particles`, `_fixed1`
-and `_fixed5` have fewer of them and fixed diffusions. `_paper` is the paper's tracker, `_paper_fixed1` and
-`_paper_fixed5` are that with fixed diffusions. A tracker has lost the face in frames in which it says so, or in which
-its pose would put the landmarks half a template away. Of the ablations of section 5.3 those are missing that no option
-of the tracker turns off: recalculation, its start, the score gate, the removal of rigid motion, the amnesic parameter,
-and sampling in one stage. A folder given with `--out` receives the curves of the deformation.
+Tables 3 and 4 of Oka, Sato et al. (2006) and section 3.4 of Sugano's thesis (2007). Faces are registered by the
+tracker's own stereo matching from the true landmarks of the first left image. Names without a suffix are the modern
+tracker's with a rigid model, adaptive diffusion `A = I, b = 1`, and 1000 particles; `_learning` may deform and
+`_online_diffusion` goes on estimating `A` and `b`; `_50_particles`, `_fixed1` and `_fixed5` have fewer of them and
+fixed diffusions. `_paper` is the paper's tracker, `_paper_fixed1` and `_paper_fixed5` are that with fixed diffusions. A
+tracker has lost the face in frames in which it says so, or in which its pose would put the landmarks half a template
+away. Not compared are trackers without a part that no option turns off: recalculation, its start, the score gate, the
+removal of rigid motion, the amnesic parameter, and sampling in one stage. A folder given with `--out` receives the
+curves of the deformation.
 """
 
 import sys

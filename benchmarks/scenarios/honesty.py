@@ -1,14 +1,19 @@
-"""Whether claimed standard deviations are true: all trackers on data with truth, in one table.
+"""Whether claimed standard deviations are true: hands, people and heads on data with truth, in one table.
+
+The systems are the hand from depth images, the articulated hand, people, and heads before one and two cameras.
+Fingertips are not in it, whose marked frames are too few and too far apart, nor symbols, whose confidences are judged
+in `gestures`. Last come three filters of the same detected key points, whose errors are taken for lasting, for inflated
+white and for white noise.
 
 For each system and kind of data, and by coordinate: the share of true values within 1, 2 and 3 of the claimed standard
 deviations (68, 95 and 99.7 % are right), with an interval by drawing whole recordings; the autocorrelation of errors
-from frame to frame; the ratio of claims to errors (sharpness, 1 is right); the continuous ranked probability score. Of
-all coordinates together: the normalised error squared with its band for as many frames as the errors are worth, and
-the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is right; `log_score_gain_` is
-what the claim is better than the constant. Last come three filters of the same detected key points, whose errors are
-taken for lasting, for inflated white and for white noise. A folder given with `--out` receives a calibration curve of
-each, and a run that was cut off goes on there after the last system that it had finished. Systems whose recordings are
-missing are named and left out.
+from frame to frame; the ratio of claims to errors (sharpness, 1 is right); the continuous ranked probability score and
+the root mean square error. Of all coordinates together: the normalised error squared with its band for as many frames
+as the errors are worth, and the log score beside that of the best constant claim. `nees_` is a coordinate's share, 1 is
+right, with the ends `lower_nees_` and `upper_nees_` of its band; `log_score_gain_` is what the claim is better than the
+constant; `lower_coverage2_` and `upper_coverage2_` are the ends of the interval. A folder given with `--out` receives a
+calibration curve of each, and a run that was cut off goes on there after the last system that it had finished. Systems
+whose recordings are missing are named and left out.
 """
 
 import re
@@ -214,10 +219,10 @@ def people_claims(quick: bool, seed: int) -> Claims:
 
 def by_person(truth: FloorTracks, tracks: dict[int, list[Sighting]], camera_m: np.ndarray) -> list[Recording]:
     """Errors along and across the line of sight of every person who is matched, with their covariances."""
-    sightings = {(one.frame, who): one for who, track in tracks.items() for one in track}
+    sightings = {(one.frame, identity): one for identity, track in tracks.items() for one in track}
     keys = list(sightings)
     places = np.array([sightings[key].mean[:2] for key in keys], float).reshape(-1, 2)
-    found = floor_tracks([frame for frame, _ in keys], [who for _, who in keys], places)
+    found = floor_tracks([frame for frame, _ in keys], [identity for _, identity in keys], places)
     pairs = match(truth, found)
     rows: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     for i, j in zip(pairs.truth, pairs.estimate, strict=True):

@@ -140,7 +140,7 @@ def truth(room: DemoRoom, setup: Setup) -> FloorTracks:
     for i in range(frames):
         running = [c for c in setup.cameras if any(setup.delivers(c, j, frames) for j in range(i, frames))]
         there = np.any([observed[c][i] for c in running], axis=0) & room.present(i) & on_floor[i]
-        rows += [(i, who, *xy[i, who]) for who in np.flatnonzero(there)]
+        rows += [(i, identity, *xy[i, identity]) for identity in np.flatnonzero(there)]
     return _tracks(rows)
 
 

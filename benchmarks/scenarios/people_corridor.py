@@ -200,12 +200,12 @@ def hidden_feet(frame: np.ndarray, feet: np.ndarray, boxes: np.ndarray) -> np.nd
 def interpolated(frame: np.ndarray, identity: np.ndarray, xy: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """(n, 2) places, those that are hidden between others of the same person on the line from one to the next."""
     found = xy.copy()
-    for who in np.unique(identity):
-        shown = np.flatnonzero((identity == who) & ~hidden)
+    for one in np.unique(identity):
+        shown = np.flatnonzero((identity == one) & ~hidden)
         shown = shown[np.argsort(frame[shown])]
         if len(shown):
             first, last = frame[shown[[0, -1]]]
-            rows = np.flatnonzero((identity == who) & hidden & (frame > first) & (frame < last))
+            rows = np.flatnonzero((identity == one) & hidden & (frame > first) & (frame < last))
             found[rows] = np.stack([np.interp(frame[rows], frame[shown], xy[shown, i]) for i in (0, 1)], axis=-1)
     return found
 

@@ -5,8 +5,9 @@ background (median of every 20th frame) and tracked with the constants that ever
 frames from the first to the last of the file of truth, `gt_0_399.csv` or what `--truth` names (columns `frame`, `id`,
 `x_m`, `y_m` and, if there is one, `in_area`). Names without a suffix are of the tracks that remain of a recording,
 smoothed and from before their confirmation; `_filtered` is what was known of the confirmed at every frame, `_simple` is
-without a tracker: blobs that differ from the background, projected back to the floor and linked to the nearest. A
-folder given with `--out` receives `tracks.csv` and `floor_plan.png`.
+without a tracker: blobs that differ from the background, projected back to the floor and linked to the nearest.
+`_merged` metrics count people who return under another identity of `gt_0_399.csv` as the same (`_pets.RETURNED_AS`);
+there are none with `--truth`. A folder given with `--out` receives `tracks.csv` and `floor_plan.png`.
 """
 
 import csv
@@ -23,7 +24,7 @@ from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, evaluate, floor_tracks
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._floor_plan import draw_floor_plan
-from jaxfilters.benchmarks.scenarios._pets import SHAPE, Pets, images, load_pets
+from jaxfilters.benchmarks.scenarios._pets import SHAPE, Pets, images, load_pets, merged, merged_metrics
 from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
 from jaxfilters.trackers.people.recorded import Sighting, smoothed
 from jaxfilters.trackers.people.session import PeopleSession
@@ -39,7 +40,7 @@ IN_METRES = ("mean_error_m", "radial_error_m", "lateral_error_m", "radial_bias_m
 COUNTED = ("id_switches", "transfers", "false_positives", "misses", "fragmentations")
 
 
-class Followed(NamedTuple):
+class VideoRun(NamedTuple):
     """What the tracker made of the video."""
 
     confirmed: list[tuple[int, int, float, float]]
@@ -73,6 +74,8 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
         estimate = within(rows, pets, covered)
         scores = evaluate(annotated, estimate, camera_xy_m=np.asarray(pets.camera.position())[:2])
         metrics |= score_metrics(scores, suffix)
+        if truth is None:
+            metrics |= merged_metrics(evaluate(merged(annotated), estimate), suffix)
     metrics |= _speed(followed)
     if out is not None:
         write_tracks(out / "tracks.csv", kept)
@@ -80,7 +83,7 @@ def run(*, quick: bool, seed: int, out: Path | None, truth: Path | None = None) 
     return metrics
 
 
-def follow_video(pets: Pets, frames: int | None) -> Followed:
+def follow_video(pets: Pets, frames: int | None) -> VideoRun:
     """As `jaxfilters track people` follows the first frames of the video; all of them without a number."""
     session = PeopleSession(pets.scene)
     session.prime([[image for i, image in enumerate(images(pets)) if i % PRIME_EVERY == 0]])
@@ -103,7 +106,7 @@ def follow_video(pets: Pets, frames: int | None) -> Followed:
             sys.stderr.write(f"  {i + 1} frames\n")
         before = time.perf_counter()
     inputs, subtracting, tracking = np.transpose(clocks)
-    return Followed(confirmed, session.tracks.recorder.tracks, tracking, subtracting, inputs)
+    return VideoRun(confirmed, session.tracks.recorder.tracks, tracking, subtracting, inputs)
 
 
 def blobs(pets: Pets, frames: int) -> list[tuple[int, int, float, float]]:
@@ -169,7 +172,7 @@ def write_tracks(path: Path, tracks: dict[int, list[Sighting]]) -> None:
             )
 
 
-def _speed(followed: Followed) -> dict[str, Metric]:
+def _speed(followed: VideoRun) -> dict[str, Metric]:
     tracking = followed.tracking_s
     both = tracking + followed.background_s
     rates = {"tracking": tracking, "with_background": both, "with_video": both + followed.input_s}

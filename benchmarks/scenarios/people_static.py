@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.scenarios import _static_people as static
-from jaxfilters.benchmarks.scenarios._static_people import BODY_M, LOOKS, MODEL_M, Estimates, Look, Runs
+from jaxfilters.benchmarks.scenarios._static_people import APPEARANCES, BODY_M, MODEL_M, Appearance, Estimates, Runs
 from jaxfilters.models.calibration import Calibration
 from jaxfilters.models.synthetic.standing_person import Flaws
 from jaxfilters.trackers.people.state import PeopleConfig
@@ -64,7 +64,7 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     del out
     seeds = range(seed, seed + (QUICK_NUM_SEEDS if quick else NUM_SEEDS))
     first, second = Rooms(static.camera_1()), Rooms(static.camera_2())
-    metrics = accuracy_metrics(seeds, first, second, ("shadow",) if quick else tuple(LOOKS))
+    metrics = accuracy_metrics(seeds, first, second, ("shadow",) if quick else tuple(APPEARANCES))
     metrics |= desk_metrics(seeds, first)
     metrics |= crossing_metrics(seeds, {"": first, "_camera2": second})
     metrics |= gap_metrics(seeds, first, QUICK_GAPS_M if quick else GAPS_M)
@@ -90,22 +90,22 @@ class Rooms:
             "_paper": lambda runs: static.run_paper(self.paper, runs),
         }
 
-    def simulate(self, seeds: range, name: str, points, look: Look, **options) -> Runs:
+    def simulate(self, seeds: range, name: str, points, appearance: Appearance, **options) -> Runs:
         """A person at each of the points, for every seed; the numbers drawn depend on the seed and the name."""
         still = np.broadcast_to(np.asarray(points, float)[:, None, None], (len(points), NUM_FRAMES, 1, 2))
-        return self.simulate_moving(seeds, name, still, look, **options)
+        return self.simulate_moving(seeds, name, still, appearance, **options)
 
-    def simulate_moving(self, seeds: range, name: str, truth: np.ndarray, look: Look, **options) -> Runs:
+    def simulate_moving(self, seeds: range, name: str, truth: np.ndarray, appearance: Appearance, **options) -> Runs:
         """The same of people (runs, frames, people, 2) who move."""
         number = zlib.crc32(name.encode())
         keys = [jax.random.fold_in(jax.random.key(seed), number) for seed in seeds]
-        parts = [static.simulate(key, self.calibration, truth, look, **options) for key in keys]
+        parts = [static.simulate(key, self.calibration, truth, appearance, **options) for key in keys]
         truth, starts, masks = (np.concatenate([part[i] for part in parts]) for i in range(3))
         desks = [part.desks for part in parts if part.desks is not None]
         return Runs(truth, starts, masks, np.concatenate(desks) if desks else None)
 
 
-def accuracy_metrics(seeds: range, first: Rooms, second: Rooms, looks: tuple[str, ...]) -> dict[str, Metric]:
+def accuracy_metrics(seeds: range, first: Rooms, second: Rooms, appearances: tuple[str, ...]) -> dict[str, Metric]:
     """E1: table 1 of the paper, at the end of eight frames."""
     metrics: dict[str, Metric] = {}
     for name, points in GROUPS.items():
@@ -113,13 +113,13 @@ def accuracy_metrics(seeds: range, first: Rooms, second: Rooms, looks: tuple[str
         unknown = rooms.trackers(height_m=None)[""]
         halving = lambda runs, rooms=rooms: static.run_paper(rooms.halving, runs)
         trackers = {**rooms.trackers(), "_halving": halving, "_unknown_height": unknown}
-        for look in looks:
-            size = MODEL_M if LOOKS[look].is_ellipsoid else BODY_M
-            runs = rooms.simulate(seeds, f"accuracy {name}", points, LOOKS[look], sizes_m=(size,))
+        for appearance in appearances:
+            size = MODEL_M if APPEARANCES[appearance].is_ellipsoid else BODY_M
+            runs = rooms.simulate(seeds, f"accuracy {name}", points, APPEARANCES[appearance], sizes_m=(size,))
             for suffix, track in trackers.items():
                 found = _errors(f"_{name}{suffix}", runs, track(runs))
-                _say(f"  {name:8} {look:10} {suffix[1:]:15}", found)
-                metrics |= found if look == "shadow" else {}
+                _say(f"  {name:8} {appearance:10} {suffix[1:]:15}", found)
+                metrics |= found if appearance == "shadow" else {}
     return metrics
 
 
@@ -139,7 +139,7 @@ def desk_metrics(seeds: range, rooms: Rooms) -> dict[str, Metric]:
         ("desk_a", GROUPS["a"], True),
         ("desk_b", GROUPS["b"], True),
     ):
-        runs = rooms.simulate(seeds, f"desk {name}", points, LOOKS["holes"], with_desk=with_desk)
+        runs = rooms.simulate(seeds, f"desk {name}", points, APPEARANCES["holes"], with_desk=with_desk)
         for suffix, track in rooms.trackers().items():
             estimates = track(runs)
             found = _errors(f"_{name}{suffix}", runs, estimates) if with_desk else {}
@@ -156,7 +156,7 @@ def crossing_metrics(seeds: range, rooms: dict[str, Rooms]) -> dict[str, Metric]
     metrics: dict[str, Metric] = {}
     for camera, room in rooms.items():
         truth = _paths(CROSSING_M)[None]
-        runs = room.simulate_moving(seeds, "crossing", truth, LOOKS["shadow"], sizes_m=CROSSING_SIZES_M)
+        runs = room.simulate_moving(seeds, "crossing", truth, APPEARANCES["shadow"], sizes_m=CROSSING_SIZES_M)
         for suffix, track in room.trackers(height_m=None).items():
             estimates = track(runs)
             errors = np.linalg.norm(estimates.xy - runs.truth, axis=-1).mean(axis=(0, 1))
@@ -176,7 +176,7 @@ def gap_metrics(seeds: range, rooms: Rooms, gaps: tuple[float, ...]) -> dict[str
     for gap in gaps:
         near, far = GAP_Y_M, GAP_Y_M + gap
         truth = _paths((((-1.9, near), (-0.1, near)), ((-0.1, far), (-1.9, far))))[None]
-        runs = rooms.simulate_moving(seeds, f"gap {gap}", truth, LOOKS["holes"], sizes_m=CROSSING_SIZES_M)
+        runs = rooms.simulate_moving(seeds, f"gap {gap}", truth, APPEARANCES["holes"], sizes_m=CROSSING_SIZES_M)
         for suffix, track in rooms.trackers(height_m=None).items():
             confused.setdefault(suffix, []).append(float(_confused(runs, track(runs)).mean()))
     metrics = {}
@@ -207,7 +207,7 @@ def height_metrics(seeds: range, rooms: Rooms, heights: tuple[float, ...]) -> di
     metrics: dict[str, Metric] = {}
     for factor in heights:
         size = (MODEL_M[0] * factor, BODY_M[1])
-        runs = rooms.simulate(seeds, "heights", GROUPS["a"], LOOKS["holes"], sizes_m=(size,))
+        runs = rooms.simulate(seeds, "heights", GROUPS["a"], APPEARANCES["holes"], sizes_m=(size,))
         for suffix, track in rooms.trackers(height_m=None).items():
             metrics[f"height_error_m_{100 * factor:.0f}{suffix}"] = _error(runs, track(runs))
     _say("  heights", metrics)
@@ -221,10 +221,13 @@ def limit_metrics(seeds: range, rooms: Rooms) -> dict[str, Metric]:
     K[:2, 2] = calibration.K[:2, 2]
     small = Rooms(calibration._replace(K=K))
     metrics: dict[str, Metric] = {}
-    cases = [(f"missing_{100 * share:.0f}", rooms, Look(flaws=Flaws(share))) for share in MISSING]
-    cases += [("small", small, Look(flaws=Flaws())), ("small_with_blob", small, Look(flaws=Flaws(), with_blob=True))]
-    for name, room, look in cases:
-        runs = room.simulate(seeds, name, GROUPS["a"], look)
+    cases = [(f"missing_{100 * share:.0f}", rooms, Appearance(flaws=Flaws(share))) for share in MISSING]
+    cases += [
+        ("small", small, Appearance(flaws=Flaws())),
+        ("small_with_blob", small, Appearance(flaws=Flaws(), with_blob=True)),
+    ]
+    for name, room, appearance in cases:
+        runs = room.simulate(seeds, name, GROUPS["a"], appearance)
         for suffix, track in room.trackers().items():
             metrics[f"{name}_error_m{suffix}"] = _error(runs, track(runs))
     _say("  limits", metrics)
@@ -240,7 +243,7 @@ def basin_metrics(seeds: range, rooms: Rooms) -> dict[str, Metric]:
         "_paper_track": lambda runs: static.run_paper(rooms.paper, runs, mode=TRACK),
     }
     for offset in OFFSETS_M:
-        runs = rooms.simulate(seeds, "basin", GROUPS["a"], LOOKS["body"], start_offset_m=_circle(offset))
+        runs = rooms.simulate(seeds, "basin", GROUPS["a"], APPEARANCES["body"], start_offset_m=_circle(offset))
         for suffix, track in trackers.items():
             off = np.linalg.norm(track(runs).xy[:, -1, 0] - runs.truth[:, -1, 0], axis=-1)
             share = Metric(float((off < FOUND_M).mean()), "", "higher")

@@ -99,15 +99,15 @@ def people_metrics(quick: bool, seed: int) -> dict[str, Metric]:
     images = [room.image(0, i) for i in range(len(room))]
     scene = people.people_scene(room.cameras, room.floor, furniture=room.furniture)
     tracks = people.track([[image] for image in images], [i / room.fps for i in range(len(room))], scene)
-    ours = [(one.frame, who, *one.mean[:2]) for who, track in tracks.items() for one in track]
+    ours = [(one.frame, identity, *one.mean[:2]) for identity, track in tracks.items() for one in track]
     empty = np.median(np.stack(images), axis=0).astype(np.uint8)
-    present = [(i, who) for i in range(len(room)) for who in np.flatnonzero(room.present(i))]
+    present = [(i, identity) for i in range(len(room)) for identity in np.flatnonzero(room.present(i))]
     frames, whose = zip(*present, strict=True)
-    truth = floor_tracks(frames, whose, np.stack([room.routes.xy[i, who] for i, who in present]))
+    truth = floor_tracks(frames, whose, np.stack([room.routes.xy[i, identity] for i, identity in present]))
     found: dict[str, Metric] = {}
     for name, rows in (("", ours), ("_simple", simplest.followed_blobs(images, empty, room.cameras[0]))):
-        frame, who, x, y = zip(*rows, strict=True)
-        scores = evaluate(truth, floor_tracks(frame, who, np.stack([x, y], axis=-1)))
+        frame, identity, x, y = zip(*rows, strict=True)
+        scores = evaluate(truth, floor_tracks(frame, identity, np.stack([x, y], axis=-1)))
         found[f"people_mota{name}"] = Metric(float(scores.mota), "%", "higher")
         found[f"people_error_m{name}"] = Metric(float(scores.mean_error_m), "m", "lower")
     return found

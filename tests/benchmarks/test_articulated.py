@@ -54,3 +54,26 @@ def test_who_is_off_by_more_than_45_degrees_has_diverged():
     found.means[0, -1, paper.LAYOUT.angles.start] = np.radians(50)
     found.means[1, 0, paper.LAYOUT.angles.start] = np.radians(50)
     assert paper.diverged(found).tolist() == [True, False]
+
+
+def test_drawn_starts_are_judged_seed_by_seed_with_and_without_those_that_end_in_another_mode(monkeypatch, capsys):
+    """NEES of 6, 1.5 and, with all angles 10 degrees off, 600; right is chi-squared with six degrees of freedom."""
+    truth = np.zeros((3, 55, paper.LAYOUT.size))
+    means = truth.copy()
+    means[..., paper.LAYOUT.static] += np.array([1.0, 0.5, 10.0])[:, None, None]
+    means[2, :, paper.LAYOUT.angles] += np.radians(10)
+    found = paper.Runs(truth, means, np.broadcast_to(np.eye(9), (3, 55, 9, 9)))
+    assert paper.in_other_mode(found).tolist() == [False, False, True]
+    assert not paper.diverged(found).any()
+    monkeypatch.setattr(paper, "run_drawn", lambda mode, shape, seeds: found)
+    value = {name: metric.value for name, metric in articulated.drawn_metrics(range(3)).items()}
+    of = {name: value[f"drawn_nees_lengths_{name}_recommended_shape1"] for name in ("mean", "median", "quantile95")}
+    assert of == pytest.approx({"mean": 607.5 / 3, "median": 6.0, "quantile95": 0.1 * 6 + 0.9 * 600})
+    assert value["drawn_other_mode_share_recommended_shape2"] == pytest.approx(1 / 3)
+    # The band of one seed is 1.24 to 14.4.
+    assert value["drawn_nees_lengths_in_band_share_recommended_shape1"] == pytest.approx(2 / 3)
+    in_mode = {name: value[f"drawn_nees_lengths_{name}_in_mode_recommended_shape1"] for name in ("mean", "median")}
+    assert in_mode == pytest.approx({"mean": 3.75, "median": 3.75})
+    assert value["drawn_nees_lengths_in_band_share_in_mode_recommended_shape1"] == 1
+    assert value["drawn_coverage_2sigma_in_mode_recommended_shape1"] == 1
+    assert "6  1.5  600*" in capsys.readouterr().out

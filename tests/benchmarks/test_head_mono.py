@@ -4,13 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.benchmarks.scenarios import _mono_detected, _mono_runs, head_mono
+from jaxfilters.benchmarks.scenarios import _mono_detected, _mono_real, _mono_runs, head_mono
 from jaxfilters.benchmarks.scenarios._mono_real import _by_yaw
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, eyes_apart_of, follow_all, talking_head
 from jaxfilters.models.face.landmarks import MEAN_SHAPE
 from jaxfilters.models.face.multilinear import shape
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
+from jaxfilters.models.synthetic.ict_face import IctModel
+from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.state import MonoTrack
@@ -138,6 +140,36 @@ def test_detected_people_stand_beside_solve_pnp():
     assert metrics["mesh_pitch_rms_deg_modelled"].value == pytest.approx(5.0)  # of whom there are meshes
     assert metrics["coverage2_z_modelled"].value == pytest.approx(50.0)
     assert metrics["lost_share_modelled"].value == pytest.approx(50.0)
+
+
+class Placed(IctSequence):
+    """The poses of a modelled person, without a face or images."""
+
+    def __init__(self, poses):
+        object.__setattr__(self, "poses", poses)
+
+
+def test_people_at_several_distances_have_rows_of_their_own(monkeypatch):
+    """Stand-ins for the renderer and the tracker, which is 1 % too far: each row has the errors of its distance."""
+    points, indices = jnp.zeros((4, 3)), jnp.zeros(68, int)
+    model = IctModel(points, points[None], points[None], indices, jnp.zeros((2, 3), int), ("jawOpen",))
+    monkeypatch.setattr(_mono_real, "ict_sequence", lambda key, model, poses, **how: Placed(poses))
+
+    def film(person, stretch, **how):
+        return _mono_real.filmed(model, np.zeros((5, 3)), np.zeros((5, 1)), person, 60, **how)
+
+    def run(made, face, detector, seed):
+        z = made.poses[0, 2]
+        return detected([0, 0, 0.01 * z, 0, 0, 0], np.zeros(6), 1.0, distance=z)
+
+    monkeypatch.setattr(_mono_detected, "filming", lambda *_: film)
+    monkeypatch.setattr(_mono_detected, "available_detectors", lambda: {"cascades": None, "mediapipe": None})
+    monkeypatch.setattr(_mono_detected, "detected_run", run)
+    metrics = _mono_detected.distance_metrics(False, 0)
+    for mm in (300, 650, 1500):
+        for detector in ("", "_mediapipe"):
+            assert metrics[f"z_error_mm_modelled_at_{mm}mm{detector}"].value == pytest.approx(0.01 * mm)
+            assert metrics[f"z_bias_share_modelled_at_{mm}mm{detector}"].value == pytest.approx(1.0)
 
 
 def test_solve_pnp_finds_the_mean_face_where_it_is():

@@ -46,6 +46,7 @@ def fake_run(errors, *, std=1.0, shapes=None, contributions=(0.5,)):
         image_points=uv[1:],
         score=np.ones(t),
         effective_sample_size=np.ones(t),
+        innovations=np.zeros((t, 2), int),
         status=np.full(t, RIGID, np.int32),
     )
     return HeadRun(track, truth, np.asarray(contributions))

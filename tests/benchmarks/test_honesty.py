@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 
+from jaxfilters.benchmarks import results_page
 from jaxfilters.benchmarks.harness import main
+from jaxfilters.benchmarks.metrics import report
 from jaxfilters.benchmarks.multi_object import floor_tracks
 from jaxfilters.benchmarks.scenarios import _claims, honesty
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording
 from jaxfilters.trackers.people.recorded import Sighting
+
+ENVIRONMENT = {"jaxfilters": "0", "jax": "0", "numpy": "0", "python": "0", "cpu": "c", "cores": 1, "device": "d"}
 
 
 def claims_of(scale, phi=0.0, recordings=8, frames=500):
@@ -45,13 +49,47 @@ def test_claims_that_are_too_narrow_show_in_every_number_and_lasting_errors_are_
 
 
 @pytest.mark.system
-def test_metrics_and_the_table_name_system_data_and_coordinates():
+def test_metrics_hold_all_that_the_table_prints_and_the_page_has_a_row_for_each_coordinate():
     claims = claims_of(1.0, frames=50)
     scores = _claims.judge(claims)
     metrics = _claims.metrics_of(claims, scores)
     assert {"coverage2_system_data", "nees_system_data", "coverage2_system_data_b_deg"} <= set(metrics)
     assert metrics["crps_system_data_a_mm"].unit == "mm"
-    assert "a_mm" in _claims.table([(claims, scores)])
+    value = {name: metric.value for name, metric in metrics.items()}
+    for i, coordinate in enumerate(claims.coordinates):
+        of = f"system_data_{coordinate}"
+        shares = [value[f"coverage{sigma}_{of}"] for sigma in (1, 2, 3)]
+        np.testing.assert_allclose(shares, 100 * scores.coverage[:, i])
+        ends = [value[f"{end}_coverage2_{of}"] for end in ("lower", "upper")]
+        np.testing.assert_allclose(ends, 100 * scores.interval[:, i])
+        errors = np.concatenate([recording.errors[:, i] for recording in claims.recordings])
+        assert value[f"rmse_{of}"] == pytest.approx(np.sqrt(np.mean(errors**2)))
+        assert value[f"autocorrelation_{of}"] == scores.autocorrelation[i]
+    band = [value[f"{end}_nees_system_data"] for end in ("lower", "upper")]
+    assert band == pytest.approx([end / 2 for end in scores.nees_band])
+    assert value["log_score_system_data"] == scores.log_score
+    assert "rmse_system_data" not in metrics  # millimetres and degrees
+
+    page = results_page.results_page([report("honesty", metrics, ENVIRONMENT)], {})
+    (row,) = [line for line in page.splitlines() if line.startswith("| `system_data_b_deg` |")]
+    assert f"| {value['coverage1_system_data_b_deg']:.4g} % | {value['coverage2_system_data_b_deg']:.4g} % |" in row
+    assert row.endswith(f"| {value['rmse_system_data_b_deg']:.4g} deg |")
+    assert "| `rmse_system" not in page  # no line for each metric
+    table = _claims.table([(claims, scores)])
+    assert "a_mm" in table
+    assert "rmse" in table
+
+
+def test_unknown_metrics_are_left_out_and_shown_as_a_dash():
+    """One recording has no interval of its coverage; coordinates of one unit have a common error."""
+    errors = np.array([[3.0, 1.0], [3.0, 1.0]])
+    claims = Claims("s", "d", ("x_mm", "y_mm"), [Recording(errors, np.ones((2, 2)))])
+    metrics = _claims.metrics_of(claims, _claims.judge(claims))
+    assert "lower_coverage2_s_d_x_mm" not in metrics
+    assert metrics["rmse_s_d"].value == pytest.approx(np.sqrt(5))
+    page = results_page.results_page([report("honesty", metrics | {"other": metrics["rmse_s_d"]}, ENVIRONMENT)], {})
+    assert "| `s_d` |" in page
+    assert "| `other` | 2.236 | mm | lower |" in page
 
 
 def test_frames_without_estimate_or_claim_do_not_count():

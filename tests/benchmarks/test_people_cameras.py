@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.benchmarks.multi_object import floor_tracks
-from jaxfilters.benchmarks.scenarios import _pom, people_cameras
+from jaxfilters.benchmarks.scenarios import _pets_two, _pom, people_cameras
 from jaxfilters.benchmarks.scenarios.people_cameras import SETUPS, Setup, handovers, joined, sees_whole, truth
 from jaxfilters.trackers.people import demo_room as demo
 from jaxfilters.trackers.people.demo_room import demo_room
@@ -101,6 +101,22 @@ def test_nobody_is_lost_between_four_cameras(monkeypatch):
         assert scores.id_switches == 0, suffix
         assert scores.mean_error_m < 0.1, suffix
         assert scores.mota > 80, suffix
+
+
+def test_the_better_view_is_scored_with_merged_identities_as_well(monkeypatch, tmp_path):
+    """View 6 alone loses a third of the positions; view 1 and both follow 14 and 15 as one identity."""
+    truth = floor_tracks(range(6), [15, 15, 15, 14, 14, 14], [(float(i), 0.0) for i in range(6)])
+    one = truth._replace(identity=np.full(6, 7))
+    lost = one._replace(frame=one.frame[:4], identity=one.identity[:4], xy_m=one.xy_m[:4])
+    monkeypatch.setattr(_pets_two, "_area", lambda folder: None)
+    monkeypatch.setattr(_pets_two, "_annotated", lambda path, area, frames: truth)
+    monkeypatch.setattr(_pets_two, "follow", lambda folder, views, *more: lost if views == (6,) else one)
+    metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False)
+    value = {name: metric.value for name, metric in metrics.items()}
+    for suffix in ("_two", "_one", "_two_refit", "_one_refit"):
+        assert (value[f"mota{suffix}"], value[f"idf1{suffix}"], value[f"transfers{suffix}"]) == (100, 50, 1)
+        assert (value[f"idf1_merged{suffix}"], value[f"transfers_merged{suffix}"]) == (100, 0)
+        assert value[f"id_switches_merged{suffix}"] == 0
 
 
 @pytest.mark.data

@@ -1,11 +1,13 @@
 """The scenario on a real video: its truth, its furniture, its pictures, and a few frames where the recording lies."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
 from jaxfilters.benchmarks.harness import main
-from jaxfilters.benchmarks.multi_object import floor_tracks
+from jaxfilters.benchmarks.multi_object import evaluate, floor_tracks
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios import _pets, people_pets
 from jaxfilters.benchmarks.scenarios._floor_plan import TRUTH_COLOR, draw_floor_plan
@@ -51,6 +53,47 @@ def test_files_that_are_no_truth_are_named(tmp_path, text, message):
     assert str(path) in str(error.value)
     with pytest.raises(RecordingError, match="is no file of truth"):
         people_pets.read_truth(tmp_path / "missing.csv", PETS)
+
+
+def test_people_who_return_under_another_identity_can_count_as_the_same():
+    """Tracked as one identity throughout: a transfer and half of the positions wrong with the file's identities."""
+    truth = floor_tracks(range(8), [15, 15, 15, 15, 14, 14, 14, 14], [(float(i), 0.0) for i in range(8)])
+    other = floor_tracks([0, 1], [1, 1], [(0.0, 5.0), (0.0, 5.0)])
+    both = floor_tracks(*(np.concatenate(pair) for pair in zip(truth, other, strict=True)))
+    estimate = both._replace(identity=np.where(both.identity == 1, 1, 3))
+    published, same = evaluate(both, estimate), evaluate(_pets.merged(both), estimate)
+    assert (published.idf1, published.transfers, published.id_switches) == (pytest.approx(100 * 12 / 20), 1, 0)
+    value = {name: metric.value for name, metric in _pets.merged_metrics(same, "_two").items()}
+    assert value == {"idf1_merged_two": 100.0, "id_switches_merged_two": 0, "transfers_merged_two": 0}
+    # A tracker that does as the file does has a switch then.
+    renamed = evaluate(_pets.merged(both), both)
+    assert (renamed.id_switches, renamed.idf1) == (1, pytest.approx(100 * 12 / 20))
+
+
+@pytest.mark.parametrize("with_truth", [False, True])
+def test_identities_are_merged_for_the_annotations_of_the_recording_only(monkeypatch, tmp_path, with_truth):
+    """Another file may have other numbers; the stand-in follows 14 and 15 as one identity."""
+    rows = "frame,id,x_m,y_m,in_area\n0,15,1,1,1\n1,15,1,1,1\n2,14,1,1,1\n"
+    (tmp_path / "gt_0_399.csv").write_text(rows)
+    camera = FloorCamera.from_matrix([[100, 0, 0, 0], [0, 0, -100, 300], [0, 1, 0, 5]], (120, 160))
+    scene = SimpleNamespace(config=PeopleConfig())
+    pets = PETS._replace(folder=tmp_path, camera=camera, scene=scene)
+    mean = np.array([1.0, 1.0, 0, 0, 1.7, 0.45])
+    tracks = {4: [Sighting(i, i / 7, mean, np.eye(6), 1.0, 0, "tracked") for i in range(3)]}
+    followed = people_pets.VideoRun([(i, 4, 1.0, 1.0) for i in range(3)], tracks, *np.ones((3, 3)))
+    monkeypatch.setattr(people_pets, "recording_folder", lambda name: tmp_path)
+    monkeypatch.setattr(people_pets, "load_pets", lambda folder, config: pets)
+    monkeypatch.setattr(people_pets, "follow_video", lambda pets, frames: followed)
+    monkeypatch.setattr(people_pets, "smoothed", lambda config, tracks: tracks)
+    monkeypatch.setattr(people_pets, "blobs", lambda pets, frames: followed.confirmed)
+    metrics = people_pets.run(quick=False, seed=0, out=None, truth=tmp_path / "gt_0_399.csv" if with_truth else None)
+    assert metrics["transfers"].value == 1
+    assert metrics["idf1"].value == pytest.approx(100 * 2 / 3)
+    assert ("idf1_merged" in metrics) != with_truth
+    if not with_truth:
+        for suffix in ("", "_filtered", "_simple"):
+            assert metrics[f"transfers_merged{suffix}"].value == 0
+            assert metrics[f"idf1_merged{suffix}"].value == 100
 
 
 def test_estimates_count_within_the_frames_and_the_area():
@@ -138,7 +181,11 @@ def test_the_recording_is_read_as_it_lies(data_dir):
     assert np.mean(pets.is_inside(xy) == rows["in_area"].astype(bool)) > 0.99
     uv, _ = pets.camera.project(np.insert(xy, 2, 0.0, axis=1).astype(np.float32))
     assert np.all((uv[:, 0] > rows["box_xmin"] - 15) & (uv[:, 0] < rows["box_xmax"] + 15))
-    assert len(people_pets.read_truth(path, pets).frame) == int(rows["in_area"].sum())
+    truth = people_pets.read_truth(path, pets)
+    assert len(truth.frame) == int(rows["in_area"].sum())
+    # Nobody is merged with a person who is there at the same time, and all who are merged exist.
+    assert set(_pets.RETURNED_AS) | set(_pets.RETURNED_AS.values()) <= set(truth.identity.tolist())
+    assert len(np.unique(_pets.merged(truth).identity)) == len(np.unique(truth.identity)) - len(_pets.RETURNED_AS)
     image = next(_pets.images(pets))
     assert image.shape == (*_pets.SHAPE, 3)
 

@@ -8,21 +8,60 @@ from jaxfilters.benchmarks.scenarios import people_speed
 from jaxfilters.trackers.people.state import TRACKED
 
 
-def test_people_in_the_crowd_keep_apart():
-    """The nearest two of 32 are farther apart than two widths; fewer people are some of the same ones."""
-    places, sizes = people_speed.crowd(0, people_speed.CAPACITY)
+@pytest.mark.parametrize(("setting", "count"), [(people_speed.ROOM, 32), (people_speed.CROWD, 50)])
+def test_people_in_the_crowd_keep_apart(setting, count):
+    """The nearest two are farther apart than a width; fewer people are some of the same ones."""
+    places, sizes = people_speed.crowd(0, setting.capacity, setting)
+    assert len(places) == len(sizes) == count
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + 9 * np.eye(len(places))
     assert apart.min() > 0.5
-    some, some_sizes = people_speed.crowd(0, 3)
+    some, some_sizes = people_speed.crowd(0, 3, setting)
     np.testing.assert_array_equal(some, places[:3])
     np.testing.assert_array_equal(some_sizes, sizes[:3])
     low, high = np.min(people_speed.FLOOR_M, axis=0), np.max(people_speed.FLOOR_M, axis=0)
     assert np.all((places > low + 0.5) & (places < high - 0.5))
 
 
+def test_a_crowd_of_fifty_is_in_the_image():
+    """Feet and heads, so that everybody can be followed."""
+    camera = people_speed.floor_camera(
+        people_speed._pinhole(people_speed.CROWD_SHAPE), people_speed.looking(*people_speed.CROWD.camera)
+    )
+    places, sizes = people_speed.crowd(0, 50, people_speed.CROWD)
+    for height in (np.zeros(50), sizes[:, 0]):
+        uv, depth = camera.project(jnp.asarray(np.column_stack([places, height]), jnp.float32))
+        assert np.all((np.asarray(uv) > 0) & (np.asarray(uv) < [639, 479]))
+        assert np.all(np.asarray(depth) > 0)
+
+
+def test_a_crowd_and_the_background_have_rows_of_their_own(monkeypatch):
+    """30 people take 20 ms and 50 take 30: 1.5 times; the background takes 4 ms wherever it is measured alone."""
+    people = people_speed._followed(people_speed.PeopleConfig(capacity=4), *people_speed.crowd(0, 2))
+    made = []
+
+    def recording(seed, count, shape, setting=people_speed.ROOM):
+        made.append((count, shape, setting))
+        return people_speed.Recording(None, people, None, None)
+
+    def interleaved(calls, rounds):
+        return {
+            name: {"tracking_fps_30_people": 0.02, "tracking_fps_50_people": 0.03}.get(name, 0.004) for name in calls
+        }
+
+    monkeypatch.setattr(people_speed, "recording", recording)
+    monkeypatch.setattr(people_speed, "foreground", lambda recording: None)
+    monkeypatch.setattr(people_speed, "interleaved", interleaved)
+    metrics = people_speed.run(quick=False, seed=0, out=None)
+    assert metrics["tracking_fps_50_people_640x480"].value == pytest.approx(1 / 0.03)
+    assert metrics["tracking_growth_30_to_50_people"].value == pytest.approx(1.5)
+    assert metrics["background_ms_1080p"].value == pytest.approx(4.0)
+    assert made[-2:] == [(count, (480, 640), people_speed.CROWD) for count in (30, 50)]
+    assert "background_ms_1080p" not in people_speed.run(quick=True, seed=0, out=None)
+
+
 def test_rates_are_of_the_times_and_of_who_is_followed(monkeypatch):
     """With one person 10 and 8 ms a frame, with eight 24 and 22: two more for each of the seven others."""
-    config = people_speed.PeopleConfig(capacity=people_speed.CAPACITY)
+    config = people_speed.PeopleConfig(capacity=people_speed.ROOM.capacity)
     recordings = {
         count: people_speed.Recording(None, people_speed._followed(config, *people_speed.crowd(0, count)), None, None)
         for count in (1, 8)

@@ -1,4 +1,4 @@
-"""The scenario of people in front of the paper's cameras: scenes, and section 4 of the specification."""
+"""The scenario of people in front of the paper's cameras: scenes, and errors within bounds."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,15 @@ import pytest
 
 from jaxfilters.benchmarks.scenarios import _static_people as static
 from jaxfilters.benchmarks.scenarios import people_static
-from jaxfilters.benchmarks.scenarios._static_people import BODY_M, LOOKS, MODEL_M, SHAPE, Estimates, Look, Runs
+from jaxfilters.benchmarks.scenarios._static_people import (
+    APPEARANCES,
+    BODY_M,
+    MODEL_M,
+    SHAPE,
+    Appearance,
+    Estimates,
+    Runs,
+)
 from jaxfilters.benchmarks.scenarios.people_static import GROUPS, HALVING, PAPER
 
 pytestmark = pytest.mark.optimised
@@ -45,7 +53,7 @@ def test_the_cameras_show_what_the_paper_says(first, second):
         (first, GROUPS["a"], 2.5, 8.0),
         (second, GROUPS["camera2"], 0.7, 3.0),
     ):
-        runs = rooms.simulate(range(1), "shares", points, LOOKS["ellipsoid"], sizes_m=(MODEL_M,))
+        runs = rooms.simulate(range(1), "shares", points, APPEARANCES["ellipsoid"], sizes_m=(MODEL_M,))
         shares = 100 * runs.masks[:, 0].mean(axis=(1, 2))
         assert low < shares.min() < shares.max() < high
 
@@ -64,7 +72,8 @@ def test_lens_distortion_goes_into_the_images_and_out_again():
 @pytest.mark.system
 def test_a_desk_stands_in_front_of_the_person_and_hides_the_legs(first):
     open_view, behind_desk = (
-        first.simulate(range(1), "desk", ((-1, 1),), LOOKS["body"], with_desk=with_desk) for with_desk in (False, True)
+        first.simulate(range(1), "desk", ((-1, 1),), APPEARANCES["body"], with_desk=with_desk)
+        for with_desk in (False, True)
     )
     rows = [np.flatnonzero(runs.masks[0, 0].any(axis=1)) for runs in (open_view, behind_desk)]
     assert rows[0][0] == rows[1][0]
@@ -76,7 +85,7 @@ def test_a_desk_stands_in_front_of_the_person_and_hides_the_legs(first):
 
 @pytest.mark.system
 def test_masks_depend_on_the_key_alone(first):
-    runs = [first.simulate(range(seed, seed + 1), "key", ((-1, 1),), LOOKS["shadow"]) for seed in (3, 3, 4)]
+    runs = [first.simulate(range(seed, seed + 1), "key", ((-1, 1),), APPEARANCES["shadow"]) for seed in (3, 3, 4)]
     np.testing.assert_array_equal(runs[0].masks, runs[1].masks)
     assert (runs[0].masks != runs[2].masks).any()
     assert np.abs(runs[0].starts - runs[0].truth[:, 0]).max() <= 0.15
@@ -87,7 +96,7 @@ def test_the_papers_tracker_meets_the_acceptance_of_table_1(first, second):
     """Section 4, E1: body with holes within 0.06, 0.12, 0.07 and 0.06 m; depth worse than sideways in (a) and (b)."""
     for name, most in {"a": 0.06, "b": 0.12, "c": 0.07, "camera2": 0.06}.items():
         rooms = second if name == "camera2" else first
-        runs = rooms.simulate(SEEDS, f"accuracy {name}", GROUPS[name], LOOKS["holes"])
+        runs = rooms.simulate(SEEDS, f"accuracy {name}", GROUPS[name], APPEARANCES["holes"])
         error, x, y = mean_error(runs, static.run_paper(rooms.paper, runs))
         assert error <= most
         if name in "ab":
@@ -97,8 +106,8 @@ def test_the_papers_tracker_meets_the_acceptance_of_table_1(first, second):
 @pytest.mark.system
 def test_step_halving_meets_its_acceptance(first):
     """Section 4, E1: 0.04 m for bodies (prototype .034), .019 m for ellipsoids."""
-    for look, size, most in (("holes", BODY_M, 0.04), ("ellipsoid", MODEL_M, 0.025)):
-        runs = first.simulate(SEEDS, "halving", GROUPS["a"], LOOKS[look], sizes_m=(size,))
+    for appearance, size, most in (("holes", BODY_M, 0.04), ("ellipsoid", MODEL_M, 0.025)):
+        runs = first.simulate(SEEDS, "halving", GROUPS["a"], APPEARANCES[appearance], sizes_m=(size,))
         assert mean_error(runs, static.run_paper(first.halving, runs))[0] <= most
 
 
@@ -113,7 +122,7 @@ def test_depth_cannot_be_seen_where_head_and_feet_are_hidden(first):
         ("desk_a", GROUPS["a"], True),
         ("desk_b", GROUPS["b"], True),
     ):
-        runs = first.simulate(range(1), f"desk {name}", points, LOOKS["body"], with_desk=with_desk)
+        runs = first.simulate(range(1), f"desk {name}", points, APPEARANCES["body"], with_desk=with_desk)
         estimates = static.run_paper(first.paper, runs)
         flatness[name] = float(estimates.flatness.mean())
         if name == "desk_a":
@@ -128,7 +137,7 @@ def test_a_crossing_pair_keeps_its_identities(first):
     """Section 4, E3: mean error within 0.10 m for both, no exchange (prototype .070, .056)."""
     truth = people_static._paths(people_static.CROSSING_M)[None]
     sizes = people_static.CROSSING_SIZES_M
-    runs = first.simulate_moving(range(1), "crossing", truth, LOOKS["shadow"], sizes_m=sizes)
+    runs = first.simulate_moving(range(1), "crossing", truth, APPEARANCES["shadow"], sizes_m=sizes)
     estimates = static.run_paper(first.paper, runs)
     assert np.linalg.norm(estimates.xy - runs.truth, axis=-1).mean(axis=(0, 1)).max() <= 0.10
     assert not people_static._confused(runs, estimates).any()
@@ -138,7 +147,9 @@ def test_a_crossing_pair_keeps_its_identities(first):
 def test_people_who_are_taller_than_believed_are_placed_wrong_but_not_lost(first):
     """Section 4, E5: within 0.10 m for heights up to 5 percent off."""
     for factor in (0.95, 1.05):
-        runs = first.simulate(range(1), "heights", GROUPS["a"], Look(), sizes_m=((MODEL_M[0] * factor, BODY_M[1]),))
+        runs = first.simulate(
+            range(1), "heights", GROUPS["a"], Appearance(), sizes_m=((MODEL_M[0] * factor, BODY_M[1]),)
+        )
         assert mean_error(runs, static.run_paper(first.paper, runs))[0] <= 0.10
 
 
@@ -148,7 +159,7 @@ def test_binary_images_find_people_from_farther_away_than_ternary_ones(first):
     shares = {}
     for offset in (0.15, 0.5):
         options = dict(start_offset_m=people_static._circle(offset))
-        runs = first.simulate(range(2), "basin", GROUPS["a"], LOOKS["body"], **options)
+        runs = first.simulate(range(2), "basin", GROUPS["a"], APPEARANCES["body"], **options)
         for mode in (people_static.ACQUIRE, people_static.TRACK):
             off = np.linalg.norm(
                 static.run_paper(first.paper, runs, mode=mode).xy[:, -1, 0] - runs.truth[:, -1, 0], axis=-1
@@ -197,7 +208,7 @@ class StandIns(people_static.Rooms):
     def trackers(self, **options):
         return {"": lambda runs: aside(runs, 0.1), "_paper": lambda runs: aside(runs, 0.2)}
 
-    def simulate_moving(self, seeds, name, truth, look, **options):
+    def simulate_moving(self, seeds, name, truth, appearance, **options):
         return Runs(truth, truth[:, 0], None, None)
 
 

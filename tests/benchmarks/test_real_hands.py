@@ -110,7 +110,7 @@ def test_registration_alone_is_told_the_time_between_frames(monkeypatch):
     aside = lambda setup, state, frames, elapsed: (None, jnp.zeros((3, 21, 3)).at[..., 0].set(elapsed[:, None]))
     monkeypatch.setattr(_real_comparison, "registered", aside)
     expected = 1e3 * np.mean([1 / 30, 0.1, 0.3])
-    assert _real_comparison.registration_error(recording, 0) == pytest.approx(expected, rel=1e-5)
+    assert _real_comparison.registration_error(recording, 0).mm == pytest.approx(expected, rel=1e-5)
 
 
 def test_real_hands_are_compared_recording_by_recording(monkeypatch):
@@ -120,7 +120,7 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     recordings = [_real_hands.HandRecording(camera, *empty, float(i)) for i in range(5)]
 
     def error_of(name, each, count=1000):
-        return millimetres[name][int(each.side)] + 100 / count
+        return _real_comparison.RunErrors(millimetres[name][int(each.side)] + 100 / count, int(each.side) // 2)
 
     # At the lower rate only the first four are there.
     monkeypatch.setattr(_real_comparison, "_recordings", lambda quick, every=1: recordings[: 4 if every == 6 else 5])
@@ -130,6 +130,12 @@ def test_real_hands_are_compared_recording_by_recording(monkeypatch):
     found = {name: metric.value for name, metric in _real_comparison.real_metrics(100, True, Finished(None)).items()}
     assert found["joint_error_mm_real_rbpf"] == pytest.approx(8.0)
     assert found["joint_error_mm_real_registration"] == pytest.approx(6.0)
+    assert found["median_joint_error_mm_real_rbpf"] == pytest.approx(8.0)
+    assert found["largest_joint_error_mm_real_rbpf"] == pytest.approx(10.0)
+    assert found["median_joint_error_mm_real_hidden_pf"] == pytest.approx(9.5)
+    assert found["wrong_frames_real_rbpf"] == 0 + 0 + 1 + 1 + 2
+    assert found["wrong_frames_real_every_6_pf"] == 0 + 0 + 1 + 1
+    assert "wrong_frames_real_registration" not in found  # which has no status
     assert found["p_value_rbpf_better_real"] == pytest.approx(1 / 32)  # all five pairs fall the same way
     assert found["p_value_rbpf_better_than_registration_real"] == pytest.approx(1.0)
     assert found["errors_by_n_real_rbpf_n8"] == pytest.approx(7 + 100 / 8)
@@ -156,5 +162,12 @@ def test_joints_without_an_estimate_count_as_those_of_a_lost_hand():
     recording = _real_hands.HandRecording(camera, np.arange(4.0), np.zeros((4, 1, 1), np.float32), truth, 1.0)
     joints = np.full((4, 21, 3), [0.01, 0.0, 0.0])
     joints[:2] = np.nan
-    error = _real_comparison._joint_error(joints, recording)
-    assert error == pytest.approx((42 * _real_comparison.MISSING_MM + 41 * 10.0) / 83)
+    errors = _real_comparison._joint_errors(joints, recording)
+    assert np.nanmean(errors) == pytest.approx((42 * _real_comparison.MISSING_MM + 41 * 10.0) / 83)
+
+
+def test_a_wrong_status_is_one_of_frames_that_are_far_off_and_called_tracking():
+    errors = np.repeat([24.9, 25.0, 80.0, 80.0, 80.0, np.nan], 21).reshape(6, 21)
+    errors[2, :20] = np.nan  # one joint alone is known
+    status = np.array([TRACKING, TRACKING, TRACKING, DOUBTFUL, SEARCHING, TRACKING])
+    assert _real_comparison.num_wrong(errors, status) == 2

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfilters.benchmarks.scenarios import _exact_tilt
 from jaxfilters.benchmarks.scenarios import _real_mocap as mocap
 from jaxfilters.benchmarks.scenarios import _real_motion as motion
 from jaxfilters.benchmarks.scenarios._real_markers import Marker, marked_hand
@@ -11,6 +12,7 @@ from jaxfilters.models.articulated.anatomy import relaxed_angles, template_shape
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.kinematics import finger_points
 from jaxfilters.models.articulated.layout import five_fingers
+from jaxfilters.models.articulated.projection import Perspective
 
 
 def test_errors_are_those_of_a_shape_from_its_root():
@@ -20,6 +22,18 @@ def test_errors_are_those_of_a_shape_from_its_root():
     others = np.delete(truth - truth[:, 2:3], 2, axis=1)
     assert plain == pytest.approx(0.5 * np.linalg.norm(others, axis=-1).mean())
     assert scaled == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("tilt", _exact_tilt.TILTS.values())
+def test_a_hand_with_exact_keypoints_is_tilted_as_it_says(tilt):
+    """The middle finger's base lies above the wrist in the image, and nearer to the camera by the sine of the tilt."""
+    layout = five_fingers(3)
+    hand = articulated_hand(layout, projection=Perspective(_exact_tilt.CAMERA))
+    x = _exact_tilt.true_state(layout, tilt)
+    base = np.asarray(hand.points(x))[2, 0] - np.asarray(x[layout.position])
+    assert base[1] < 0  # y points down
+    assert -base[2] / np.hypot(base[1], base[2]) == pytest.approx(np.sin(np.radians(tilt)), abs=0.02)
 
 
 @pytest.mark.system
