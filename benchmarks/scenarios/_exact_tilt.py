@@ -23,7 +23,7 @@ from jaxfilters.models.articulated.anatomy import (
 )
 from jaxfilters.models.articulated.features import KEYPOINTS
 from jaxfilters.models.articulated.filters import inequalities
-from jaxfilters.models.articulated.hand import ArticulatedHand, articulated_hand
+from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.kinematics import unit_rotation
 from jaxfilters.models.articulated.layout import Layout, five_fingers
 from jaxfilters.models.articulated.limits import limit_rows
@@ -81,7 +81,7 @@ def palm_errors_deg(tilt_deg: float, *, with_lean: bool, num_frames: int = NUM_F
     hand = dataclasses.replace(hand, point_std=jnp.asarray(noise, dtype=float))
     frames = FeatureFrame(y, np.isfinite(y), np.full(y.shape, persistence(times) * noise, np.float32))
     limits = inequalities(limit_rows(layout, five_finger_limits(layout)))
-    begins = Start(truth, _start_covariance(hand, truth))
+    begins = Start(truth, start.start_covariance(hand, start.AVERAGE_SIZE, truth))
     tracker = tracker_of(hand, limits, begins, ArticulatedConfig(focal=float(CAMERA.focal[0])))
     state = tracker.init(jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], frames))
     _, track = tracker.step(state, frames, times)
@@ -99,22 +99,3 @@ def true_state(layout: Layout, tilt_deg: float) -> Float[Array, " n"]:
     x = x.at[layout.position].set(jnp.array([0.0, 0.0, DISTANCE]))
     x = x.at[layout.static].set(1e-3 * jnp.asarray(template_shape(), dtype=float))
     return x.at[layout.angles].set(jnp.asarray(relaxed_angles(layout), dtype=float).ravel())
-
-
-def _start_covariance(hand: ArticulatedHand, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """As wide as the tracker's own starts: pose as fitted, lengths and size as those of any hand."""
-    layout, pixel = hand.layout, DISTANCE / float(CAMERA.focal[0])
-    position, quaternion, angle = start.RATE_STD
-    std = jnp.zeros(layout.size).at[layout.position].set(start.POSITION_STD * pixel)
-    std = std.at[layout.rates].set(layout.per_moving(position * pixel, quaternion, angle))
-    std = std.at[layout.static].set(start.LENGTH_STD * x[layout.static])
-    q = x[layout.quaternion]
-    covariance = (
-        jnp.diag(std**2)
-        .at[layout.quaternion, layout.quaternion]
-        .set((0.5 * start.ROTATION_STD) ** 2 * (jnp.eye(4) - jnp.outer(q, q)))
-    )
-    root = start.ANGLE_STD * hand.motion.angle_root
-    covariance = covariance.at[layout.angles, layout.angles].set(jnp.matmul(root, root.T, precision="highest"))
-    grows = jnp.zeros_like(x).at[layout.static].set(x[layout.static]).at[layout.position].set(x[layout.position])
-    return covariance + start.SIZE_STD**2 * jnp.outer(grows, grows)

@@ -122,7 +122,7 @@ def starts_from_points(
     means = jnp.where(jnp.isfinite(means[best]), means[best], states[order][best])
     found = found & jnp.all(jnp.isfinite(means))
     means = jnp.where(found, means, jax.vmap(lambda q: _template(hand, q, size))(orientations[:NUM_STARTS]))
-    covariances = jax.vmap(partial(_covariance, hand, size))(means)
+    covariances = jax.vmap(partial(start_covariance, hand, size))(means)
     return Starts(means, covariances, apart[best], found)
 
 
@@ -244,8 +244,11 @@ def _angle_root(hand: ArticulatedHand) -> Float[Array, "angles angles"]:
     return ANGLE_STD * (jnp.eye(4 * hand.layout.num_fingers) if alike is None else alike)
 
 
-def _covariance(hand: ArticulatedHand, size: HandSize, x: Array) -> Array:
-    """Pose as fitted; a hand as a whole may be larger or smaller, in perspective at a distance in proportion."""
+def start_covariance(hand: ArticulatedHand, size: HandSize, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Covariance of a fitted state: pose as fitted, and a hand whose size as a whole is as uncertain as `size` says.
+
+    In perspective a larger hand is at a distance in proportion.
+    """
     layout: Layout = hand.layout
     projection = hand.projection
     pixel = x[2] / projection.camera.focal[0] if isinstance(projection, Perspective) else 1.0
