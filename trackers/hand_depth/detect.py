@@ -26,7 +26,9 @@ hand whose edge or fingertips point at the camera."""
 USUAL_INSET = 0.038
 APART = 0.07
 """Metres between the middles of two palms that are tried."""
-MOST_SIGHTINGS = 3
+MOST_SIGHTINGS, MOST_ON_SURFACE = 3, 2
+"""Places that are tried, and those on one surface while there are others: a desk that is nearer than the hand has many
+places of a palm's width."""
 FARTHER = 0.6
 """Metres behind the nearest of these places within which others are tried."""
 SKIN_TO_MIDDLE = 0.015
@@ -94,15 +96,20 @@ def _sightings(camera: Pinhole, frame: np.ndarray, depth: np.ndarray, jump: floa
     cx, cy = np.asarray(camera.center)
     centers = np.stack([(cols - cx) / fx * z, (rows - cy) / fy * z, z + SKIN_TO_MIDDLE], axis=-1)
     cost = 3.0 * z + np.abs(np.log(inset[rows, cols] / USUAL_INSET))
+    order = [int(i) for i in np.argsort(cost) if z[i] <= z.min() + FARTHER]
+    on = labels[rows, cols]
+    return [_sighting(frame, surfaces, area, centers[i], int(on[i])) for i in _chosen(order, centers, on)]
+
+
+def _chosen(order: list[int], centers: np.ndarray, surface: np.ndarray) -> list[int]:
+    """The first ones in an order that are `APART`, of all surfaces that have one, at most `MOST_SIGHTINGS`."""
     chosen: list[int] = []
-    for i in np.argsort(cost):
-        if z[i] > z.min() + FARTHER:
-            continue
-        if all(np.linalg.norm(centers[i] - centers[j]) > APART for j in chosen):
-            chosen.append(int(i))
-        if len(chosen) == MOST_SIGHTINGS:
-            break
-    return [_sighting(frame, surfaces, area, centers[i], int(labels[rows[i], cols[i]])) for i in chosen]
+    for most in (MOST_ON_SURFACE, MOST_SIGHTINGS):
+        for i in order:
+            full = len(chosen) == MOST_SIGHTINGS or np.sum(surface[chosen] == surface[i]) >= most
+            if not full and all(np.linalg.norm(centers[i] - centers[j]) > APART for j in chosen):
+                chosen.append(i)
+    return chosen
 
 
 def _without_small_holes(frame: np.ndarray) -> np.ndarray:

@@ -43,6 +43,15 @@ def test_a_desk_nearer_than_the_hand_does_not_hide_it():
     assert nearest_to(hand_sightings(CAMERA, frame), PALM) < 0.01
 
 
+def test_a_level_desk_of_many_wide_places_leaves_one_to_the_hand():
+    frame = with_palm(np.full((120, 160), 1.9, np.float32))
+    below = np.arange(1, 60)
+    frame[61:] = np.minimum(frame[61:], (0.1 * 200 / below)[:, None])  # 0.1 m below the camera, from 0.34 m on
+    sightings = hand_sightings(CAMERA, frame)
+    assert nearest_to(sightings, PALM) < 0.01
+    assert nearest_to(sightings[:1], PALM) > 0.2
+
+
 def test_small_holes_and_specks_change_nothing():
     frame = with_palm(blank())
     frame[5, 5] = frame[100, 30:32] = 0.3
