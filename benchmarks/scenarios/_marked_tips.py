@@ -92,7 +92,7 @@ def counted(marked: dict[str, Any], frames: dict[int, Tips]) -> Count:
     names: dict[str, set[int]] = {name: set() for name in NAMES}
     for i, own in marked["frames"].items():
         tips = frames[int(i)]
-        pairs = _pairs(own, tips, float(marked["half_width_px"]))
+        pairs = pairs_of(own, tips, float(marked["half_width_px"]))
         num_marked += len(own["tips"])
         num_found += sum(name in own["tips"] for name in pairs)
         reported += len(tips.position)
@@ -102,8 +102,8 @@ def counted(marked: dict[str, Any], frames: dict[int, Tips]) -> Count:
     return Count(num_marked, num_found, reported, false, names)
 
 
-def _pairs(own: dict[str, Any], tips: Tips, most: float) -> dict[str, int]:
-    """The tip of each marked finger that has one, by the least sum of distances."""
+def pairs_of(own: dict[str, Any], tips: Tips, most: float) -> dict[str, int]:
+    """The tip of each marked or cut finger that has one within `most` pixels, by the least sum of distances."""
     fingers = own["tips"] | own["cut"]
     if not fingers or not len(tips.position):
         return {}

@@ -7,7 +7,7 @@ from jaxfilters.benchmarks import results_page
 from jaxfilters.benchmarks.harness import main
 from jaxfilters.benchmarks.metrics import report
 from jaxfilters.benchmarks.multi_object import floor_tracks
-from jaxfilters.benchmarks.scenarios import _claims, honesty
+from jaxfilters.benchmarks.scenarios import _claims, _tip_claims, honesty
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording
 from jaxfilters.trackers.people.recorded import Sighting
 
@@ -134,3 +134,16 @@ def test_a_system_runs_on_its_recording(monkeypatch, capsys):
     monkeypatch.setattr(honesty, "QUICK_CAPTURE_FRAMES", 200)
     assert main(["honesty", "--quick"]) == 0
     assert "nees_articulated_dfki" in capsys.readouterr().out
+
+
+def test_fingertips_belong_to_the_nearest_true_one_within_half_a_finger():
+    """Two fingers in two frames; the second frame has a tip 30 pixels off, which is false, and misses the other."""
+    truth = np.array([[[10.0, 10.0], [50.0, 10.0]], [[10.0, 12.0], [50.0, 12.0]]])
+    position = np.array([[[51.0, 12.0], [0.0, 0.0], [10.5, 9.0]], [[80.0, 12.0], [0.0, 0.0], [10.0, 12.5]]])
+    is_tip = np.array([[True, False, True], [True, False, True]])
+    sd = np.array([[2.0, 0.0, 3.0], [4.0, 0.0, 5.0]])
+    first, second = _tip_claims.by_finger(position, is_tip, sd, truth)
+    np.testing.assert_allclose(first.errors, [[0.5, -1.0], [0.0, 0.5]])
+    np.testing.assert_allclose(first.deviations, [[3.0, 3.0], [5.0, 5.0]])
+    np.testing.assert_allclose(second.errors, [[1.0, 2.0], [np.nan, np.nan]])
+    np.testing.assert_allclose(second.deviations, [[2.0, 2.0], [np.nan, np.nan]])
