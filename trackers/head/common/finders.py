@@ -8,7 +8,8 @@ from jaxtyping import Float, UInt8
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, STABLE_SHARE, StableDetector, complete, detect
-from jaxfilters.trackers.head.common.mesh import MeshDetector
+from jaxfilters.trackers.head.common.mesh import MOST_FACES, MeshDetector, landmarks_of
+from jaxfilters.trackers.head.common.mesh_crops import largest, nearest, solids_anywhere, solids_near
 
 MOST_MOVED_PX = 2.0
 """Between two images of a face that holds still; `STABLE_SHARE` of the eyes' distance where that is more."""
@@ -26,9 +27,15 @@ class Finder(Protocol):
         """The landmarks in pixels (u, v), or `None`."""
 
     def glance(
-        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "10 2"] | None:
-        """The landmarks in one image of a face that may move, of several faces those nearest to a pixel, or `None`."""
+        """The landmarks in one image of a face that may move, of several faces those nearest to a place, or `None`.
+
+        Args:
+            image: Grey.
+            near: Where the face is expected, pixels.
+            apart_px: Distance between its eyes, pixels.
+        """
 
     def reset(self) -> None:
         """Forget the images so far."""
@@ -55,9 +62,10 @@ class CascadeFinder:
         return points
 
     def glance(
-        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "10 2"] | None:
-        """The landmarks in one image of a face that may move, of several faces those nearest to a pixel, or `None`."""
+        """The landmarks in one image of a face that may move, of several faces those nearest to a place, or `None`."""
+        del apart_px
         found = detect(image, near=near)
         return None if found is None else complete(image, found.points)
 
@@ -76,18 +84,20 @@ class MeshFinder:
             ImportError: without MediaPipe, or with one that has no face mesh of its own.
         """
         self.complaints: list[str] = []
-        self._mesh = MeshDetector()
+        self._mesh = MeshDetector(most_faces=MOST_FACES)
         self._last: np.ndarray | None = None
         self._agreeing = 0
 
     def find(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "10 2"] | None:
         """The landmarks in pixels (u, v), or `None`."""
-        found = self._mesh.detect(image)
-        self.complaints = ["no face"] if found is None else []
-        if found is None:
+        solids, near = self._solids(image), None if self._last is None else self._last.mean(axis=0)
+        if not solids:
+            self.complaints = ["no face"]
             self.reset()
             return None
-        most = max(MOST_MOVED_PX, STABLE_SHARE * float(np.linalg.norm(np.subtract(*eye_centers(found)))))
+        self.complaints = [f"{len(solids)} faces; the largest is taken"] if len(solids) > 1 else []
+        found = landmarks_of(largest(solids) if near is None else nearest(solids, near))
+        most = max(MOST_MOVED_PX, STABLE_SHARE * _eyes_px(found))
         is_still = self._last is not None and float(np.abs(found - self._last).max()) < most
         self._last, self._agreeing = found, self._agreeing + 1 if is_still else 1
         across = found[EYES[3]] - found[EYES[0]]
@@ -96,15 +106,26 @@ class MeshFinder:
         return found if self._agreeing >= STABLE_FRAMES else None
 
     def glance(
-        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "10 2"] | None:
-        """The landmarks of the most evident face in one image, which may move, or `None`."""
-        del near
-        return self._mesh.detect(image)
+        """The landmarks in one image of a face that may move, of several faces those nearest to a place, or `None`."""
+        solids = solids_near(self._mesh, image, near, apart_px) or self._mesh.solids(image)
+        return landmarks_of(nearest(solids, near)) if solids else None
+
+    def _solids(self, image: UInt8[np.ndarray, "rows cols"]) -> list[Float[np.ndarray, "V 3"]]:
+        """Faces about the last one, or anywhere if it is gone."""
+        about = (
+            [] if self._last is None else solids_near(self._mesh, image, self._last.mean(axis=0), _eyes_px(self._last))
+        )
+        return about or solids_anywhere(self._mesh, image)
 
     def reset(self) -> None:
         """Forget the images so far."""
         self._last, self._agreeing = None, 0
+
+
+def _eyes_px(points: Float[np.ndarray, "10 2"]) -> float:
+    return float(np.linalg.norm(np.subtract(*eye_centers(points))))
 
 
 FINDERS: dict[str, type[CascadeFinder] | type[MeshFinder]] = {"cascades": CascadeFinder, "mediapipe": MeshFinder}

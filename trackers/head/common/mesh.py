@@ -9,6 +9,10 @@ from jaxtyping import Float, UInt8
 
 VERTICES = ((33,), (133,), (362,), (263,), (61,), (291,), (79,), (309,), (55, 107), (285, 336))
 """Of the mesh of 468 for each landmark: brows end between their upper and lower edge."""
+EYE_VERTICES = ((33, 133), (362, 263))
+"""Corners of the right and of the left eye."""
+MOST_FACES = 4
+"""That are looked for in an image."""
 
 
 class MeshDetector:
@@ -50,21 +54,23 @@ class MeshDetector:
         with self._lock:  # a search beside the frames must not come between two looks
             if self._looks > 1:
                 self._mesh.reset()
-            for _ in range(self._looks - 1):
-                self._mesh.process(image)
-            return self._mesh.process(image).multi_face_landmarks or []
+            for look in range(self._looks):
+                found = self._mesh.process(image).multi_face_landmarks or []
+                if not found or look == self._looks - 1:
+                    break
+            return found
 
     def solid(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "V 3"] | None:
         """All vertices in pixels (u, v, and away from the camera as large), or `None` without a face."""
         found = self.solids(image)
         return found[0] if found else None
 
-    def mesh(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "V 2"] | None:
-        """All vertices in pixels (u, v), or `None` without a face."""
-        solid = self.solid(image)
-        return None if solid is None else solid[:, :2]
-
     def detect(self, image: UInt8[np.ndarray, "rows cols"]) -> Float[np.ndarray, "10 2"] | None:
         """All ten landmarks in pixels (u, v), or `None` without a face."""
-        mesh = self.mesh(image)
-        return None if mesh is None else np.array([mesh[list(vertices)].mean(axis=0) for vertices in VERTICES])
+        solid = self.solid(image)
+        return None if solid is None else landmarks_of(solid)
+
+
+def landmarks_of(solid: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "10 2"]:
+    """The ten landmarks of a mesh in pixels (u, v)."""
+    return np.array([solid[list(vertices), :2].mean(axis=0) for vertices in VERTICES])

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
 from jaxfilters.trackers.head.mono.detectors import MESH_MM, CascadeDetector, Detector, Seen, dense_noise
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, is_symmetric
@@ -20,8 +21,8 @@ SAME_PLACE = 3.0
 """Distances between the eyes within which two detections are of one face."""
 
 
-LEAST_NOISE_PX, EYES_APART_MM = 0.5, 62.0
-"""Noise of a detector, at least; distance between the middles of the eyes in people."""
+LEAST_NOISE_PX = 0.5
+"""Noise of a detector, at least."""
 
 
 class Detections(NamedTuple):
@@ -93,8 +94,11 @@ class Collector:
         self._observed, self._images, self._times = [], [], []
 
     def _detected(self, image: np.ndarray) -> Seen | None:
-        near = self._observed[-1].points.mean(axis=0) if self._observed else None
-        found = self._detector.detect(image, near)
+        near, apart_px = None, None
+        if self._observed:
+            last = self._observed[-1].points
+            near, apart_px = last.mean(axis=0), float(np.linalg.norm(np.subtract(*eye_centers(last))))
+        found = self._detector.detect(image, near, apart_px)
         if isinstance(found, str):
             self.reason = found
             return None

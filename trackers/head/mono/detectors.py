@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, UInt8
 from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.detect import complete, detect
-from jaxfilters.trackers.head.common.mesh import MeshDetector
+from jaxfilters.trackers.head.common.mesh import MOST_FACES, MeshDetector
+from jaxfilters.trackers.head.common.mesh_crops import Meshes, largest, nearest, solids_anywhere, solids_near
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
 from jaxfilters.trackers.io.detector_errors import DetectorErrors, default_detector_errors
 
@@ -32,8 +33,6 @@ IRISES = ((469, 471), (474, 476))
 MESH_SHARE, LEAST_PX = 0.01, 0.5
 """Standard deviation of a coordinate of the mesh from frame to frame: a share of the distance between the eyes, and
 never less than so many pixels; twice that at the chin."""
-MOST_FACES = 4
-"""That the mesh looks for in an image."""
 LOOKS = 3
 """Of the mesh at an image: the box that a face is found in is rough where the head is turned or wears glasses.
 
@@ -72,8 +71,19 @@ class Detector(Protocol):
         """Whether a track in doubt may be averaged with the landmarks' pose, as it must not where they err grossly."""
         ...
 
-    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
-        """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+    def detect(
+        self,
+        image: UInt8[np.ndarray, "rows cols"],
+        near: Float[np.ndarray, " 2"] | None,
+        apart_px: float | None = None,
+    ) -> Seen | str:
+        """The face, or why there is none; of several the one nearest to a place, the largest without one.
+
+        Args:
+            image: Grey.
+            near: Where the face is expected, pixels.
+            apart_px: Distance between the eyes of the face that is expected there, pixels, if it is known.
+        """
         ...
 
 
@@ -82,9 +92,12 @@ class MeshGiver(Detector, Protocol):
     """Finds a face in an image by a mesh, of which `errors.vertices` is the mean."""
 
     def glance(
-        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "V 3"] | None:
-        """The mesh of the face nearest to a place, as fast as it can be found; None without a face."""
+        """The mesh of the face nearest to a place, as fast as it can be found; None without a face.
+
+        Arguments are those of `detect`.
+        """
         ...
 
 
@@ -99,8 +112,14 @@ class CascadeDetector:
     def __init__(self) -> None:
         self.errors = default_detector_errors()["cascades"]
 
-    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
+    def detect(
+        self,
+        image: UInt8[np.ndarray, "rows cols"],
+        near: Float[np.ndarray, " 2"] | None,
+        apart_px: float | None = None,
+    ) -> Seen | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
+        del apart_px
         found = detect(image, near=near)
         if found is None:
             return "no face whose eyes and lips are visible"
@@ -125,33 +144,45 @@ class MeshLandmarks:
         self._glance = MeshDetector(refined=True, most_faces=MOST_FACES)
         self.errors = default_detector_errors()["mediapipe"]
 
-    def detect(self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"] | None) -> Seen | str:
-        """The face, or why there is none; of several the one nearest to a place, the largest without one."""
-        solids = self._mesh.solids(image)
+    def detect(
+        self,
+        image: UInt8[np.ndarray, "rows cols"],
+        near: Float[np.ndarray, " 2"] | None,
+        apart_px: float | None = None,
+    ) -> Seen | str:
+        """The face, or why there is none; of several the one nearest to a place, the largest without one.
+
+        Small faces are found in parts of the image: about the place that is given, or anywhere if none is.
+        """
+        if near is None:
+            solids = solids_anywhere(self._mesh, image, quick=self._glance)
+        else:
+            solids = _about(self._mesh, image, near, apart_px)
         if not solids:
             return "no face"
-        if near is None:
-            solid = max(solids, key=lambda one: float(np.prod(np.ptp(one[:, :2], axis=0))))
-        else:
-            solid = _nearest(solids, near)
+        solid = largest(solids) if near is None else nearest(solids, near)
         mesh = solid[:, :2]
         dense = np.array([mesh[list(vertices)].mean(axis=0) if vertices else (np.nan, np.nan) for vertices in MESH_68])
         iris_px = np.array([np.linalg.norm(mesh[a] - mesh[b]) for a, b in IRISES])
         return Seen(dense[list(FROM_68)], len(solids), dense, iris_px, solid)
 
     def glance(
-        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"]
+        self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "V 3"] | None:
         """The mesh of the face nearest to a place after one look; None without a face.
 
         In a quarter of the time of three looks, and the mean of a track and a mesh (`mesh_rotation`) is as good.
         """
-        solids = self._glance.solids(image)
-        return _nearest(solids, near) if solids else None
+        solids = _about(self._glance, image, near, apart_px)
+        return nearest(solids, near) if solids else None
 
 
-def _nearest(solids: list[Float[np.ndarray, "V 3"]], place: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "V 3"]:
-    return min(solids, key=lambda one: float(np.linalg.norm(one[:, :2].mean(axis=0) - place)))
+def _about(
+    mesh: Meshes, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float | None
+) -> list[Float[np.ndarray, "V 3"]]:
+    """Faces in the part of an image about a place; those of the whole image where there is none, or no size."""
+    found = [] if apart_px is None else solids_near(mesh, image, near, apart_px)
+    return found or mesh.solids(image)
 
 
 DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {

@@ -38,6 +38,11 @@ FOLLOWED = recent.Drift(first=2.5, each=0.4, most=6.0)
 Measured on three of the ICT face model's people with recorded speech and rotations: 2.0 to 3.7 mm a coordinate as soon
 as a landmark has changed its looks, 2.5 to 6 once it was followed for some 30 frames.
 """
+RETURNED_SCORE = 0.7
+"""Normalised correlation from which on a landmark that did not look as registered does so beyond doubt again.
+
+What covers a face correlates by chance with a patch that is searched for in its surroundings.
+"""
 FEWEST_SURE = 7
 """Landmarks that must look as registered, where the model has them, for an estimate beyond doubt: speech hides two."""
 
@@ -52,6 +57,8 @@ class Estimate(NamedTuple):
     is_found: Bool[Array, ""]
     num_anchored: Float[Array, ""]
     """Landmarks that look as registered, and are where the model has them."""
+    is_unsure: Bool[Array, " K"]
+    """Landmarks that do not, or did not before and have not done so beyond doubt since."""
     recent: Recent
     windows: Float[Array, "1 K T T"]
     """Grey levels about the landmarks."""
@@ -100,12 +107,16 @@ def aligned(
     variance = state.model_variance + UNMODELLED_MM**2
     spread = einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
     covariance = found.covariance + by_slope + spread + PIXEL_FLOOR**2 * jnp.eye(2)
+    # The score of a landmark that is followed is that of the last frame's patch; the registered one has a lower one.
+    has_returned = jnp.any(anchored & ~is_followed & (found.score > RETURNED_SCORE), axis=0)
+    is_unsure = jnp.all(observed.has_changed, axis=0) | (state.is_unsure & ~has_returned)
     return Estimate(
         fit.belief,
         # What is followed from the last frame is some other point of the skin, and says nothing of the person.
         Views(found.uv, covariance, found.observed & (found.score > LEAST_SCORE) & ~is_followed),
         sound & (fit.num_observed >= FEWEST_OBSERVED),
         jnp.sum(jnp.any(~observed.has_changed, axis=0)).astype(x.dtype),
+        is_unsure,
         observed,
         state.windows,
         learn_slopes(state.slopes, found.slope_information, found.slope_score),
@@ -154,6 +165,7 @@ def projected(
         view,
         jnp.all(jnp.isfinite(x)),
         every,
+        jnp.zeros(uv.shape[1], bool),
         state.recent,
         state.windows,
         state.slopes,

@@ -25,13 +25,15 @@ from jaxfilters.models.face.pose import within_half_turn
 from jaxfilters.models.face.refinement import refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import shape
+from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
 from jaxfilters.trackers.head.common.near_mode import UNKNOWN_STD
 from jaxfilters.trackers.head.common.recent import CHANGED_SCORE, nothing_changed
 from jaxfilters.trackers.head.common.search import gathered
-from jaxfilters.trackers.head.common.state import DEFORMABLE, LOST, POSE
+from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, LOST, POSE
 from jaxfilters.trackers.head.mono.claims import frame_covariance
 from jaxfilters.trackers.head.mono.detections import noise_px
 from jaxfilters.trackers.head.mono.detectors import Detector, Seen
+from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
 from jaxfilters.trackers.head.stereo.tracking import LEAST_SCORE, REGAINED_SCORE
@@ -68,10 +70,32 @@ def seconds_between(detector: Detector) -> float:
     return EVERY_S_AVERAGED if detector.is_averaged else EVERY_S
 
 
-def place_of(state: MonoState, rig: CameraRig) -> Float[np.ndarray, " 2"] | None:
-    """Where the face of a track is in the image, pixels; None where it has no finite place."""
-    place = np.asarray(rig.center[0] + rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2], float)
-    return place if np.all(np.isfinite(place)) else None
+class ImagePosition(NamedTuple):
+    """Where a face is in an image, and how large; pixels."""
+
+    middle: Float[np.ndarray, " 2"]
+    apart_px: float
+    """Distance between its eyes if they are as far apart as people's."""
+
+
+def place_of(state: MonoState, rig: CameraRig) -> ImagePosition | None:
+    """Where the face of a track is in the image; None where it has no finite place."""
+    place, focal = state.belief.mean[:3], rig.focal[0]
+    middle = np.asarray(rig.center[0] + focal * place[:2] / place[2], float)
+    apart_px = float(focal[0] * EYES_APART_MM / place[2])
+    return ImagePosition(middle, apart_px) if np.all(np.isfinite(middle)) else None
+
+
+def is_beyond_doubt(state: MonoState, row: MonoTrack) -> bool:
+    """Whether a track needs no comparison: enough landmarks look as registered, whatever they did before.
+
+    Args:
+        state: Of the tracker after the row's image.
+        row: Of the track.
+    """
+    num_anchored = int(np.sum(np.any(~np.asarray(state.recent.has_changed), axis=0)))
+    is_found = row.status == DOUBTFUL and int(state.misses) == 0
+    return bool(row.status == DEFORMABLE or (is_found and num_anchored >= FEWEST_SURE))
 
 
 def located(
@@ -221,6 +245,7 @@ def _placed(
         search=gathered(state.search, x)._replace(estimate=x, velocity=jnp.zeros_like(state.search.velocity)),
         belief=found,
         recent=recent,
+        is_unsure=jnp.zeros_like(state.is_unsure),
         last_good=x,
         misses=jnp.zeros_like(state.misses),
         num_outliers=jnp.zeros_like(state.num_outliers),

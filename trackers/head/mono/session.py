@@ -19,7 +19,7 @@ from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
-from jaxfilters.trackers.head.common.state import DEFORMABLE, INITIALISING, POSE
+from jaxfilters.trackers.head.common.state import INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
@@ -284,11 +284,11 @@ class _MonoTracker:
 
     def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray, time: float) -> Compared:
         place = redetection.place_of(state, self.rig)
-        if row.status == DEFORMABLE:
+        if redetection.is_beyond_doubt(state, row):
             if self._meshes.are_used and isinstance(self._detector, MeshGiver) and place is not None:
-                self._meshes.add(self._detector.glance(images[0], place), row, time)
+                self._meshes.add(self._detector.glance(images[0], *place), row, time)
             return Compared(state, None)
-        observed = self._detector.detect(images[0], place)
+        observed = self._detector.detect(images[0], *(place or (None,)))
         if isinstance(observed, str):
             return Compared(state, None)
         compared = self._beside(state, row, observed, images)

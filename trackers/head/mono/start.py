@@ -14,7 +14,7 @@ from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.filter import Filter
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.face.bundle import Adjustment, Bundle, Reach, Views, adjust, projected
-from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS
+from jaxfilters.models.face.landmarks import BROWS, EYES, MOUTH, NOSTRILS, NUM_LANDMARKS
 from jaxfilters.models.face.misplacement import misplacement
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import SIZE, SKIN_NORMALS, WIDE_SIZE, patches_of, unknown_slopes, windows
@@ -183,6 +183,7 @@ def begin(
         recent=nothing_changed(last, posed_shape(face, person, expressed), here, rig),
         windows=registered.templates,
         is_fresh=jnp.zeros((), bool),
+        is_unsure=jnp.zeros(NUM_LANDMARKS, bool),
         slopes=unknown_slopes(face.num_landmarks),
         model_variance=jnp.full(face.num_landmarks, FIRST_MODEL_VARIANCE, x.dtype),
         residual_scale=jnp.ones((), x.dtype),

@@ -103,6 +103,8 @@ class MonoState(NamedTuple):
     num_adjusted: Int[Array, ""]
     """Adjustments so far, the start included."""
     recent: Recent
+    is_unsure: Bool[Array, " K"]
+    """Landmarks that do not look as registered, or did not before and have not done so beyond doubt since."""
     windows: Float[Array, "1 K T T"]
     """About the landmarks of the frame before, as recalculated."""
     is_fresh: Bool[Array, ""]

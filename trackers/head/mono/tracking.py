@@ -114,7 +114,7 @@ def _step(
         is_fresh=~missed,
         window=state.window._replace(ages=state.window.ages + 1),
     )
-    num_sure = jnp.where(missed, 0.0, estimate.num_anchored)
+    num_sure = jnp.where(missed, 0.0, jnp.sum(~estimate.is_unsure).astype(score.dtype))
     track = _track(system, state, score, info.effective_sample_size, is_adjusted, num_sure, innovations)
     return state, track
 
@@ -184,6 +184,7 @@ def _after(
         search=search,
         belief=belief,
         recent=pick(found, estimate.recent, state.recent),
+        is_unsure=pick(found, estimate.is_unsure, state.is_unsure),
         windows=pick(found, estimate.windows, state.windows),
         slopes=pick(is_usual, estimate.slopes, state.slopes),
         model_variance=pick(is_usual, estimate.model_variance, state.model_variance),

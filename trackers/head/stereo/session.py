@@ -16,6 +16,7 @@ from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
 from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
+from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import DOUBTFUL, INITIALISING, LOST, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo import redetection
@@ -276,8 +277,9 @@ class _HeadTracker:
 
     def _at_detected(self, state: HeadState, images: np.ndarray) -> HeadState | None:
         """The state at a detected face, if there is one that has the shape."""
-        near = self.rig.center[0] + self.rig.focal[0] * state.belief.mean[:2] / state.belief.mean[2]
-        points = self._finder.glance(images[0], np.asarray(near, float))
+        place, focal = state.belief.mean[:3], self.rig.focal[0]
+        near = np.asarray(self.rig.center[0] + focal * place[:2] / place[2], float)
+        points = self._finder.glance(images[0], near, float(focal[0] * EYES_APART_MM / place[2]))
         if points is None:
             return None
         try:

@@ -97,7 +97,7 @@ class Mesh:
     def __init__(self, dense):
         self.dense = dense
 
-    def detect(self, image, near):
+    def detect(self, image, near, apart_px=None):
         return Seen(FACE, 1, self.dense, np.array([11.0, 12.0]))
 
 

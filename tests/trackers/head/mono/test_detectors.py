@@ -51,9 +51,9 @@ def test_of_two_faces_the_nearest_or_largest_is_taken(monkeypatch):
     np.testing.assert_array_equal(alone.dense[30], large[4])
     np.testing.assert_array_equal(beside.dense[30], small[4])
     np.testing.assert_array_equal(beside.solid, solid(small))
-    np.testing.assert_array_equal(detector.glance(IMAGE, np.array([60.0, 60.0])), solid(small))
+    np.testing.assert_array_equal(detector.glance(IMAGE, np.array([60.0, 60.0]), 200.0), solid(small))
     assert looked == [LOOKS, LOOKS, 1]
-    assert detector_of(monkeypatch, lambda image: []).glance(IMAGE, np.zeros(2)) is None
+    assert detector_of(monkeypatch, lambda image: []).glance(IMAGE, np.zeros(2), 200.0) is None
 
 
 def test_the_mesh_is_the_default_where_it_can_be_loaded(monkeypatch):

@@ -229,16 +229,16 @@ class Meshes:
         self._made, self._rig, self._vertices = made, rig, vertices
         self.asked = []
 
-    def detect(self, image, near):
-        del near
+    def detect(self, image, near, apart_px=None):
+        del near, apart_px
         i = self._frames[image.tobytes()]
         self.asked.append(i)
         uv = self._made.uv[i, 0]
         solid, _ = solid_of(self._vertices, self._made.poses[i, 3:] + WRONG, uv.mean(axis=0), self._rig)
         return Seen(uv, solid=solid)
 
-    def glance(self, image, near):
-        return self.detect(image, near).solid
+    def glance(self, image, near, apart_px):
+        return self.detect(image, near, apart_px).solid
 
 
 @pytest.mark.system

@@ -30,7 +30,7 @@ class Detector:
         self.made, self.images, self.is_blind = made, images, is_blind
         self.error = np.random.default_rng(0).normal(0, 1, (10, 2))
 
-    def glance(self, image, near):
+    def glance(self, image, near, apart_px):
         at = [i for i in range(AFTER.start, AFTER.stop) if np.array_equal(self.images[i, 0], image)]
         return self.made.uv[at[0], 0] + self.error if at and not self.is_blind else None
 
