@@ -44,6 +44,10 @@ class FingertipConfig:
     """Time between two frames, in thirtieths of a second; velocities are pixels in such a time."""
     measurement_sd: float = 1.5
     """Of a coordinate of a tip, pixels (sigma_v)."""
+    misplacement_sd: float = 1.2
+    """Of a coordinate, pixels: of the end of a finger's silhouette from where a person marks the tip. It lasts, so that
+    no filter reduces it, and is part of reported standard deviations alone. Chosen so that they agree with the errors
+    in `desk_hand_video`."""
     drive_sd: float = 3.0
     """Of the change of a velocity in a frame of 1/30 s, pixels a frame (sigma_w)."""
     max_speed: float = 60.0
@@ -115,7 +119,10 @@ def rescaled(config: Config, *, pixels: Sequence[str], durations: Sequence[str],
 
 def scaled(config: FingertipConfig, *, height: float = 480.0, fps: float = 30.0) -> FingertipConfig:
     """The same for images of another height in pixels, and another number of frames a second."""
-    in_pixels = ("measurement_sd", "drive_sd", "max_speed", "gate", "tentative_gate", "apart", "carried_sd")
+    in_pixels = (
+        *("measurement_sd", "misplacement_sd", "drive_sd", "carried_sd"),
+        *("max_speed", "gate", "tentative_gate", "apart"),
+    )
     found = rescaled(config, pixels=in_pixels, durations=("empty_frames", "axis_frames"), height=height, fps=fps)
     longer = 30.0 / fps
     # In a longer frame a finger gets farther from its prediction; the errors of detection stay in a shorter one.
@@ -194,7 +201,7 @@ class HandReport(NamedTuple):
     position: Float[Array, "slots 2"]
     """Pixels."""
     sd: Float[Array, " slots"]
-    """Of a coordinate, pixels."""
+    """Of a coordinate, pixels, misplacement included."""
     innovations: Int32[Array, "slots 2"]
     """How many coordinates were compared with their prediction, and how many of these lie within its 95 % band."""
     velocity: Float[Array, "slots 2"]

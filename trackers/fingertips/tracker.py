@@ -261,7 +261,8 @@ def _report(
     is_tip = (tracks.mode == CONFIRMED) & is_there
     reported = jax.vmap(method.report)(sight.tips, sight.corrected.mean[:, :2])
     position = jnp.where(sight.matched[:, None], reported, sight.corrected.mean[:, :2])
-    sd = config.measurement_sd * jnp.sqrt(jnp.maximum(motion.uncertainty(sight.corrected), 0.0))
+    uncertainty = jnp.maximum(motion.uncertainty(sight.corrected), 0.0)
+    sd = jnp.hypot(config.measurement_sd * jnp.sqrt(uncertainty), config.misplacement_sd)
     thumb_out = jnp.any(tracks.is_thumb & is_tip)
     mode = jnp.where(jnp.any(is_tip), jnp.where(thumb_out, MANIPULATION, SYMBOLIC), ABSENT)
     return HandReport(
