@@ -34,8 +34,8 @@ def rendered_claims(quick: bool, seed: int) -> Claims:
         frames = fingertips.render(key, count, QUICK_NUM_FRAMES if quick else NUM_FRAMES)
         observed = fingertips.stacked([fingertips.detected(frame.image, parameters) for frame in frames])
         report = fingertips.follow(FingertipConfig(), MODERN, jax.tree.map(lambda leaf: leaf[None], observed))
-        truth = [frame.tips[frame.extended] for frame in frames]
-        recordings += by_finger(report.position[0], report.is_tip[0], report.sd[0], np.stack(truth))
+        position, is_tip, sd = (np.asarray(part[0]) for part in (report.position, report.is_tip, report.sd))
+        recordings += by_finger(position, is_tip, sd, np.stack([frame.tips[frame.extended] for frame in frames]))
     return Claims("fingertips", "rendered", COORDINATES, recordings)
 
 
@@ -50,7 +50,7 @@ def marked_claims(quick: bool, seed: int) -> Claims:
     rows = {finger: list[tuple[np.ndarray, float]]() for finger in NAMES}
     for frame, own in of_frames.items():
         tips = tips_of(report, int(frame))
-        deviations = report.sd[int(frame), 0][report.is_tip[int(frame), 0]]
+        deviations = np.asarray(report.sd[int(frame), 0])[np.asarray(report.is_tip[int(frame), 0])]
         for finger, i in pairs_of(own, tips, float(marked["half_width_px"])).items():
             if finger in own["tips"]:
                 rows[finger].append((tips.position[i] - np.array(own["tips"][finger]), deviations[i]))
