@@ -65,6 +65,9 @@ class StreamSpec(NamedTuple):
     """What must be equal for a run to be continued (input, configuration, versions), JSON-able."""
     frames: int | None
     """How many there will be; None where that is not known."""
+    prime: Callable[[], None] = lambda: None
+    """What a new run reads of the sources before their first images: with the folder of the results held, and not in a
+    run that is continued, whose saved state has all that came of it."""
 
 
 class RunResult(NamedTuple):
@@ -110,9 +113,11 @@ class StreamRun:
             if saved is not None:
                 self._last_s = float(saved["time_s"])
                 spec.session.restore(saved["session"], self.writer.results)
+            else:
+                spec.prime()
             self._log = open_log(options, spec.table)
         except BaseException:
-            self.writer.close()
+            self._release()
             raise
         self._saved_at = time.monotonic()
         self._video: OverlayVideo | None = None
@@ -172,7 +177,15 @@ class StreamRun:
         """Let other runs write into the folder."""
         if self._log is not None:
             self._log.close()
-        self.writer.close()
+        self._release()
+
+    def _release(self) -> None:
+        """Let go of the folder; without a frame, no table is left that would be taken for the results of a run."""
+        try:
+            if not self.writer.frames:
+                (self._options.out / "track.csv").unlink(missing_ok=True)
+        finally:
+            self.writer.close()
 
     def _take(self) -> None:
         waiting: list[FrameSet] = []

@@ -21,12 +21,15 @@ from jaxfilters.models.fingertip.keypoints import (
 )
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.trackers.articulated.recording import looks_normalized
-from jaxfilters.trackers.io.errors import InputError
+from jaxfilters.trackers.io.errors import InputError, shortened
+from jaxfilters.trackers.io.input_files import exists
 from jaxfilters.trackers.io.keypoints import read_hands
 from jaxfilters.trackers.io.video_input import DEFAULT_FPS, LiveCamera, VideoSource, open_video, spread
 
 _THUMB, _INDEX = 0, 1
 _BONE, _BACKGROUND = (150, 150, 150), 40
+_LONGEST_NAME = 160
+"""Characters of the name of a file that a message repeats."""
 
 
 class HandKeypoints(NamedTuple):
@@ -59,8 +62,8 @@ class KeypointSource:
         Raises:
             InputError: keypoints that cannot be used, a live camera, or an image of unknown size.
         """
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder.")
+        if not exists(path):
+            raise InputError(f"--keypoints {shortened(str(path), _LONGEST_NAME)}: no such file or folder.")
         if isinstance(video, LiveCamera):
             raise InputError(f"--keypoints {path}: of a recording only, not of a live camera.")
         found = read_hands(path, fps or (video.fps if video else DEFAULT_FPS))

@@ -28,11 +28,11 @@ from jaxfilters.trackers.people.drawing import write_plan
 from jaxfilters.trackers.people.files import by_frame, write_coco, write_mot
 from jaxfilters.trackers.people.identity import identity_of
 from jaxfilters.trackers.people.options import DEFAULT_BACKGROUND
-from jaxfilters.trackers.people.recorded import Sighting
+from jaxfilters.trackers.people.recorded import Sighting, by_identity, smoothed
 from jaxfilters.trackers.people.run import PeopleStream
 from jaxfilters.trackers.people.session import PRIMING_IMAGES, PeopleSession
 from jaxfilters.trackers.people.state import PeopleConfig, PeopleScene
-from jaxfilters.trackers.people.table import STATUS, as_rows, people_table
+from jaxfilters.trackers.people.table import STATUS, as_rows, from_rows, people_table
 from jaxfilters.trackers.people.tracker import people_scene
 
 
@@ -65,13 +65,7 @@ def track(options: argparse.Namespace) -> str:
     moments = straightened(together(setup.sources), setup.undistortions)
     spec = StreamSpec(
         *(setup.sources, moments, partial(_trouble, setup.sources), PeopleStream(session)),
-        *(people_table(setup.scene), _identity(setup, options), total),
-    )
-    session.prime(
-        [
-            [undistortion.apply(image) for image in source.sample(PRIMING_IMAGES)]
-            for source, undistortion in zip(setup.sources, setup.undistortions, strict=True)
-        ]
+        *(people_table(setup.scene), _identity(setup, options), total, partial(_prime, setup, session)),
     )
     with closing(StreamRun(options, spec)) as run:
         return _tracked(setup, options, session, run)
@@ -79,15 +73,27 @@ def track(options: argparse.Namespace) -> str:
 
 def _session(setup: Setup, options: argparse.Namespace) -> PeopleSession:
     if setup.detected and options.background is None:
-        return PeopleSession(setup.scene, setup.detected)
-    return PeopleSession(setup.scene, options.background or DEFAULT_BACKGROUND, setup.detected)
+        return PeopleSession(setup.scene, setup.detected, keep_tracks=False)
+    return PeopleSession(setup.scene, options.background or DEFAULT_BACKGROUND, setup.detected, keep_tracks=False)
+
+
+def _prime(setup: Setup, session: PeopleSession) -> None:
+    """Estimate the empty rooms from images of the recordings."""
+    session.prime(
+        [
+            [undistortion.apply(image) for image in source.sample(PRIMING_IMAGES)]
+            for source, undistortion in zip(setup.sources, setup.undistortions, strict=True)
+        ]
+    )
 
 
 def _tracked(setup: Setup, options: argparse.Namespace, session: PeopleSession, run: StreamRun) -> str:
     began = time.perf_counter()
     result = run.follow()
     is_smoothed = not any(map(is_live, setup.sources))
-    tracks = session.tracks.smoothed() if is_smoothed else session.tracks.recorder.tracks
+    # While it ran, rows were written and not kept: smoothing, and the formats of others, need all of them once.
+    tracks = by_identity(from_rows(run.writer.results))
+    tracks = smoothed(setup.scene.config, tracks) if is_smoothed else tracks
     if options.mot:
         write_mot(options.out / "tracks_mot.txt", setup.scene, setup.undistortions[0], tracks)
     if options.coco:

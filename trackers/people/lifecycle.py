@@ -331,10 +331,15 @@ def named(people: People) -> People:
 
 
 def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
-    """With the birth in a free slot; without a free one, nobody is added."""
-    config, free = scene.config, people.mode == FREE
-    slot = (jnp.arange(len(free)) == jnp.argmax(free)) & free & found.found
-    n = len(free)
+    """With the birth in a free slot; without one, in that of whoever left and was not observed for longest.
+
+    Where everybody is followed, nobody is added.
+    """
+    config, n = scene.config, len(people.mode)
+    left_s = jnp.where(people.mode == DORMANT, people.unseen_s, -jnp.inf)
+    preference = jnp.where(people.mode == FREE, jnp.inf, left_s)
+    best = jnp.argmax(preference)
+    slot = (jnp.arange(n) == best) & (preference[best] >= 0) & found.found
     mean = jnp.zeros(STATE).at[:2].set(found.xy).at[HEIGHT].set(config.height_m).at[WIDTH].set(config.width_m)
     speed, size = [config.speed_sd] * 2, [config.height_sd_m, config.width_sd_m]
     sd = jnp.array([0.0, 0.0, *speed, *size, *[1.0] * NUM_BIASES])

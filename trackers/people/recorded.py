@@ -1,6 +1,7 @@
 """Tracks as they are kept: collected while the tracker runs, and smoothed when a recording has ended."""
 
 import itertools
+from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +20,9 @@ from jaxfilters.trackers.people.tracker import motion
 
 NO_IMAGE = -1
 """In place of the number of an image, where a camera had none."""
+MOST_UNCONFIRMED = 1000
+"""Frames of a candidate that follow its confirmation; older ones are forgotten. Candidates are confirmed or given up
+within a few seconds, so this bounds the memory and nothing else."""
 
 
 class Sighting(NamedTuple):
@@ -46,12 +50,24 @@ MODES = ("tentative", "tracked", "hidden", "no_depth")
 
 
 class Recorder:
-    """Collects sightings by identity; those from before a confirmation follow once there is an identity."""
+    """Names sightings by identity; those from before a confirmation follow once there is an identity.
 
-    def __init__(self) -> None:
+    Its memory depends on the capacity of the tracker and not on the length of the run, unless tracks are kept.
+    """
+
+    def __init__(self, *, keep_tracks: bool = True) -> None:
+        """Nothing yet.
+
+        Args:
+            keep_tracks: Whether `tracks` collects all that `add` returns, about a kilobyte a person and frame.
+        """
         self.tracks: dict[int, list[Sighting]] = {}
-        self.unconfirmed: dict[int, list[Sighting]] = {}
-        """By slot."""
+        """By identity; empty where they are not kept."""
+        self.unconfirmed: dict[int, deque[Sighting]] = {}
+        """By slot, at most `MOST_UNCONFIRMED` each."""
+        self.ended: dict[int, int] = {}
+        """The last frame of everybody who has a slot, by identity: who has none cannot come back."""
+        self._keep_tracks = keep_tracks
 
     def add(self, frame: int, image: int, time_s: float, people: People, report: Report) -> list[tuple[int, Sighting]]:
         """The sightings of a frame and, for the newly confirmed, of the frames before.
@@ -73,15 +89,48 @@ class Recorder:
                 # A slot that was given up and taken again within one frame holds another person.
                 if people.log_odds[slot] == 0:
                     self.unconfirmed.pop(slot, None)
-                self.unconfirmed.setdefault(slot, []).append(sighting)
+                self.unconfirmed.setdefault(slot, deque(maxlen=MOST_UNCONFIRMED)).append(sighting)
                 continue
             # Whoever comes back was perhaps followed anew, unconfirmed, before the old track had ended.
-            before = self.tracks.get(int(identity), [])
-            ended = before[-1].frame if before else -1
-            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, []), sighting] if one.frame > ended]
-        for identity, sighting in added:
-            self.tracks.setdefault(identity, []).append(sighting)
+            ended = self.ended.get(int(identity), -1)
+            added += [(int(identity), one) for one in [*self.unconfirmed.pop(slot, ()), sighting] if one.frame > ended]
+        last = self.ended | {identity: sighting.frame for identity, sighting in added}
+        self.ended = {identity: last[identity] for identity in map(int, people.identity) if identity in last}
+        if self._keep_tracks:
+            self.tracks = by_identity(added, self.tracks)
         return added
+
+    def state(self) -> dict[str, dict[str, np.ndarray]]:
+        """All but the tracks, as arrays to save."""
+        ended = np.array([*self.ended.items()], np.int64).reshape(-1, 2)
+        return {
+            "unconfirmed": as_arrays([(slot, one) for slot, some in self.unconfirmed.items() for one in some]),
+            "ended": {"identity": ended[:, 0], "frame": ended[:, 1]},
+        }
+
+    def restore(self, state: Mapping[str, Mapping[str, np.ndarray]], tracks: Sequence[tuple[int, Sighting]]) -> None:
+        """Continue from what `state` gave; with the tracks up to then, where they are kept."""
+        self.unconfirmed = {
+            slot: deque(some, MOST_UNCONFIRMED) for slot, some in by_identity(from_arrays(state["unconfirmed"])).items()
+        }
+        ended = state["ended"]
+        self.ended = dict(zip(ended["identity"].tolist(), ended["frame"].tolist(), strict=True))
+        self.tracks = by_identity(tracks) if self._keep_tracks else {}
+
+
+def by_identity(
+    sightings: Sequence[tuple[int, Sighting]], tracks: dict[int, list[Sighting]] | None = None
+) -> dict[int, list[Sighting]]:
+    """Sightings at the ends of the tracks of their identities.
+
+    Args:
+        sightings: With their identities, in the order in which they became known.
+        tracks: To which they are added in place; none by default.
+    """
+    tracks = {} if tracks is None else tracks
+    for identity, sighting in sightings:
+        tracks.setdefault(identity, []).append(sighting)
+    return tracks
 
 
 def as_arrays(sightings: Sequence[tuple[int, Sighting]]) -> dict[str, np.ndarray]:

@@ -10,14 +10,14 @@ from jaxfilters.trackers.io.video_input import FrameSet
 from jaxfilters.trackers.people.drawing import drawn
 from jaxfilters.trackers.people.session import PeopleEstimate, PeopleSession
 from jaxfilters.trackers.people.state import TRACKED
-from jaxfilters.trackers.people.table import TimedPeopleTrack, as_rows, from_rows
+from jaxfilters.trackers.people.table import TimedPeopleTrack, as_rows
 
 
 class PeopleStream:
     """The session of people, as `jaxfilters.trackers.app.stream` runs it."""
 
     def __init__(self, session: PeopleSession):
-        """Before its first images."""
+        """Before its first images; the session need not keep its tracks."""
         self._session = session
         self._now: PeopleEstimate | None = None
 
@@ -47,6 +47,6 @@ class PeopleStream:
         """As of the session."""
         return self._session.state()
 
-    def restore(self, saved: Any, rows: TimedPeopleTrack) -> None:
-        """As of the session."""
-        self._session.restore(saved, from_rows(rows))
+    def restore(self, saved: Any, rows: TimedPeopleTrack) -> None:  # noqa: ARG002
+        """As of the session; rows stay in the results of the run."""
+        self._session.restore(saved)

@@ -15,7 +15,7 @@ from jaxfilters.trackers.background.median import MedianBackground, evenly
 from jaxfilters.trackers.background.registration import Registration, intrinsics
 from jaxfilters.trackers.people.config import PeopleConfig
 from jaxfilters.trackers.people.detected import DetectedForeground, combined
-from jaxfilters.trackers.people.recorded import NO_IMAGE, Recorder, Sighting, as_arrays, from_arrays, smoothed
+from jaxfilters.trackers.people.recorded import NO_IMAGE, Recorder, Sighting, smoothed
 from jaxfilters.trackers.people.standing import emptied
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, People, PeopleScene, Report
 from jaxfilters.trackers.people.tracker import outlines, people_scene, start, step
@@ -88,13 +88,14 @@ def track(
 class PeopleTracks:
     """The tracker over foreground that is given, frame by frame, with everybody's track so far."""
 
-    def __init__(self, scene: PeopleScene):
+    def __init__(self, scene: PeopleScene, *, keep_tracks: bool = True):
         """Nobody yet.
 
         Args:
             scene: Cameras, floor and furniture.
+            keep_tracks: As for `PeopleSession`.
         """
-        self.scene, self.recorder = scene, Recorder()
+        self.scene, self.recorder = scene, Recorder(keep_tracks=keep_tracks)
         self.frames, self.people = 0, start(scene)
         self.time_s = 0.0
         self.images = np.zeros(len(scene.cameras), np.int64)
@@ -120,27 +121,23 @@ class PeopleTracks:
         return PeopleEstimate(self.frames - 1, time_s, people, reported, added, seconds)
 
     def smoothed(self) -> dict[int, list[Sighting]]:
-        """All tracks, smoothed backwards in time: for a recording that has ended."""
+        """All tracks that were kept, smoothed backwards in time: for a recording that has ended."""
         return smoothed(self.scene.config, self.recorder.tracks)
 
     def state(self) -> dict[str, Any]:
         """What the next frame needs, but for the tracks: arrays by name."""
-        unconfirmed = [(slot, one) for slot, some in self.recorder.unconfirmed.items() for one in some]
         return {
             "people": self.people,
             "clock": np.array([self.frames, self.time_s]),
             "images": self.images.copy(),
-            "unconfirmed": as_arrays(unconfirmed),
+            "recorder": self.recorder.state(),
         }
 
-    def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
-        """Continue from what `state` gave, with the tracks up to then."""
+    def restore(self, state: dict[str, Any], tracks: Sequence[tuple[int, Sighting]] = ()) -> None:
+        """Continue from what `state` gave; with the tracks up to then, where they are kept."""
         self.people, (frames, self.time_s) = state["people"], map(float, state["clock"])
-        self.frames, self.recorder, self.images = int(frames), Recorder(), np.array(state["images"])
-        for slot, one in from_arrays(state["unconfirmed"]):
-            self.recorder.unconfirmed.setdefault(slot, []).append(one)
-        for identity, one in tracks:
-            self.recorder.tracks.setdefault(identity, []).append(one)
+        self.frames, self.images = int(frames), np.array(state["images"])
+        self.recorder.restore(state["recorder"], tracks)
 
 
 class PeopleSession:
@@ -151,6 +148,8 @@ class PeopleSession:
         scene: PeopleScene,
         subtraction: str | Sequence[Background] = "median",
         detected: Sequence[DetectedForeground] = (),
+        *,
+        keep_tracks: bool = True,
     ):
         """Nobody yet, and backgrounds of which nothing is known: `prime` them with images of a recording.
 
@@ -159,6 +158,9 @@ class PeopleSession:
             subtraction: Of the background: `median`, `mog2` or `knn`, or one object for each camera that gives the
                 foreground of its images, such as `DetectedForeground`.
             detected: For each camera, boxes of a detector, which decide together with `subtraction` what is foreground.
+            keep_tracks: Whether all rows stay in memory, about a kilobyte a person and frame, for `tracks.smoothed()`.
+                Without them the memory depends on the capacity and not on the length of the run; what `process` returns
+                is then the only place that has the rows.
 
         Raises:
             ValueError: if there is no such method, or not one object for each camera.
@@ -166,7 +168,7 @@ class PeopleSession:
         _check_count("subtraction", subtraction, len(scene.cameras))
         if detected:
             _check_count("detected", detected, len(scene.cameras))
-        self.tracks, self._detected = PeopleTracks(scene), list(detected)
+        self.tracks, self._detected = PeopleTracks(scene, keep_tracks=keep_tracks), list(detected)
         self._backgrounds: list[Background] = (
             [background(subtraction) for _ in scene.cameras] if isinstance(subtraction, str) else list(subtraction)
         )
@@ -253,8 +255,8 @@ class PeopleSession:
             "detected": [one.state() for one in self._detected],
         }
 
-    def restore(self, state: dict[str, Any], tracks: list[tuple[int, Sighting]]) -> None:
-        """Continue from what `state` gave, with the tracks up to then."""
+    def restore(self, state: dict[str, Any], tracks: Sequence[tuple[int, Sighting]] = ()) -> None:
+        """Continue from what `state` gave; with the tracks up to then, where they are kept."""
         self.tracks.restore(state, tracks)
         for model, saved in zip(self._backgrounds, state["backgrounds"], strict=True):
             model.restore(saved)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.trackers.app import results, stream
+from jaxfilters.trackers.app.output_folder import OutputFolder
 from jaxfilters.trackers.app.results import Columns, TrackTable
 from jaxfilters.trackers.app.stream import StreamRun, StreamSpec
 from jaxfilters.trackers.io.errors import CheckpointError, InputError, OutputError
@@ -181,6 +182,8 @@ def test_an_image_that_cannot_be_read_ends_the_run_with_what_was_done(whole, tmp
 def test_without_images_there_are_no_results(tmp_path):
     with pytest.raises(InputError, match="the sources hold no images"):
         follow(tmp_path / "out", Source(0))
+    assert not (tmp_path / "out" / "track.csv").exists()
+    follow(tmp_path / "out", Source(10))
     session = Sums()
     session.stop_at = 0, KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt, match="nothing was kept"):
@@ -257,3 +260,23 @@ def test_neither_memory_nor_checkpoints_grow_with_the_length_of_a_run(tmp_path, 
     assert max(sizes[-20:]) <= 1.01 * max(sizes[20:40])
     # The rows of the frames between take 400 kB.
     assert peaks[-1] - peaks[30] < 150_000
+
+
+def test_only_a_new_run_reads_ahead_and_holds_its_folder_meanwhile(tmp_path):
+    """Two runs that begin at once would read the same recordings, and one of them for nothing."""
+
+    def prime():
+        with pytest.raises(OutputError, match="another run writes into it"):
+            OutputFolder(tmp_path)
+        raise InputError("numbers: cannot be read ahead.")
+
+    def run(**changes):
+        source = Source(10)
+        return StreamRun(options(tmp_path, **changes), StreamSpec([source], source.moments(), list, Sums(), *rest))
+
+    rest = (TABLE, {"input": "numbers"}, None, prime)
+    with pytest.raises(InputError, match="cannot be read ahead"):
+        run()
+    assert not (tmp_path / "track.csv").exists()
+    follow(tmp_path, Source(10))
+    run(resume=True).close()

@@ -44,6 +44,12 @@ def written(folder: Path, frames, form):
     return folder / "hand.json"
 
 
+def test_an_impossible_name_is_refused_in_a_short_line():
+    with pytest.raises(InputError, match=r"^--keypoints n+\.\.\.: no such file or folder\.$") as refused:
+        KeypointSource(Path(3000 * "n"), None, None, SIZE)
+    assert len(str(refused.value)) < 240
+
+
 @pytest.mark.parametrize("form", [mediapipe, legacy, openpose])
 def test_hands_of_a_frame_are_read_from_every_form(tmp_path, form):
     two = [skeleton(place=(450, 350)), skeleton(place=(200, 350), size=60)]

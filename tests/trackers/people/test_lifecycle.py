@@ -257,10 +257,19 @@ def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it(scene):
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(unchanged), jax.tree.leaves(people), strict=True))
 
 
-def test_a_full_house_admits_nobody(scene):
-    full = people_of(TRACKED, TENTATIVE, DORMANT, TRACKED)
+def test_where_everybody_is_followed_nobody_is_added(scene):
+    full = people_of(TRACKED, TENTATIVE, TRACKED, TRACKED)
     after = confirm(scene, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(full), strict=True))
+
+
+def test_without_a_free_slot_whoever_left_first_is_forgotten(scene):
+    full = people_of(DORMANT, DORMANT, TRACKED, TENTATIVE, identity=[4, 5, 6, -1])
+    full = full._replace(unseen_s=jnp.array([3.0, 4.0, 9.0, 0.0]))
+    after = confirm(scene, full, Birth(jnp.array([1.5, 2.5]), jnp.array(True)))
+    assert after.mode.tolist() == [DORMANT, TENTATIVE, TRACKED, TENTATIVE]
+    assert after.identity.tolist() == [4, -1, 6, -1]
+    assert after.unseen_s.tolist() == [3, 0, 9, 0]
 
 
 @pytest.mark.system

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
+from jaxfilters.trackers.people import recorded
 from jaxfilters.trackers.people.recorded import NO_IMAGE, Recorder, Sighting, smoothed, spreads
 from jaxfilters.trackers.people.state import DORMANT, FREE, STATE, TENTATIVE, TRACKED, PeopleConfig, Report, nobody
 from jaxfilters.trackers.people.table import as_rows, from_rows
@@ -62,6 +63,26 @@ def test_a_person_who_comes_back_stands_once_in_each_frame():
     added = recorder.add(3, 3, 0.3, people._replace(mode=np.array([FREE, TRACKED]), identity=np.array([-1, 5])), report)
     assert [(identity, sighting.frame) for identity, sighting in added] == [(5, 3)]
     assert [sighting.frame for sighting in recorder.tracks[5]] == [0, 1, 2, 3]
+
+
+def test_memory_is_bounded_by_the_slots_where_tracks_are_not_kept(monkeypatch):
+    """A hundred people one after another, and a candidate who is never confirmed; also after a restart."""
+    monkeypatch.setattr(recorded, "MOST_UNCONFIRMED", 7)
+    recorder, kept = Recorder(keep_tracks=False), Recorder()
+    for i in range(200):
+        people, report = _frame(TRACKED, i // 2)
+        people = people._replace(mode=np.array([TRACKED, TENTATIVE]), log_odds=np.array([1.0, 1.0]))
+        added = recorder.add(i, i, 0.1 * i, people, report)
+        assert [(who, one.frame) for who, one in added] == [(i // 2, i)]
+        assert added[0][1].mean is not kept.add(i, i, 0.1 * i, people, report)[0][1].mean
+        if i % 50 == 0:
+            again = Recorder(keep_tracks=False)
+            again.restore(recorder.state(), ())
+            recorder = again
+    assert recorder.tracks == {}
+    assert recorder.ended == {99: 199}
+    assert [one.frame for one in recorder.unconfirmed[1]] == list(range(193, 200))
+    assert sum(map(len, kept.tracks.values())) == 200
 
 
 def test_whoever_is_given_up_leaves_nothing():

@@ -12,7 +12,6 @@ from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import session
 from jaxfilters.trackers.people.demo_room import demo_room
 from jaxfilters.trackers.people.detected import DetectedForeground
-from jaxfilters.trackers.people.recorded import as_arrays, from_arrays
 from jaxfilters.trackers.people.state import TENTATIVE, TRACKED, CameraFrame, PeopleConfig, Report
 from jaxfilters.trackers.people.table import as_rows, from_rows
 from jaxfilters.trackers.people.tracker import people_scene
@@ -70,7 +69,7 @@ def test_images_of_the_first_camera_are_counted_also_in_a_run_that_was_interrupt
     people = session.PeopleTracks(scene)
     for i in range(6):
         if i == interrupted_after:
-            state, tracks = people.state(), from_rows(as_rows([(4, one) for one in people.recorder.tracks.get(4, [])]))
+            state, tracks = people.state(), [(4, one) for one in people.recorder.tracks.get(4, [])]
             people = session.PeopleTracks(scene)
             people.restore(state, tracks)
         people.step(shown(i, present=i % 2 == 0), 0.1 * i)
@@ -124,9 +123,7 @@ def test_a_session_that_is_saved_and_restored_goes_on_bit_for_bit():
     state = primed.state()
     tracks = [(who, one) for who, track in primed.tracks.recorder.tracks.items() for one in track]
     restored = with_boxes()
-    restored.restore(
-        state | {"unconfirmed": as_arrays(from_arrays(state["unconfirmed"]))}, from_arrays(as_arrays(tracks))
-    )
+    restored.restore(state, from_rows(as_rows(tracks)))
     for i in range(20, 30):
         expected, found = (one.process(images[i], i / room.fps) for one in (primed, restored))
         for a, b in zip(jax.tree.leaves(expected[:-2]), jax.tree.leaves(found[:-2]), strict=True):
