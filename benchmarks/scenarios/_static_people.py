@@ -27,7 +27,7 @@ from jaxfilters.models.synthetic.standing_person import (
 )
 from jaxfilters.trackers.io.undistortion import Undistortion
 from jaxfilters.trackers.people import tracker
-from jaxfilters.trackers.people.lifecycle import MOST_LOG_ODDS, NEWCOMER_SD_M
+from jaxfilters.trackers.people.lifecycle import BIRTH_SD_M, MOST_LOG_ODDS
 from jaxfilters.trackers.people.state import (
     BIAS,
     NUM_BIASES,
@@ -267,7 +267,7 @@ def run_people(
     calibration: Calibration,
     *,
     height_m: tuple[float, float] | None = None,
-    start_sd_m: float = NEWCOMER_SD_M,
+    start_sd_m: float = BIRTH_SD_M,
 ) -> Estimates:
     """The modern tracker, without distortion; everybody is known, but not well where they start.
 

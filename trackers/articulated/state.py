@@ -11,7 +11,7 @@ SEARCHING, TRACKING, LOST = range(3)
 
 
 class ArticulatedTrack(NamedTuple):
-    """What is known of the hand in each of `b` frames, by the heaviest hypothesis; NaN while it is searched for."""
+    """What is known of the hand in each of `b` frames, by its likeliest hypothesis; NaN while it is searched for."""
 
     mean: Float[Array | np.ndarray, "b n"]
     """States, in the order of the layout."""
@@ -27,7 +27,7 @@ class ArticulatedTrack(NamedTuple):
     scale: Float[Array | np.ndarray, " b"]
     """The quaternion's squared length: pixels of the image for one of a length; 1 with `focal`."""
     weight: Float[Array | np.ndarray, " b"]
-    """Share of the heaviest hypothesis."""
+    """Weight of this hypothesis."""
     num_hypotheses: Int[Array | np.ndarray, " b"]
     is_new_view: Bool[Array | np.ndarray, " b"]
     """Whether lengths were estimated from this frame."""

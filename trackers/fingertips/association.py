@@ -40,7 +40,7 @@ def nearest_in_order(
 def likeliest(
     config: FingertipConfig, state: HandState, beliefs: Gaussian, observed: HandObservation
 ) -> tuple[Int32[Array, " slots"], Bool[Array, ""]]:
-    """The likeliest pairs in order within the gates of every finger's own uncertainty, fingertips before newcomers.
+    """The likeliest pairs in order within the gates of every finger's own uncertainty, confirmed tracks first.
 
     A pair costs twice its negative log likelihood. Where the order is contradicted for some frames, as when fingers
     cross, any order will do until it is not.
@@ -57,8 +57,8 @@ def likeliest(
     doubt = spent > config.disorder * free.cost + LEAST_DOUBT
     tips = jnp.where(doubt & (state.disordered >= config.disordered_frames - 1), free.column, tips)
     taken = jnp.any(tips[:, None] == jnp.arange(len(observed.is_tip)), axis=0)
-    newcomers, _ = _in_order(state, beliefs, observed, cost, mode == TENTATIVE, observed.is_tip & ~taken, gated)
-    return jnp.where(certain, tips, newcomers), doubt
+    tentative, _ = _in_order(state, beliefs, observed, cost, mode == TENTATIVE, observed.is_tip & ~taken, gated)
+    return jnp.where(certain, tips, tentative), doubt
 
 
 def _in_order(state, beliefs, observed, cost, rows, columns, match):

@@ -99,7 +99,7 @@ def continued(
     mode = jnp.where(tracks.mode == CONFIRMED, jnp.where(known, CONFIRMED, FREE), tracks.mode)
     mode = jnp.where((mode == TENTATIVE) & ~matched, FREE, mode)
     ready = (mode == TENTATIVE) & (hits >= config.min_hits) & known
-    # A hand has five fingers: newcomers wait until one of those that are coasting is given up.
+    # A hand has five fingers: new ones wait until one of those that are coasting is given up.
     room = MAX_TIPS - jnp.sum(mode == CONFIRMED)
     ready &= jnp.cumsum(ready) <= room
     identity = jnp.where(mode == FREE, -1, tracks.identity)

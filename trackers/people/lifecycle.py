@@ -67,14 +67,14 @@ AWAY_SD = 2.0
 """Standard deviations beyond the border of the floor from which on a person has left it."""
 LOST_SD_M = 1.2
 """A place known no better than this is no place."""
-LOST_NEWCOMER_SDS = 2.0
+LOST_BIRTH_SDS = 2.0
 """Where cameras tell distances worse than that, the same in standard deviations of a birth."""
 LIKENESS = 0.3
 """Dissimilarity up to which a person who comes is a person who left."""
 WALKING_M_PER_S = 2.0
 LEARNING_RATE = 0.1
-"""Share of a new appearance in the remembered one."""
-NEWCOMER_SD_M = 0.3
+"""Share of a new appearance in the kept one."""
+BIRTH_SD_M = 0.3
 """Of the place of a birth, from the distance between cells."""
 _LEAST_INFORMATION = 0.01
 """Inverse square metres: a place that no silhouette fixes is still somewhere on the floor."""
@@ -100,12 +100,12 @@ def cells_of(
     axes = [np.arange(a + config.cell_m / 2, b, config.cell_m) for a, b in zip(low, high, strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
     xy = from_host(_filled(points), jnp.float32)
-    looks = [_look(camera, depth, config, xy) for camera, depth in zip(cameras, furniture, strict=True)]
-    observed = np.max([np.asarray(look.share) for look in looks], axis=0) >= LEAST_SHARE
+    views = [_expected_view(camera, depth, config, xy) for camera, depth in zip(cameras, furniture, strict=True)]
+    observed = np.max([np.asarray(view.share) for view in views], axis=0) >= LEAST_SHARE
     (kept,) = np.nonzero((observed & np.asarray(walkable(jnp.asarray(floor), xy)))[: len(points)])
     if not len(kept):
         raise ValueError("floor: no camera sees half of a person anywhere on it; check units (metres) and cameras.")
-    pixels, presence, share, area = zip(*(_rows(look, kept) for look in looks), strict=True)
+    pixels, presence, share, area = zip(*(_rows(view, kept) for view in views), strict=True)
     return Cells(_rows(xy, kept), pixels, presence, share, area)
 
 
@@ -134,7 +134,7 @@ def stride(shape: tuple[int, int]) -> int:
     return max(1, -(-shape[1] // REDUCED_COLS))
 
 
-class _Look(NamedTuple):
+class _ExpectedView(NamedTuple):
     """One camera's part of `Cells`."""
 
     pixels: Int32[Array, "cells samples"]
@@ -144,7 +144,7 @@ class _Look(NamedTuple):
 
 
 @partial(compiled_quickly, static_argnums=2)
-def _look(camera, furniture, config, xy):
+def _expected_view(camera, furniture, config, xy):
     offsets = _offsets()
     rows, cols = camera.shape
     step = stride(camera.shape)
@@ -160,7 +160,7 @@ def _look(camera, furniture, config, xy):
         free = inside & (furniture[jnp.minimum(v * step, rows - 1), jnp.minimum(u * step, cols - 1)] > contour.depth)
         weight = presence(camera.P, xy, config.height_m, config.width_m, uv, config.spread_px)
         index = jnp.where(free, v * reduced_cols + u, reduced_rows * reduced_cols)
-        return _Look(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(contour) / step**2)
+        return _ExpectedView(index, weight, jnp.sum(weight * free) / weight.sum(), area_of(contour) / step**2)
 
     return jax.vmap(one)(xy)
 
@@ -242,7 +242,7 @@ def is_active(mode: Int32[Array, " slots"]) -> Bool[Array, " slots"]:
 
 
 def _ended(mode: Int32[Array, " slots"], gone: Bool[Array, " slots"]) -> Int32[Array, " slots"]:
-    """Modes where those who are `gone` are remembered if they were tracked, and forgotten if they were not."""
+    """Modes where those who are `gone` stay as dormant if they were tracked, and are removed if they were not."""
     return jnp.where(gone, jnp.where(mode == TRACKED, DORMANT, FREE), mode)
 
 
@@ -261,8 +261,8 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
     unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)
     sd = _largest_sd(people.belief.covariance[:, :2, :2])
-    newcomers = jax.vmap(newcomer_covariance, in_axes=(None, 0))(scene, people.belief.mean[:, :2])
-    lost = sd > jnp.maximum(LOST_SD_M, LOST_NEWCOMER_SDS * _largest_sd(newcomers))
+    births = jax.vmap(birth_covariance, in_axes=(None, 0))(scene, people.belief.mean[:, :2])
+    lost = sd > jnp.maximum(LOST_SD_M, LOST_BIRTH_SDS * _largest_sd(births))
     away = _is_away(scene, people.belief)
     gone = active & ((log_odds < config.dropped) | (unseen > config.hidden_s) | lost | away)
     gone |= (people.mode == TENTATIVE) & (unseen > 0.5)
@@ -298,7 +298,7 @@ def seniority(people: People) -> Float[Array, " slots"]:
     return jnp.where(tracked, MOST_LOG_ODDS + 1.0 + juniors, tentative)
 
 
-def remembered(people: People, histograms: Float[Array, "slots 48"], good: Bool[Array, " slots"]) -> People:
+def with_appearances(people: People, histograms: Float[Array, "slots 48"], good: Bool[Array, " slots"]) -> People:
     """Appearances with what this frame shows of those who are certainly who they are said to be."""
     good &= ~is_meeting(people.meetings)
     blank = jnp.all(people.appearance == people.appearance[:, :1], axis=-1)
@@ -343,7 +343,7 @@ def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
     mean = jnp.zeros(STATE).at[:2].set(found.xy).at[HEIGHT].set(config.height_m).at[WIDTH].set(config.width_m)
     speed, size = [config.speed_sd] * 2, [config.height_sd_m, config.width_sd_m]
     sd = jnp.array([0.0, 0.0, *speed, *size, *[1.0] * NUM_BIASES])
-    covariance = jnp.diag(sd**2).at[:2, :2].set(newcomer_covariance(scene, found.xy))
+    covariance = jnp.diag(sd**2).at[:2, :2].set(birth_covariance(scene, found.xy))
     fresh = Gaussian(jnp.broadcast_to(mean, (n, STATE)), jnp.broadcast_to(covariance, (n, STATE, STATE)))
     return people._replace(
         belief=chosen(slot, fresh, people.belief),
@@ -357,7 +357,7 @@ def confirm(scene: PeopleScene, people: People, found: Birth) -> People:
     )
 
 
-def newcomer_covariance(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+def birth_covariance(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Array, "2 2"]:
     """Of the place of a birth, square metres: that of the grid of cells, and of edges in the reduced image.
 
     An edge that is a pixel of the reduced image too low moves a person who is looked at under a small angle by metres.
@@ -367,4 +367,4 @@ def newcomer_covariance(scene: PeopleScene, xy: Float[Array, " 2"]) -> Float[Arr
     edges_px = [float(stride(camera.shape)) for camera in scene.cameras]
     known = jnp.zeros((3, 3)).at[2, 2].set(1 / config.height_sd_m**2) + _LEAST_INFORMATION * jnp.eye(3)
     covariance = edge_covariance(scene, xy, jnp.asarray(config.height_m), edges_px, known)
-    return covariance[:2, :2] + NEWCOMER_SD_M**2 * jnp.eye(2)
+    return covariance[:2, :2] + BIRTH_SD_M**2 * jnp.eye(2)

@@ -139,7 +139,7 @@ def step(
     histograms, good = appearances(scene, places, active, frames)
     good &= fit.share_seen > CLEAR
     people = identity_switch_correction(people, histograms, good, dt)
-    people = lifecycle.named(lifecycle.remembered(people, histograms, good))
+    people = lifecycle.named(lifecycle.with_appearances(people, histograms, good))
     people = lifecycle.confirm(scene, people, birth(scene, places, active, frames))
     return people, _report(scene, people, fit, nis, innovations)
 

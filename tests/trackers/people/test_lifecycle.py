@@ -233,13 +233,13 @@ def test_two_who_come_at_once_are_not_the_same_old_one():
 @pytest.mark.system
 def test_clothes_are_taken_at_first_and_then_followed_slowly():
     people, good = people_of(TRACKED, TRACKED), jnp.array([True, False, False, False])
-    first = lifecycle.remembered(people, jnp.tile(RED, (SLOTS, 1)), good)
+    first = lifecycle.with_appearances(people, jnp.tile(RED, (SLOTS, 1)), good)
     np.testing.assert_array_equal(first.appearance[0], RED)
     np.testing.assert_array_equal(first.appearance[1], people.appearance[1])
-    later = lifecycle.remembered(first, jnp.tile(BLUE, (SLOTS, 1)), good)
+    later = lifecycle.with_appearances(first, jnp.tile(BLUE, (SLOTS, 1)), good)
     np.testing.assert_allclose(later.appearance[0], 0.9 * RED + 0.1 * BLUE, atol=1e-6)
     open_ = first.meetings._replace(is_open=first.meetings.is_open.at[0, 1].set(True).at[1, 0].set(True))
-    during = lifecycle.remembered(first._replace(meetings=open_), jnp.tile(BLUE, (SLOTS, 1)), good)
+    during = lifecycle.with_appearances(first._replace(meetings=open_), jnp.tile(BLUE, (SLOTS, 1)), good)
     np.testing.assert_array_equal(during.appearance[0], RED)
 
 
@@ -283,8 +283,8 @@ def test_a_newcomer_is_as_uncertain_as_edges_of_the_reduced_image(low_camera, mo
 
     slopes = [(rows(d[0], 1.72 + d[1]) - rows(-d[0], 1.72 - d[1])) / 1.0 for d in np.diag([0.5, 0.5])]
     information = slopes @ np.transpose(slopes) / stride(low_camera.shape) ** 2 + np.diag([0.0, 0.08**-2])
-    variance = np.linalg.inv(information)[0, 0] + lifecycle.NEWCOMER_SD_M**2
-    found = np.asarray(lifecycle.newcomer_covariance(far, jnp.zeros(2)))
+    variance = np.linalg.inv(information)[0, 0] + lifecycle.BIRTH_SD_M**2
+    found = np.asarray(lifecycle.birth_covariance(far, jnp.zeros(2)))
     np.testing.assert_allclose(found[1, 1], variance, rtol=0.1)
     assert found[0, 0] < 0.11
     born = confirm(far, nobody(config), Birth(jnp.zeros(2), jnp.bool_(True)))

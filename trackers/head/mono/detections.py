@@ -10,7 +10,7 @@ from jaxfilters.models.face.landmarks import FROM_68
 from jaxfilters.trackers.head.common.corners import eye_centers
 from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
-from jaxfilters.trackers.head.mono.detectors import MESH_MM, CascadeDetector, Detector, Seen, dense_noise
+from jaxfilters.trackers.head.mono.detectors import MESH_MM, CascadeDetector, DetectedFace, Detector, dense_noise
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, is_symmetric
 from jaxfilters.trackers.head.mono.state import NUM_FRAMES
 from jaxfilters.trackers.io.detector_errors import DetectorErrors
@@ -57,7 +57,7 @@ class Collector:
         self.several = 0
         """Faces in the last frame, if more than one."""
         self._detector = detector or CascadeDetector()
-        self._observed: list[Seen] = []
+        self._observed: list[DetectedFace] = []
         self._images: list[np.ndarray] = []
         self._times: list[float] = []
 
@@ -93,7 +93,7 @@ class Collector:
         """Begins anew."""
         self._observed, self._images, self._times = [], [], []
 
-    def _detected(self, image: np.ndarray) -> Seen | None:
+    def _detected(self, image: np.ndarray) -> DetectedFace | None:
         near, apart_px = None, None
         if self._observed:
             last = self._observed[-1].points
@@ -120,7 +120,7 @@ class Collector:
         while self._times and time - self._times[0] > STALE_S:
             del self._observed[0], self._images[0], self._times[0]
 
-    def _kept(self, observed: Seen, image: np.ndarray, time: float) -> Detections | None:
+    def _kept(self, observed: DetectedFace, image: np.ndarray, time: float) -> Detections | None:
         self._observed.append(observed)
         self._images.append(image.copy())
         self._times.append(time)

@@ -43,7 +43,7 @@ MESH_MM = 1.5
 """Standard deviation by which the mesh's landmarks lie beside the model's in all frames alike."""
 
 
-class Seen(NamedTuple):
+class DetectedFace(NamedTuple):
     """One face in one image; pixels (u, v)."""
 
     points: Float[np.ndarray, "10 2"]
@@ -76,7 +76,7 @@ class Detector(Protocol):
         image: UInt8[np.ndarray, "rows cols"],
         near: Float[np.ndarray, " 2"] | None,
         apart_px: float | None = None,
-    ) -> Seen | str:
+    ) -> DetectedFace | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one.
 
         Args:
@@ -117,7 +117,7 @@ class CascadeDetector:
         image: UInt8[np.ndarray, "rows cols"],
         near: Float[np.ndarray, " 2"] | None,
         apart_px: float | None = None,
-    ) -> Seen | str:
+    ) -> DetectedFace | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one."""
         del apart_px
         found = detect(image, near=near)
@@ -126,7 +126,7 @@ class CascadeDetector:
         points = complete(image, found.points)
         if points is None:
             return "nostrils or brows are not visible"
-        return Seen(points, found.num_faces)
+        return DetectedFace(points, found.num_faces)
 
 
 class MeshLandmarks:
@@ -149,7 +149,7 @@ class MeshLandmarks:
         image: UInt8[np.ndarray, "rows cols"],
         near: Float[np.ndarray, " 2"] | None,
         apart_px: float | None = None,
-    ) -> Seen | str:
+    ) -> DetectedFace | str:
         """The face, or why there is none; of several the one nearest to a place, the largest without one.
 
         Small faces are found in parts of the image: about the place that is given, or anywhere if none is.
@@ -164,7 +164,7 @@ class MeshLandmarks:
         mesh = solid[:, :2]
         dense = np.array([mesh[list(vertices)].mean(axis=0) if vertices else (np.nan, np.nan) for vertices in MESH_68])
         iris_px = np.array([np.linalg.norm(mesh[a] - mesh[b]) for a, b in IRISES])
-        return Seen(dense[list(FROM_68)], len(solids), dense, iris_px, solid)
+        return DetectedFace(dense[list(FROM_68)], len(solids), dense, iris_px, solid)
 
     def glance(
         self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float

@@ -32,7 +32,7 @@ from jaxfilters.trackers.head.common.search import gathered
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, LOST, POSE
 from jaxfilters.trackers.head.mono.claims import frame_covariance
 from jaxfilters.trackers.head.mono.detections import noise_px
-from jaxfilters.trackers.head.mono.detectors import Detector, Seen
+from jaxfilters.trackers.head.mono.detectors import DetectedFace, Detector
 from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, facing_pose
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
@@ -103,7 +103,7 @@ def located(
     row: MonoTrack,
     rig: CameraRig,
     detector: Detector,
-    detected: Seen,
+    detected: DetectedFace,
     image: UInt8[np.ndarray, "rows cols"],
 ) -> Located | None:
     """The state with the face where a detector finds it in the last image; None if its landmarks have no pose.

@@ -24,7 +24,7 @@ from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head.mono.detections import Collector, Detections
-from jaxfilters.trackers.head.mono.detectors import CascadeDetector, Detector, MeshGiver, Seen
+from jaxfilters.trackers.head.mono.detectors import CascadeDetector, DetectedFace, Detector, MeshGiver
 from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
 from jaxfilters.trackers.head.mono.mesh_rotation import MeshRotations
@@ -301,7 +301,7 @@ class _MonoTracker:
         index = np.where(np.asarray(track.person_index) < num_known, track.person_index, -1)
         return self._meshes.reported(track._replace(person_index=index), times)
 
-    def _beside(self, state: MonoState, row: MonoTrack, observed: Seen, images: np.ndarray) -> Compared:
+    def _beside(self, state: MonoState, row: MonoTrack, observed: DetectedFace, images: np.ndarray) -> Compared:
         """A track in doubt, or lost, beside what was detected in the last images."""
         found = redetection.located(state, row, self.rig, self._detector, observed, images[0])
         if found is None:

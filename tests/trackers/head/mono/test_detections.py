@@ -8,7 +8,7 @@ import pytest
 from jaxfilters.models.face.landmarks import FROM_68, MEAN_SHAPE
 from jaxfilters.trackers.head.mono import detectors as module
 from jaxfilters.trackers.head.mono.detections import APART_S, STALE_S, Collector
-from jaxfilters.trackers.head.mono.detectors import CHIN, MESH_SHARE, Seen
+from jaxfilters.trackers.head.mono.detectors import CHIN, MESH_SHARE, DetectedFace
 from jaxfilters.trackers.head.mono.start import is_symmetric
 from jaxfilters.trackers.head.mono.state import NUM_FRAMES
 from jaxfilters.trackers.head.stereo.session import check_points
@@ -98,7 +98,7 @@ class Mesh:
         self.dense = dense
 
     def detect(self, image, near, apart_px=None):
-        return Seen(FACE, 1, self.dense, np.array([11.0, 12.0]))
+        return DetectedFace(FACE, 1, self.dense, np.array([11.0, 12.0]))
 
 
 def test_more_landmarks_are_kept_with_what_is_not_seen_of_them():

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.face.pose import place
-from jaxfilters.trackers.head.mono.detectors import Seen
+from jaxfilters.trackers.head.mono.detectors import DetectedFace
 from jaxfilters.trackers.head.mono.mesh_rotation import (
     GROSS_SHARE,
     GROSS_STD,
@@ -235,7 +235,7 @@ class Meshes:
         self.asked.append(i)
         uv = self._made.uv[i, 0]
         solid, _ = solid_of(self._vertices, self._made.poses[i, 3:] + WRONG, uv.mean(axis=0), self._rig)
-        return Seen(uv, solid=solid)
+        return DetectedFace(uv, solid=solid)
 
     def glance(self, image, near, apart_px):
         return self.detect(image, near, apart_px).solid

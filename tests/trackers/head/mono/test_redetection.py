@@ -14,7 +14,7 @@ from jaxfilters.models.face.shape_model import shape
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, LOST, PATIENCE, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.claims import CHANGED_STD
-from jaxfilters.trackers.head.mono.detectors import Seen
+from jaxfilters.trackers.head.mono.detectors import DetectedFace
 from jaxfilters.trackers.head.mono.session import MonoSession
 from jaxfilters.trackers.head.mono.state import MonoTrack
 
@@ -34,7 +34,7 @@ class KnownLandmarks:
     def detect(self, image, near, apart_px=None):
         self.asked += 1
         noise = np.random.default_rng(self.asked).normal(0, 1.0, (10, 2))
-        return Seen(self.uv + noise) if np.isfinite(self.uv).all() else "no face"
+        return DetectedFace(self.uv + noise) if np.isfinite(self.uv).all() else "no face"
 
 
 @pytest.fixture(scope="module")
