@@ -192,34 +192,51 @@ def test_ctrl_c_writes_what_there_is(stereo, fake_head, tmp_path, monkeypatch, c
     assert len(rows_of(out)) == 16
 
 
-@pytest.mark.parametrize("kept_until", [0, 8, 16])
-def test_an_interrupted_run_is_resumed_bit_for_bit(stereo, fake_head, tmp_path, monkeypatch, capsys, kept_until):
-    """Ended by an error that nobody foresaw in the frames after the last checkpoint, or before the first one."""
+def fail_from(monkeypatch, frames):
+    """Let sessions end by an error that nobody foresaw, after so many frames."""
     process = head_command.HeadSession.process
-    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    assert run(*stereo, "--out", whole) == 0
 
     def fail(self, images, times):
-        if self.frames >= kept_until:
+        if self.frames >= frames:
             raise RuntimeError("killed")
         return process(self, images, times)
 
+    monkeypatch.setattr(head_command.HeadSession, "process", fail)
+
+
+@pytest.mark.parametrize("kept_until", [8, 16])
+def test_an_interrupted_run_is_resumed_bit_for_bit(stereo, fake_head, tmp_path, monkeypatch, capsys, kept_until):
+    """Ended by an error that nobody foresaw in the frames after the last checkpoint."""
+    monkeypatch.setattr(stream, "CHECKPOINT_EVERY_S", 0.0)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert run(*stereo, "--out", whole) == 0
     with monkeypatch.context() as patch:
-        patch.setattr(head_command.HeadSession, "process", fail)
+        fail_from(patch, kept_until)
         assert run(*stereo, "--out", out) == 70
     assert len(rows_of(out)) == kept_until
     assert run(*stereo, "--out", out) == 2
     assert "choose another --out, or --resume" in capsys.readouterr().err
-    assert run(*stereo, "--out", out, "--seed", 5, "--resume") == (2 if kept_until else 0)
-    if kept_until:
-        assert "config.seed was 0 and is 5" in capsys.readouterr().err
-    assert run(*stereo, "--out", out, "--resume") == (0 if kept_until else 2)
+    assert run(*stereo, "--out", out, "--seed", 5, "--resume") == 2
+    assert "config.seed was 0 and is 5" in capsys.readouterr().err
+    assert run(*stereo, "--out", out, "--resume") == 0
     assert rows_of(out) == rows_of(whole)
     report, expected = (json.loads((folder / "report.json").read_text()) for folder in (out, whole))
     assert report["events"] == expected["events"]
-    if kept_until:
-        assert (out / f"overlay_from_{kept_until}.mp4").exists()
+    assert (out / f"overlay_from_{kept_until}.mp4").exists()
+
+
+@pytest.mark.parametrize("again", [(), ("--resume",)])
+def test_a_run_that_ends_before_its_first_frame_leaves_its_folder_to_another_one(
+    stereo, fake_head, tmp_path, monkeypatch, again
+):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert run(*stereo, "--out", whole) == 0
+    with monkeypatch.context() as patch:
+        fail_from(patch, 0)
+        assert run(*stereo, "--out", out) == 70
+    assert not (out / "track.csv").exists()
+    assert run(*stereo, "--out", out, *again) == 0
+    assert rows_of(out) == rows_of(whole)
 
 
 def test_ctrl_c_before_anything_was_tracked(stereo, fake_head, tmp_path, monkeypatch, capsys):
