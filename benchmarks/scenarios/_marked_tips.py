@@ -107,11 +107,16 @@ def pairs_of(own: dict[str, Any], tips: Tips, most: float) -> dict[str, int]:
     fingers = own["tips"] | own["cut"]
     if not fingers or not len(tips.position):
         return {}
-    apart = np.linalg.norm(np.array(list(fingers.values()), float)[:, None] - tips.position, axis=-1)
+    pairs = pairs_within(np.array(list(fingers.values()), float), tips.position, most)
+    return {list(fingers)[finger]: tip for finger, tip in pairs}
+
+
+def pairs_within(fingers: np.ndarray, tips: np.ndarray, most: float) -> list[tuple[int, int]]:
+    """Pairs of (m, 2) and (n, 2) places that are nearer than `most`, by the least sum of distances."""
+    apart = np.linalg.norm(fingers[:, None] - tips, axis=-1)
     # As many pairs as possible, whatever is beyond the gate.
     rows, columns = linear_sum_assignment(np.where(apart < most, apart, 1e3 * most))
-    near = [(row, column) for row, column in zip(rows, columns, strict=True) if apart[row, column] < most]
-    return {list(fingers)[row]: int(column) for row, column in near}
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if apart[i, j] < most]
 
 
 def images_of(path: Path) -> list[np.ndarray]:

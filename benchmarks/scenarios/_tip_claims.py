@@ -7,12 +7,11 @@ who marked them.
 
 import jax
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.benchmarks.scenarios import fingertips
 from jaxfilters.benchmarks.scenarios._claims import Claims, Recording
-from jaxfilters.benchmarks.scenarios._marked_tips import NAMES, images_of, marks, pairs_of, tips_of
+from jaxfilters.benchmarks.scenarios._marked_tips import NAMES, images_of, marks, pairs_of, pairs_within, tips_of
 from jaxfilters.models.fingertip.observation import MAX_TIPS
 from jaxfilters.trackers.fingertips.images import track
 from jaxfilters.trackers.fingertips.state import FingertipConfig
@@ -73,11 +72,8 @@ def by_finger(position: np.ndarray, is_tip: np.ndarray, sd: np.ndarray, truth: n
     errors, deviations = np.full(truth.shape, np.nan), np.full(truth.shape, np.nan)
     for frame, own in enumerate(truth):
         tips, claimed = position[frame][is_tip[frame]], sd[frame][is_tip[frame]]
-        apart = np.linalg.norm(own[:, None] - tips, axis=-1)
-        near = apart < HALF_WIDTH_PX
-        for finger, tip in zip(*linear_sum_assignment(np.where(near, apart, 1e3 * HALF_WIDTH_PX)), strict=True):
-            if near[finger, tip]:
-                errors[frame, finger], deviations[frame, finger] = tips[tip] - own[finger], claimed[tip]
+        for finger, tip in pairs_within(own, tips, HALF_WIDTH_PX):
+            errors[frame, finger], deviations[frame, finger] = tips[tip] - own[finger], claimed[tip]
     return [Recording(errors[:, i], deviations[:, i]) for i in range(truth.shape[1])]
 
 

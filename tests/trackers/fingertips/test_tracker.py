@@ -333,3 +333,17 @@ def test_a_hand_that_turns_over_has_its_thumb_on_the_other_side_within_a_second(
         assert names_from_the_left(report) == [0, 1, 2, 3, 4]
     assert names_from_the_left(reports[-1]) == [4, 3, 2, 1, 0]
     assert reports[-1].position[reports[-1].is_thumb][:, 0] == pytest.approx(320 - open_hand[0, 0], abs=1)
+
+
+def test_the_lasting_misplacement_is_added_to_the_variance_that_is_reported_and_to_nothing_else(hands):
+    observed = jax.tree.map(lambda leaf: leaf[0, :60], hands.observed)
+    reports = []
+    for misplacement_sd in (1e-6, 1.5):
+        config = replace(CONFIG, misplacement_sd=misplacement_sd)
+        reports.append(tracker.run(config, ANGLES, tracker.start(config, ANGLES), observed)[1])
+    without, with_it = reports
+    assert np.any(without.is_tip)
+    variance = np.where(without.is_tip, without.sd**2 + 1.5**2, 0.0)
+    np.testing.assert_allclose(with_it.sd**2, variance, rtol=1e-5)
+    for one, other in zip(with_it._replace(sd=0), without._replace(sd=0), strict=True):
+        np.testing.assert_array_equal(one, other)

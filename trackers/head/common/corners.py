@@ -31,6 +31,12 @@ def eye_centers(six: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
     return six[list(EYES)].reshape(2, 2, 2).mean(axis=1)
 
 
+def eyes_apart_px(six: Float[np.ndarray, "n 2"]) -> float:
+    """Distance between these midpoints."""
+    right, left = eye_centers(six)
+    return float(np.linalg.norm(right - left))
+
+
 def corners(
     image: UInt8[np.ndarray, "rows cols"], eyes: Float[np.ndarray, "2 4"], mouth: Float[np.ndarray, " 4"]
 ) -> Float[np.ndarray, "6 2"] | None:

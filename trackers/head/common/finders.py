@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfilters.models.face.landmarks import EYES
-from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.corners import eyes_apart_px
 from jaxfilters.trackers.head.common.detect import STABLE_FRAMES, STABLE_SHARE, StableDetector, complete, detect
 from jaxfilters.trackers.head.common.mesh import MOST_FACES, MeshDetector, landmarks_of
-from jaxfilters.trackers.head.common.mesh_crops import largest, nearest, solids_anywhere, solids_near
+from jaxfilters.trackers.head.common.mesh_crops import largest, nearest, solids_about, solids_anywhere, solids_near
 
 MOST_MOVED_PX = 2.0
 """Between two images of a face that holds still; `STABLE_SHARE` of the eyes' distance where that is more."""
@@ -97,7 +97,7 @@ class MeshFinder:
             return None
         self.complaints = [f"{len(solids)} faces; the largest is taken"] if len(solids) > 1 else []
         found = landmarks_of(largest(solids) if near is None else nearest(solids, near))
-        most = max(MOST_MOVED_PX, STABLE_SHARE * _eyes_px(found))
+        most = max(MOST_MOVED_PX, STABLE_SHARE * eyes_apart_px(found))
         is_still = self._last is not None and float(np.abs(found - self._last).max()) < most
         self._last, self._agreeing = found, self._agreeing + 1 if is_still else 1
         across = found[EYES[3]] - found[EYES[0]]
@@ -109,23 +109,18 @@ class MeshFinder:
         self, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float
     ) -> Float[np.ndarray, "10 2"] | None:
         """The landmarks in one image of a face that may move, of several faces those nearest to a place, or `None`."""
-        solids = solids_near(self._mesh, image, near, apart_px) or self._mesh.solids(image)
+        solids = solids_about(self._mesh, image, near, apart_px)
         return landmarks_of(nearest(solids, near)) if solids else None
 
     def _solids(self, image: UInt8[np.ndarray, "rows cols"]) -> list[Float[np.ndarray, "V 3"]]:
         """Faces about the last one, or anywhere if it is gone."""
-        about = (
-            [] if self._last is None else solids_near(self._mesh, image, self._last.mean(axis=0), _eyes_px(self._last))
-        )
+        last = self._last
+        about = [] if last is None else solids_near(self._mesh, image, last.mean(axis=0), eyes_apart_px(last))
         return about or solids_anywhere(self._mesh, image)
 
     def reset(self) -> None:
         """Forget the images so far."""
         self._last, self._agreeing = None, 0
-
-
-def _eyes_px(points: Float[np.ndarray, "10 2"]) -> float:
-    return float(np.linalg.norm(np.subtract(*eye_centers(points))))
 
 
 FINDERS: dict[str, type[CascadeFinder] | type[MeshFinder]] = {"cascades": CascadeFinder, "mediapipe": MeshFinder}

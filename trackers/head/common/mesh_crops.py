@@ -1,9 +1,7 @@
 """Faces that a mesh finds in parts of an image: small ones anywhere, and the one that is followed about its place.
 
 MediaPipe scales the whole image down to 128 pixels before it looks for faces, so that it finds none whose eyes are less
-than 7 % of the width apart. In a part of the image the same face is larger. On 80 images of people 0 to 7 of the ICT
-face model at each distance, 640 x 480 pixels with a focal length of 800, it finds in the whole image 37 at 1 m, 2 at
-1.2 m and none at 1.5 and 2 m; in parts of half the size 75, 75, 66 and 50; and about a known place 73, 76, 76 and 80.
+than 7 % of the width apart. In a part of the image the same face is larger.
 """
 
 from typing import Protocol, runtime_checkable
@@ -13,8 +11,6 @@ from jaxtyping import Float, UInt8
 
 from jaxfilters.trackers.head.common.mesh import EYE_VERTICES
 
-EYES_APART_MM = 62.0
-"""Distance between the middles of the eyes in people."""
 WIDTH = 7.0
 """Of the part about a face, in distances between the eyes: three times the width of the face."""
 MOST_SHARE = 0.75
@@ -51,16 +47,25 @@ def solids_near(
         meshes: What finds them.
         image: Grey.
         middle: Of the face, pixels (u, v).
-        apart_px: Distance between its eyes, pixels. Where the part would be most of the image, all of it is taken.
+        apart_px: Distance between its eyes, pixels.
+
+    Returns:
+        None of them where the part would be most of the image, or the place is not finite.
     """
     rows, cols = image.shape
     if not np.isfinite(apart_px) or WIDTH * apart_px > MOST_SHARE * cols or not np.all(np.isfinite(middle)):
-        return meshes.solids(image)
+        return []
     size = min(max(round(WIDTH * apart_px), LEAST_PX), rows, cols)
-    u, v = (
-        np.clip(round(float(at)) - size // 2, 0, all_ - size) for at, all_ in zip(middle, (cols, rows), strict=True)
-    )
-    return _in_part(meshes, image, (int(u), int(v)), (size, size))
+    u, v = (int(np.clip(round(float(middle[i])) - size // 2, 0, (cols, rows)[i] - size)) for i in range(2))
+    return _in_part(meshes, image, (u, v), (size, size))
+
+
+def solids_about(
+    meshes: Meshes, image: UInt8[np.ndarray, "rows cols"], middle: Float[np.ndarray, " 2"], apart_px: float | None
+) -> list[Float[np.ndarray, "V 3"]]:
+    """As `solids_near`, and where that has no face, or the size is not known, those of the whole image."""
+    found = [] if apart_px is None else solids_near(meshes, image, middle, apart_px)
+    return found or meshes.solids(image)
 
 
 def solids_anywhere(

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfilters.models.face.landmarks import FROM_68
-from jaxfilters.trackers.head.common.corners import eye_centers
-from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
+from jaxfilters.trackers.head.common.corners import eye_centers, eyes_apart_px
+from jaxfilters.trackers.head.common.image_position import EYES_APART_MM
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, Dense
 from jaxfilters.trackers.head.mono.detectors import MESH_MM, CascadeDetector, DetectedFace, Detector, dense_noise
 from jaxfilters.trackers.head.mono.start import DETECTED_PX, is_symmetric
@@ -97,7 +97,7 @@ class Collector:
         near, apart_px = None, None
         if self._observed:
             last = self._observed[-1].points
-            near, apart_px = last.mean(axis=0), float(np.linalg.norm(np.subtract(*eye_centers(last))))
+            near, apart_px = last.mean(axis=0), eyes_apart_px(last)
         found = self._detector.detect(image, near, apart_px)
         if isinstance(found, str):
             self.reason = found
@@ -143,7 +143,7 @@ def noise_px(errors: DetectorErrors, points: Float[np.ndarray, "n K 2"]) -> Floa
 
     Frames within a few seconds look alike, and a detector is wrong in them alike: all of them tell as much as one.
     """
-    apart = [np.linalg.norm(np.subtract(*eye_centers(one))) for one in points]
+    apart = [eyes_apart_px(one) for one in points]
     px_per_mm = float(np.mean(apart)) / EYES_APART_MM
     return math.sqrt(len(points)) * np.maximum(px_per_mm * errors.white, LEAST_NOISE_PX)
 

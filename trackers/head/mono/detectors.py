@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfilters.models.face.landmarks import FROM_68
-from jaxfilters.trackers.head.common.corners import eye_centers
+from jaxfilters.trackers.head.common.corners import eyes_apart_px
 from jaxfilters.trackers.head.common.detect import complete, detect
 from jaxfilters.trackers.head.common.mesh import MOST_FACES, MeshDetector
-from jaxfilters.trackers.head.common.mesh_crops import Meshes, largest, nearest, solids_anywhere, solids_near
+from jaxfilters.trackers.head.common.mesh_crops import largest, nearest, solids_about, solids_anywhere
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE
 from jaxfilters.trackers.io.detector_errors import DetectorErrors, default_detector_errors
 
@@ -157,7 +157,7 @@ class MeshLandmarks:
         if near is None:
             solids = solids_anywhere(self._mesh, image, quick=self._glance)
         else:
-            solids = _about(self._mesh, image, near, apart_px)
+            solids = solids_about(self._mesh, image, near, apart_px)
         if not solids:
             return "no face"
         solid = largest(solids) if near is None else nearest(solids, near)
@@ -173,16 +173,8 @@ class MeshLandmarks:
 
         In a quarter of the time of three looks, and the mean of a track and a mesh (`mesh_rotation`) is as good.
         """
-        solids = _about(self._glance, image, near, apart_px)
+        solids = solids_about(self._glance, image, near, apart_px)
         return nearest(solids, near) if solids else None
-
-
-def _about(
-    mesh: Meshes, image: UInt8[np.ndarray, "rows cols"], near: Float[np.ndarray, " 2"], apart_px: float | None
-) -> list[Float[np.ndarray, "V 3"]]:
-    """Faces in the part of an image about a place; those of the whole image where there is none, or no size."""
-    found = [] if apart_px is None else solids_near(mesh, image, near, apart_px)
-    return found or mesh.solids(image)
 
 
 DETECTORS: dict[str, type[CascadeDetector] | type[MeshLandmarks]] = {
@@ -204,7 +196,7 @@ def dense_noise(
     dense: Float[np.ndarray, "n 68 2"],
 ) -> tuple[Float[np.ndarray, "n 68 2 2"], Bool[np.ndarray, "n 68"]]:
     """Covariance of the mesh's landmarks in each frame, pixels squared, and which of them there are."""
-    apart = [np.linalg.norm(np.subtract(*eye_centers(points[list(FROM_68[:6])]))) for points in dense]
+    apart = [eyes_apart_px(points[list(FROM_68[:6])]) for points in dense]
     std_px = np.maximum(MESH_SHARE * np.array(apart), LEAST_PX)[:, None] * np.ones(NUM_DENSE)
     std_px[:, CHIN] *= 2
     return std_px[..., None, None] ** 2 * np.eye(2), np.isfinite(dense).all(axis=-1)

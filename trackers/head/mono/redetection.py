@@ -25,7 +25,6 @@ from jaxfilters.models.face.pose import within_half_turn
 from jaxfilters.models.face.refinement import refine
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import shape
-from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
 from jaxfilters.trackers.head.common.near_mode import UNKNOWN_STD
 from jaxfilters.trackers.head.common.recent import CHANGED_SCORE, nothing_changed
 from jaxfilters.trackers.head.common.search import gathered
@@ -68,22 +67,6 @@ class Located(NamedTuple):
 def seconds_between(detector: Detector) -> float:
     """How often a track in doubt is compared with what a detector finds."""
     return EVERY_S_AVERAGED if detector.is_averaged else EVERY_S
-
-
-class ImagePosition(NamedTuple):
-    """Where a face is in an image, and how large; pixels."""
-
-    middle: Float[np.ndarray, " 2"]
-    apart_px: float
-    """Distance between its eyes if they are as far apart as people's."""
-
-
-def place_of(state: MonoState, rig: CameraRig) -> ImagePosition | None:
-    """Where the face of a track is in the image; None where it has no finite place."""
-    place, focal = state.belief.mean[:3], rig.focal[0]
-    middle = np.asarray(rig.center[0] + focal * place[:2] / place[2], float)
-    apart_px = float(focal[0] * EYES_APART_MM / place[2])
-    return ImagePosition(middle, apart_px) if np.all(np.isfinite(middle)) else None
 
 
 def is_beyond_doubt(state: MonoState, row: MonoTrack) -> bool:

@@ -19,6 +19,7 @@ from jaxfilters.models.face.person_prior import Person, Prior
 from jaxfilters.models.face.rig import CameraRig, monocular
 from jaxfilters.models.face.shape_model import FaceModel
 from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
+from jaxfilters.trackers.head.common.image_position import image_position
 from jaxfilters.trackers.head.common.state import INITIALISING, POSE
 from jaxfilters.trackers.head.mono import redetection
 from jaxfilters.trackers.head.mono.config import MonoConfig
@@ -283,7 +284,7 @@ class _MonoTracker:
         return self._recognised(state), track
 
     def compared(self, state: MonoState, row: MonoTrack, images: np.ndarray, time: float) -> Compared:
-        place = redetection.place_of(state, self.rig)
+        place = image_position(state.belief.mean[:3], self.rig)
         if redetection.is_beyond_doubt(state, row):
             if self._meshes.are_used and isinstance(self._detector, MeshGiver) and place is not None:
                 self._meshes.add(self._detector.glance(images[0], *place), row, time)

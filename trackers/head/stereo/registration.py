@@ -15,6 +15,7 @@ from jaxfilters.models.face import rig as cameras
 from jaxfilters.models.face.landmarks import EYES, MOUTH, NAMES, NOSTRILS, PEOPLE_SHAPE
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.shape_model import FaceModel, rigid
+from jaxfilters.trackers.head.common.image_position import EYES_APART_MM
 from jaxfilters.trackers.head.stereo import epipolar
 from jaxfilters.trackers.head.stereo.contradiction import LEAST_SCORE, MOST_RETURN, why_unmatched
 
@@ -24,8 +25,6 @@ EYE_WIDTH = (20.0, 45.0)
 """Millimetres between the corners of an eye."""
 INSIDE_OUT = 5.0
 """Millimetres by which nostrils may lie behind the plane of eyes and mouth."""
-EYES_APART = 62.0
-"""Millimetres between the centres of the eyes that one camera takes for granted."""
 _LANDMARK_STD, _ANGLE_STD = 4.0, np.radians(10.0)
 """Of one face from the average, millimetres; of a face that looks into the camera."""
 _WORST_LANDMARK = 15.0
@@ -92,7 +91,7 @@ def register_monocular(
     points: Float[np.ndarray, "K 2"],
     rig: CameraRig,
     *,
-    eyes_apart_mm: float = EYES_APART,
+    eyes_apart_mm: float = EYES_APART_MM,
     num_modes: int = 0,
 ) -> Registration:
     """Face of average depth that has exactly the given projections, for one camera, which sees no depth.

@@ -16,7 +16,7 @@ from jaxfilters.trackers.head.common import learning
 from jaxfilters.trackers.head.common.config import HeadConfig, compiled
 from jaxfilters.trackers.head.common.finders import FINDERS, Finder
 from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, Compared, Following
-from jaxfilters.trackers.head.common.mesh_crops import EYES_APART_MM
+from jaxfilters.trackers.head.common.image_position import image_position
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import DOUBTFUL, INITIALISING, LOST, NUM_MODES, POSE, HeadState, HeadTrack
 from jaxfilters.trackers.head.stereo import redetection
@@ -277,9 +277,8 @@ class _HeadTracker:
 
     def _at_detected(self, state: HeadState, images: np.ndarray) -> HeadState | None:
         """The state at a detected face, if there is one that has the shape."""
-        place, focal = state.belief.mean[:3], self.rig.focal[0]
-        near = np.asarray(self.rig.center[0] + focal * place[:2] / place[2], float)
-        points = self._finder.glance(images[0], near, float(focal[0] * EYES_APART_MM / place[2]))
+        place = image_position(state.belief.mean[:3], self.rig)
+        points = None if place is None else self._finder.glance(images[0], *place)
         if points is None:
             return None
         try:

@@ -6,13 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.head.common.mesh_crops import (
-    EYES_APART_MM,
-    eyes_px,
-    nearest,
-    solids_anywhere,
-    solids_near,
-)
+from jaxfilters.trackers.head.common.image_position import EYES_APART_MM
+from jaxfilters.trackers.head.common.mesh_crops import eyes_px, nearest, solids_about, solids_anywhere
 from jaxfilters.trackers.head.mono.detectors import MeshLandmarks
 
 ROWS, COLS = 480, 640
@@ -86,11 +81,14 @@ def test_an_image_with_a_large_face_or_none_has_no_more_of_them_for_its_parts():
 
 def test_about_its_place_a_face_is_large_and_another_one_is_left_out():
     image = image_of((600, 240, 12), (300, 240, 50))
-    alone = solids_near(Faces(), image, np.array([595.0, 243.0]), 12.5)
+    alone = solids_about(Faces(), image, np.array([595.0, 243.0]), 12.5)
     np.testing.assert_array_equal(alone, [face(600, 240, 12)])
-    # A face about which most of the image would be taken is looked for in all of it.
-    np.testing.assert_array_equal(solids_near(Faces(), image, np.array([595.0, 243.0]), 80.0), [face(300, 240, 50)])
-    np.testing.assert_array_equal(solids_near(Faces(), image, np.full(2, np.nan), 12.5), [face(300, 240, 50)])
+    # The whole image is taken once, where the part would be most of it, has no place, no face or no size.
+    elsewhere = (([595.0, 243.0], 80.0), ([np.nan, np.nan], 12.5), ([100.0, 100.0], 12.5), ([595.0, 243.0], None))
+    for middle, apart in elsewhere:
+        meshes = Faces()
+        np.testing.assert_array_equal(solids_about(meshes, image, np.array(middle), apart), [face(300, 240, 50)])
+        assert meshes.num_images == 1 + (middle[0] == 100.0)
     faces = [face(100, 100, 60), face(200, 100, 20)]
     assert nearest(faces, np.array([160.0, 100.0])) is faces[1]
 
