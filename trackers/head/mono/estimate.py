@@ -108,8 +108,7 @@ def aligned(
     spread = einsum("ckix,k,ckjx->ckij", by_shape, variance, by_shape)
     covariance = found.covariance + by_slope + spread + PIXEL_FLOOR**2 * jnp.eye(2)
     # The score of a landmark that is followed is that of the last frame's patch; the registered one has a lower one.
-    has_returned = jnp.any(anchored & ~is_followed & (found.score > RETURNED_SCORE), axis=0)
-    is_unsure = jnp.all(observed.has_changed, axis=0) | (state.is_unsure & ~has_returned)
+    is_unsure = unsure(state.is_unsure, observed.has_changed, jnp.where(anchored & ~is_followed, found.score, 0.0))
     return Estimate(
         fit.belief,
         # What is followed from the last frame is some other point of the skin, and says nothing of the person.
@@ -143,6 +142,17 @@ def recalculated(
     # A window beyond the border leaves the point where it was: that is no measurement.
     observed = rough.view.observed & jnp.isfinite(info.residual)
     return rough._replace(view=rough.view._replace(uv=uv[None], observed=observed), windows=windows)
+
+
+def unsure(before: Bool[Array, " K"], has_changed: Bool[Array, "C K"], score: Float[Array, "C K"]) -> Bool[Array, " K"]:
+    """Landmarks that do not look as registered, or did not before and have not done so beyond doubt since.
+
+    Args:
+        before: Those of the frame before.
+        has_changed: Which do not look as registered, in each camera.
+        score: Correlation with what was registered, 0 where another patch is followed.
+    """
+    return jnp.all(has_changed, axis=0) | (before & ~jnp.any(score > RETURNED_SCORE, axis=0))
 
 
 def projected(

@@ -6,7 +6,7 @@ import pytest
 
 from jaxfilters.trackers.head.common.state import DEFORMABLE, DOUBTFUL, LOST
 from jaxfilters.trackers.head.mono import redetection
-from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE
+from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, unsure
 from jaxfilters.trackers.head.mono.session import MonoSession
 
 COVERED = slice(28, 44)
@@ -24,6 +24,14 @@ def covered(image, points):
     lines = np.min(np.abs(np.subtract.outer(cols, u + width * np.array([-0.25, 0.0, 0.25]))), axis=1)
     changed[rows, cols[0] : cols[-1] + 1] = np.where(lines < 1.5, 60, 150)
     return changed
+
+
+def test_a_covered_landmark_counts_again_from_a_higher_correlation_than_one_that_never_was():
+    """Columns: never covered, covered now, resembling by chance since, returned, followed by another patch since."""
+    before = jnp.array([False, False, True, True, True])
+    has_changed = jnp.array([[False, True, False, False, False]])
+    score = jnp.array([[0.6, 0.3, 0.6, 0.8, 0.0]])
+    assert unsure(before, has_changed, score).tolist() == [False, True, True, False, True]
 
 
 @pytest.mark.system
