@@ -136,10 +136,8 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
     pieces, first = [], 0
     while first < len(frames):
         due = float(state.race_time) <= float(times[first])
-        if due and int(state.misses) >= PATIENCE:
-            state = search(setup, state, frames[first], float(times[first]))
-            before = jnp.asarray(times[first] - FRAME_INTERVAL, dtype=float)
-            state = state._replace(time=before, least_cost=jnp.asarray(math.inf, dtype=float))
+        if due and int(state.misses):
+            state = _searched(setup, state, frames[first], float(times[first]))
         elif due:
             state = race(setup, state, frames[first], float(times[first]))
             state = state._replace(least_cost=jnp.asarray(math.inf, dtype=float))
@@ -149,12 +147,24 @@ def _advance(setup: Setup, state: TrackState, frames: np.ndarray, times: np.ndar
             continue
         state, (track, done) = _scan(setup.compiled(), _through_the_host(state), frames, times, first)
         state = _through_the_host(state)
-        if int(state.misses) >= PATIENCE:
-            state = state._replace(race_time=jnp.asarray(times[first], dtype=float))
         end = first + int(np.sum(done))
+        if int(state.misses) in (1, PATIENCE):
+            state = state._replace(race_time=jnp.asarray(times[end - 1], dtype=float))
         pieces.append(jax.tree.map(lambda rows: np.asarray(rows)[first:end], track))  # noqa: B023
         first = end
     return state, HandTrack(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+
+
+def _searched(setup: Setup, state: TrackState, frame: np.ndarray, time: float) -> TrackState:
+    """The state after a search on a frame for the hand that was missed, about a new start where one is found.
+
+    As long as the hand may be where the track is, in front of which something passes, a doubtful start does not count.
+    """
+    found = search(setup, state, frame, time)
+    if int(found.misses) or (bool(found.doubt) and int(state.misses) < PATIENCE):
+        return state._replace(race_time=found.race_time)
+    before = jnp.asarray(time - FRAME_INTERVAL, dtype=float)
+    return found._replace(time=before, least_cost=jnp.asarray(math.inf, dtype=float))
 
 
 def _through_the_host(state: TrackState) -> TrackState:
@@ -171,7 +181,7 @@ def _through_the_host(state: TrackState) -> TrackState:
 def _scan(
     setup: Setup, state: TrackState, frames: Array, times: Array, first: Array
 ) -> tuple[TrackState, tuple[HandTrack, Array]]:
-    """Track from frame `first` until the hand was missed too often or a race is due; the state then stands still."""
+    """Track from frame `first` until the hand was missed or a race is due; the state then stands still."""
 
     def skip(state: TrackState, frame: Array, time: Array) -> tuple[TrackState, HandTrack]:
         _, track = jax.eval_shape(partial(_step, setup), state, frame, time)
@@ -179,7 +189,8 @@ def _scan(
 
     def body(state: TrackState, inputs: tuple) -> tuple[TrackState, tuple[HandTrack, Array]]:
         frame, time, index = inputs
-        active = (index >= first) & (state.misses < PATIENCE) & ((index == first) | (time < state.race_time))
+        goes_on = (index > first) & (state.misses == 0) & (time < state.race_time)
+        active = (index == first) | goes_on
         state, track = jax.lax.cond(active, partial(_step, setup), skip, state, frame, time)
         return state, (track, active)
 
@@ -210,7 +221,8 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
     pose, covariance = pose_moments(*particles_of(ensemble))
     cost = likelihood.cost(pose, image)
     observed = something & (cost < LOST_COST)
-    race_time = jnp.where(observed & (cost > SUDDEN * state.least_cost), time, state.race_time)
+    sudden = observed & (cost > SUDDEN * state.least_cost)
+    race_time = jnp.where(sudden, time, state.race_time)
     least_cost = jnp.where(observed, jnp.minimum(cost, state.least_cost), state.least_cost)
     misses = jnp.where(observed, 0, state.misses + 1)
     joints = forward_kinematics(pose, likelihood.geometry).joints
@@ -222,7 +234,7 @@ def _step(setup: Setup, state: TrackState, frame: Array, time: Array) -> tuple[T
         innovations=jnp.where(observed, corrections, 0),
         effective_sample_size=info.effective_sample_size,
         log_evidence=info.log_evidence,
-        status=jnp.where(observed, jnp.where(state.doubt, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
+        status=jnp.where(observed, jnp.where(state.doubt | sudden, DOUBTFUL, TRACKING), LOST).astype(jnp.int32),
     )
     following = state._replace(
         ensemble=ensemble,

@@ -108,6 +108,26 @@ def test_a_hand_that_leaves_and_returns_is_said_lost_and_found_again(tracker, se
 
 
 @pytest.mark.system
+def test_a_hand_that_jumps_away_is_found_one_frame_after_it_was_missed(tracker, sequence):
+    depth, joints = sequence[0][:CHUNK].copy(), sequence[1][:CHUNK]
+    depth[5:] = np.roll(depth[5:], 150, axis=2)
+    track = follow(tracker, depth)
+    np.testing.assert_array_equal(track.status, [TRACKING] * 5 + [LOST] + [TRACKING] * (CHUNK - 6))
+    aside = joints[6:, :, 2:] * np.array([150 / float(kinect_v2().focal[0]), 0.0, 0.0])
+    assert 1000 * np.linalg.norm(track.joints[6:] - joints[6:] - aside, axis=-1).mean() < 20
+
+
+@pytest.mark.system
+def test_an_estimate_that_suddenly_explains_less_is_doubtful(tracker, sequence):
+    depth = sequence[0][:CHUNK].copy()
+    depth[5:] = np.roll(depth[5:], 25, axis=2)
+    track = follow(tracker, depth)
+    assert np.all(track.status[:5] == TRACKING)
+    assert track.status[5] == DOUBTFUL
+    assert joint_errors_mm(track, sequence[1][:CHUNK])[5] > 25
+
+
+@pytest.mark.system
 @pytest.mark.parametrize("value", [np.nan, 3.0])
 def test_without_any_hand_the_tracker_searches(tracker, value):
     track = follow(tracker, np.full((CHUNK, 424, 512), value, np.float32))
