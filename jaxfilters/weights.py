@@ -140,17 +140,17 @@ def mean_around_mode(
     to differentiation.
 
     Examples:
-        Of two clusters, the one about 8 has the heaviest particle.
+        Of two clusters, the one about 8 has the particle of the highest weight.
 
         >>> import jax.numpy as jnp, jaxfilters as jf
         >>> x, log_weights = jnp.array([[0.0, 1.0, 8.0, 9.0]]), jnp.log(jnp.array([2.0, 2.0, 3.0, 1.0]))
         >>> [round(v, 3) for v in jf.weights.mean_around_mode(x, log_weights, jnp.ones(1)).tolist()]
         [8.25]
     """
-    heaviest = jnp.argmax(linear(log_weights))
-    apart = jax.lax.stop_gradient((x - x[:, heaviest, None]) / scale[:, None])
+    map_particle = jnp.argmax(linear(log_weights))
+    apart = jax.lax.stop_gradient((x - x[:, map_particle, None]) / scale[:, None])
     near = jnp.sum(jnp.square(apart), axis=0) < distance**2
-    near = near | (jnp.arange(log_weights.shape[0]) == heaviest)
+    near = near | (jnp.arange(log_weights.shape[0]) == map_particle)
     return mean(x, jnp.where(near, _below_peak(log_weights)[0], -jnp.inf))
 
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, in_millimetres, pose_errors
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import project_shape
 from jaxfilters.models.synthetic.face_sequence import FaceSequence
@@ -78,9 +78,9 @@ def follow(sequence: FaceSequence, trackers: Mapping[str, HeadConfig]) -> dict[s
             if start:
                 tracks[name].append(track)
                 contributions[name].append(session.contribution)
+    joined = {name: jax.tree.map(lambda *rows: np.concatenate(rows), *parts) for name, parts in tracks.items()}
     return {
-        name: HeadRun(jax.tree.map(lambda *parts: np.concatenate(parts), *parts), sequence, np.array(shares))
-        for (name, parts), shares in zip(tracks.items(), contributions.values(), strict=True)
+        name: HeadRun(in_millimetres(track), sequence, np.array(contributions[name])) for name, track in joined.items()
     }
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import recording_folder
 from jaxfilters.benchmarks.scenarios._mono_real import NUM_FRAMES, PEOPLE, QUICK_NUM_FRAMES, filmed, modelled_face
-from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, in_millimetres, pose_errors
 from jaxfilters.models.face.multilinear import MultilinearFace, shape
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.synthetic.ict_course import read_biwi, read_livelink
@@ -181,11 +181,11 @@ def detected_run(made: IctSequence, face: MultilinearFace, detector: Detector, s
 def followed(
     made: IctSequence, images: UInt8[np.ndarray, "t 1 rows cols"], face: MultilinearFace, detector: Detector, seed: int
 ) -> MonoTrack:
-    """Track of all images of one person, of whom nothing else is known."""
+    """Track of all images of one person, of whom nothing else is known; millimetres."""
     session = MonoSession(made.rig, face, MonoConfig(seed=seed), detector=detector)
     pieces = [slice(start, start + PIECE) for start in range(0, len(images), PIECE)]
     parts = [session.process(images[piece], made.times[piece]) for piece in pieces]
-    return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
+    return in_millimetres(jax.tree.map(lambda *rows: np.concatenate(rows), *parts))
 
 
 def pnp(face: MultilinearFace, rig: CameraRig, points: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, " 6"]:

@@ -11,6 +11,7 @@ from jaxfilters.benchmarks.metrics import Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios._mesh_agreement import agreement
 from jaxfilters.benchmarks.scenarios._mono_runs import Contender, MonoRun, camera, follow_all
+from jaxfilters.benchmarks.scenarios._poses import in_millimetres
 from jaxfilters.benchmarks.scenarios.head_real import VIDEOS, detector_distances, longest, read_video
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import FROM_68
@@ -128,7 +129,7 @@ def video_metrics(quick: bool, seed: int) -> dict[str, Metric]:
         parts = [
             session.process(images[i : i + PIECE, None], times[i : i + PIECE]) for i in range(0, len(images), PIECE)
         ]
-        track = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        track = in_millimetres(jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts))
         is_tracked = np.isin(track.status, TRACKED)
         apart = detector_distances(images, track, round(fps))
         for frame, what in session.events:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, in_millimetres, pose_errors
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.gallery import Gallery, remember
 from jaxfilters.models.face.landmarks import FROM_68
@@ -137,7 +137,7 @@ def follow_all(made: FaceSequence | IctSequence, contenders: Mapping[str, Conten
         for name, session in sessions.items():
             tracks[name].append(session.process(images, made.times[start : start + len(images)]))
     joined = {name: jax.tree.map(lambda *rows: np.concatenate(rows), *parts) for name, parts in tracks.items()}
-    return {name: evaluated(track, made) for name, track in joined.items()}
+    return {name: evaluated(in_millimetres(track), made) for name, track in joined.items()}
 
 
 def evaluated(track: MonoTrack, made: FaceSequence | IctSequence) -> MonoRun:

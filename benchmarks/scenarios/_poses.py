@@ -8,6 +8,17 @@ from jaxtyping import Float
 DISPLAY = np.array([1.0, 1.0, 1.0, *np.rad2deg(np.ones(3))])
 """From millimetres and radians to millimetres and degrees."""
 
+_LENGTHS = ("shape", "offset")
+"""Fields of tracks, beside poses, that are lengths."""
+
+
+def in_millimetres(track: Any) -> Any:
+    """A track of a head, which is in metres, in the unit of synthetic faces; with the fields of `HeadTrack`."""
+    scale = np.repeat(np.array([1e3, 1.0]), 3)
+    poses = {name: scale * np.asarray(getattr(track, name)) for name in ("pose", "pose_std")}
+    others = {name: 1e3 * np.asarray(getattr(track, name)) for name in _LENGTHS if name in track._fields}
+    return track._replace(**poses, **others)
+
 
 def pose_errors(poses: Any, truth: Any) -> Float[np.ndarray, "t 6"]:
     """Millimetres and degrees, angles within half a turn.

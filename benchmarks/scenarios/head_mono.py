@@ -2,7 +2,7 @@
 
 Tables 4.1 to 4.3 of Sugano's thesis (2007): errors over eight users, of `b_` and `b_eyes_` over 24, by mean, median and
 worst. `a_` knows faces of eleven people, the user among them, and may recognise them; `c_` is `a_` with an adjustment
-at the start alone, `a_strange_` takes everybody for unknown. `b_` does not know the user: its model is of 200 other
+at the start alone, `a_unknown_` takes everybody for unknown. `b_` does not know the user: its model is of 200 other
 people of the generator, and its gallery is empty; beside its error in depth stands that of the size which the exact
 shapes of the same faces tell, `error_b_z_of_exact_shape`; `error_modelled_z_of_` is that of people of the ICT face
 model from their ten or 68 landmarks or points of their skin, with and without errors. `b_ten_` has the model of the ten
@@ -63,7 +63,7 @@ AXIS_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 AXIS_ORDER = [0, 1, 2, 3, 5, 4]
 """Where they are in a pose of the tracker."""
 FIRST_USER, NUM_USERS, NUM_KNOWN, NUM_MANY = 300, 8, 11, 200
-NUM_STRANGERS = 24
+NUM_UNKNOWN_USERS = 24
 """Users of `b` and `b_eyes`: how large an unknown person is is luck, and the mean over eight people says little."""
 DISTANCE_MM = 650.0
 """Of the heads."""
@@ -77,7 +77,7 @@ PAPER_MAP = replace(PUBLISHED, prior_weight=0.7)
 
 def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     """Run all parts, print the scores, return them."""
-    users = range(1 if quick else NUM_STRANGERS)
+    users = range(1 if quick else NUM_UNKNOWN_USERS)
     kept = Finished(out, scenario="head-mono", quick=quick, seed=seed)
     metrics = experiment_metrics(users, QUICK_NUM_FRAMES if quick else NUM_FRAMES, seed, quick, kept)
     parts = {
@@ -111,12 +111,12 @@ def contenders_for(user: int, seed: int, quick: bool) -> dict[str, Contender]:
         return best
     many = _of_many(seed)
     apart = eyes_apart_of(_identity(FIRST_USER + user)) + np.random.default_rng([seed, user, 1]).normal(0, EYES_STD_MM)
-    strangers = {"b": Contender(many, USUAL), "b_eyes": Contender(many, replace(USUAL, eyes_apart_mm=apart))}
+    unknown_users = {"b": Contender(many, USUAL), "b_eyes": Contender(many, replace(USUAL, eyes_apart_mm=apart))}
     if user >= NUM_USERS:
-        return strangers
+        return unknown_users
     unknown, of_unknown = learnt_from(people_but(user), 10, seed)
-    best |= strangers | {
-        "a_strange": Contender(known, USUAL),
+    best |= unknown_users | {
+        "a_unknown": Contender(known, USUAL),
         "b_ten": Contender(unknown, USUAL, of_unknown),
         "b_past": Contender(many, replace(USUAL, past="marginalised")),
         "b_angles": Contender(many, replace(USUAL, selection="angles")),

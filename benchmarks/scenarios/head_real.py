@@ -29,7 +29,7 @@ from jaxfilters.benchmarks.metrics import WITHIN_TWO_SIGMA, Metric
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
 from jaxfilters.benchmarks.scenarios import _simplest as simplest
 from jaxfilters.benchmarks.scenarios._head_runs import AXES, AXIS_UNITS
-from jaxfilters.benchmarks.scenarios._poses import DISPLAY, pose_errors
+from jaxfilters.benchmarks.scenarios._poses import DISPLAY, in_millimetres, pose_errors
 from jaxfilters.models.camera import Pinhole
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.rig import monocular
@@ -205,9 +205,9 @@ def yaw_metrics(found: Modelled) -> dict[str, Metric]:
 
 
 def follow(session: HeadSession, images: np.ndarray, times_s: np.ndarray) -> HeadTrack:
-    """Track of all frames, handed over in pieces."""
+    """Track of all frames, handed over in pieces; millimetres."""
     parts = [session.process(images[i : i + PIECE], times_s[i : i + PIECE]) for i in range(0, len(images), PIECE)]
-    return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
+    return in_millimetres(jax.tree.map(lambda *rows: np.concatenate(rows), *parts))
 
 
 def detector_distances(images: np.ndarray, track: HeadTrack, every: int) -> Float[np.ndarray, " looks"]:

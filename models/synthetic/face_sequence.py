@@ -17,6 +17,8 @@ from jaxfilters.models.face.rig import CameraRig, nominal, project_shape
 from jaxfilters.models.synthetic.face import Identity, face_shape, make_identity
 from jaxfilters.models.synthetic.face_motion import (
     FPS,
+    MONOCULAR_PLACE_MM,
+    STEREO_PLACE_MM,
     deformation_schedule,
     gain_schedule,
     motion,
@@ -114,16 +116,17 @@ def sequence(
         kind: `slow`, `fast` or `mix`.
         num_frames: How many.
         seed: Of the motion.
-        rig: Cameras; the two of `rig.nominal` if none.
+        rig: Cameras; the two of `rig.nominal` if none. Before one camera, the head moves about its axis.
         deform: Whether the face has the expressions of section 5.2.
         occlusion: Whether mouth and nostrils are covered for a while and the light goes down later (section 5.1).
 
     Raises:
         ValueError: as `motion`.
     """
+    place_mm = STEREO_PLACE_MM if rig is None or rig.num_cameras > 1 else MONOCULAR_PLACE_MM
     return face_sequence(
         key,
-        motion(kind, num_frames, seed),
+        motion(kind, num_frames, seed, place_mm=place_mm),
         rig=rig,
         expressions=deformation_schedule(num_frames) if deform else None,
         covered=occlusion_schedule(num_frames) if occlusion else None,

@@ -16,6 +16,7 @@ from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.state import DEFORMABLE
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.state import MonoTrack
+from jaxfilters.trackers.head.mono.table import mono_in_metres
 from jaxfilters.trackers.io.face_models import default_face_model
 
 
@@ -97,7 +98,8 @@ def test_trackers_start_from_noisy_landmarks_and_are_judged_after_them(monkeypat
             track = {name: rows[:, None] for name in MonoTrack._fields}
             # A shape that is elsewhere as a whole is none the worse.
             shape = made.shapes[rows] + 5.0
-            return MonoTrack(**track | {"pose": pose, "shape": shape, "status": np.full(len(rows), DEFORMABLE)})
+            track |= {"pose": pose, "shape": shape, "status": np.full(len(rows), DEFORMABLE)}
+            return mono_in_metres(MonoTrack(**track))
 
     monkeypatch.setattr(_mono_runs, "MonoSession", Session)
     contender = Contender(default_face_model().model, MonoConfig())

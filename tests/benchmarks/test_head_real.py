@@ -15,6 +15,7 @@ from jaxfilters.benchmarks.scenarios.head_real import Modelled
 from jaxfilters.models.face.rig import nominal, project_shape
 from jaxfilters.models.synthetic.ict_sequence import IctSequence
 from jaxfilters.trackers.head.common.state import INITIALISING, LOST, RIGID, HeadTrack
+from jaxfilters.trackers.head.common.table import in_metres
 from jaxfilters.trackers.head.stereo.session import HeadSession
 
 
@@ -136,7 +137,7 @@ def test_a_modelled_person_counts_from_registration_on(monkeypatch):
     pose[4] = np.nan
     status = [INITIALISING, INITIALISING, RIGID, RIGID, LOST, RIGID]
     std = np.broadcast_to(np.array([2.0, 2, 2, 2, 2, 2]) / head_real.DISPLAY, (6, 6))
-    monkeypatch.setattr(Session, "track", made_track(status, pose=pose, pose_std=std, shape=made.shapes))
+    monkeypatch.setattr(Session, "track", in_metres(made_track(status, pose=pose, pose_std=std, shape=made.shapes)))
     monkeypatch.setattr(head_real, "HeadSession", Session)
     monkeypatch.setattr(head_real, "without_tracker", lambda made, _: made.poses + np.array([0, 0, 5, 0, 0, 2 * np.pi]))
     found = head_real.followed(made, [0])[0]

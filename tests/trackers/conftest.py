@@ -333,10 +333,11 @@ def face_track(face_model):
 def fake_head(monkeypatch, face_model):
     """Puts something quick in the place of the head tracker; what it was made with and fed is in the list returned.
 
-    A pose tells of its images: x is the mean grey of the first camera and y that of the last, z the time in
-    milliseconds. The first two frames initialise; a frame darker than 10 is lost, with a pose that nobody should see.
+    A pose tells of its images: x is the mean grey of the first camera and y that of the last in thousandths, z the
+    time. The first two frames initialise; a frame darker than 10 is lost, with a pose that nobody should see.
     """
     from jaxfilters.trackers.head.common.state import HeadTrack
+    from jaxfilters.trackers.head.common.table import in_metres
     from jaxfilters.trackers.head.stereo import command as head_command
 
     made = []
@@ -371,7 +372,7 @@ def fake_head(monkeypatch, face_model):
                 self.model, self.contribution = face_model, 0.75
                 self.events += [(2, "registered"), (12, "learnt")]
             zero = np.zeros(b)
-            return HeadTrack(
+            track = HeadTrack(
                 pose=np.stack([means[:, 0], means[:, -1], 1000 * times, zero + 0.1, zero + 0.2, zero + 0.3], axis=-1),
                 pose_std=np.full((b, 6), 0.5),
                 deformation=np.ones((b, 2)),
@@ -382,6 +383,7 @@ def fake_head(monkeypatch, face_model):
                 innovations=np.full((b, 2), (6, 5)),
                 status=status,
             )
+            return in_metres(track)
 
     monkeypatch.setattr(head_command, "HeadSession", FakeSession)
     return made

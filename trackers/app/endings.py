@@ -1,6 +1,5 @@
 """How a command ends before its time: by a signal, or by an error that nobody foresaw."""
 
-import os
 import signal
 import tempfile
 import threading
@@ -11,6 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from jaxfilters import __version__
+from jaxfilters.trackers.io.input_files import is_folder
 
 ERROR_FILE = "error.txt"
 _LONGEST = 200
@@ -47,8 +47,7 @@ def unforeseen(error: Exception, out: Path | None) -> str:
     """
     text = "".join(traceback.format_exception(error))
     report = f"jaxfilters {__version__}\n{text}"
-    # Not `Path.is_dir`, which raises for a name that is too long.
-    places = [] if out is None else [out if os.path.isdir(out) else out.parent]
+    places = [] if out is None else [out if is_folder(out) else out.parent]
     for folder in [*places, Path(tempfile.gettempdir())]:
         path = folder / ERROR_FILE
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from jaxfilters.trackers.io.errors import OutputError
+from jaxfilters.trackers.io.input_files import exists, is_folder
 
 LOCK = ".lock"
 
@@ -45,7 +46,7 @@ def check_free(path: Path) -> None:
         OutputError: Another run writes into it, or nobody can.
     """
     _check_writable(path, f"cannot write into {path}")
-    if os.path.exists(path / LOCK):
+    if exists(path / LOCK):
         OutputFolder(path).close()
 
 
@@ -56,9 +57,9 @@ def check_file(path: Path) -> None:
         OutputError: Nobody can write it, or it is a folder.
     """
     refused = f"cannot write {path}"
-    if os.path.isdir(path):
+    if is_folder(path):
         raise OutputError(f"{refused}: it is a folder.")
-    if not os.path.exists(path):
+    if not exists(path):
         _check_writable(path.parent, refused, path.name)
     elif os.path.isfile(path):
         # Pipes and devices are left alone: opening one may wait for whoever reads it.
@@ -77,8 +78,8 @@ def _check_writable(path: Path, refused: str, *names: str) -> None:
     Raises:
         OutputError: The folder cannot be made, or nothing can be made in it; the message begins with `refused`.
     """
-    nearest = next(folder for folder in (path, *path.absolute().parents) if os.path.exists(folder))
-    if not os.path.isdir(nearest):
+    nearest = next(folder for folder in (path, *path.absolute().parents) if exists(folder))
+    if not is_folder(nearest):
         raise OutputError(f"{refused}: {nearest} is not a folder.")
     try:
         with tempfile.TemporaryDirectory(prefix=".jaxfilters-", dir=nearest) as trial:

@@ -67,7 +67,7 @@ class StreamSpec(NamedTuple):
     """How many there will be; None where that is not known."""
     prime: Callable[[], None] = lambda: None
     """What a new run reads of the sources before their first images: with the folder of the results held, and not in a
-    run that is continued, whose saved state has all that came of it."""
+    run that is continued: its saved state has all that came of it, or `restore` of the session reads it again."""
 
 
 class RunResult(NamedTuple):

@@ -1,6 +1,5 @@
 """Features of an articulated hand over time: what was measured in each frame, how well, and the truth where known."""
 
-import hashlib
 import math
 import re
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from jaxfilters.models.articulated.features import BLOCKS, KEYPOINTS, FeatureSet
 from jaxfilters.models.articulated.layout import Layout
 from jaxfilters.models.articulated.motion import FRAME_INTERVAL, MOVEMENT_TIME
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.io.content_hash import content_hash
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.recording import check_times
 
@@ -110,10 +110,9 @@ class FeatureSequence:
 
     def fingerprint(self) -> str:
         """A hash of everything that an estimate rests on: equal for the same recording wherever it lies."""
-        digest = hashlib.sha256(repr((self.num_fingers, self.features.blocks, self.image_shape)).encode())
-        for part in (self.times_s, self.y, self.std, *(self.start or ())):
-            digest.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
-        return digest.hexdigest()[:16]
+        blocks = [block in self.features.blocks for block in BLOCKS]
+        measured = (self.times_s, self.y, self.std)
+        return content_hash(self.num_fingers, blocks, self.image_shape or (), *measured, *(self.start or ()))
 
 
 def from_keypoints(

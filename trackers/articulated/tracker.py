@@ -298,7 +298,7 @@ def _step(setup: _Setup, state: TrackState, frame: FeatureFrame, time: Array) ->
     # With the gate, what is left of a hand that is not there fits well: too few rows count as a miss, too.
     rows = jnp.sum(frame.mask)
     observed = measured & (nis < LOST_NIS) & (2 * reported.kalman.rank >= rows) & jnp.isfinite(info.log_evidence)
-    bank = _heaviest(_select(measured & jnp.isfinite(info.log_evidence), bank, predicted), _most(setup))
+    bank = _pruned(_select(measured & jnp.isfinite(info.log_evidence), bank, predicted), _most(setup))
     # Only keypoints are searched for. With a given start the hypotheses go on, and fit again when the hand is back.
     searching = (state.misses > PATIENCE) if setup.start is None else jnp.zeros((), bool)
     status = jnp.where(searching, SEARCHING, jnp.where(observed, TRACKING, LOST)).astype(jnp.int32)
@@ -320,7 +320,7 @@ def _most(setup: _Setup) -> int:
     return setup.config.hypotheses if setup.config.variant == "recommended" else 1
 
 
-def _heaviest(bank: GaussianSumState, most: int) -> GaussianSumState:
+def _pruned(bank: GaussianSumState, most: int) -> GaussianSumState:
     """The bank with `most` hypotheses or fewer: they are in descending order of their weights."""
     kept = jnp.arange(len(bank.log_weights)) < most
     return bank._replace(log_weights=jax.nn.log_softmax(jnp.where(kept, bank.log_weights, -jnp.inf)))

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.models.gesture import coded
 from jaxfilters.trackers.app.options import config_from_args
 from jaxfilters.trackers.app.progress import warn
@@ -22,13 +21,12 @@ from jaxfilters.trackers.app.stream import RunResult, StreamRun, StreamSpec, che
 from jaxfilters.trackers.fingertips.config import RunConfig
 from jaxfilters.trackers.fingertips.events import Recognised, Recogniser, Stroke
 from jaxfilters.trackers.fingertips.files import EventFile
-from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, User, angles_of, estimate_user, hands_in
+from jaxfilters.trackers.fingertips.images import OPEN_HAND_IMAGES, angles_of, estimate_user, hands_in
 from jaxfilters.trackers.fingertips.input import DemoHand, open_hands
-from jaxfilters.trackers.fingertips.run import FingertipStream
+from jaxfilters.trackers.fingertips.run import Begun, FingertipStream
 from jaxfilters.trackers.fingertips.session import VARIANTS, FingertipSession
 from jaxfilters.trackers.fingertips.summary import write_summary
 from jaxfilters.trackers.fingertips.table import STATUS, TIP_TABLE
-from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.innovations import contradiction, innovation_share
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.gesture_models import SymbolsFile, default_symbols, read_symbols
@@ -55,7 +53,24 @@ def track(options: argparse.Namespace) -> str:
         keypoints=options.keypoints,
         image_size=options.image_size,
     )
-    user = _user(source, run_config.mask)
+    with closing(EventFile(options.out / "events.jsonl")) as events:
+        stream = FingertipStream(source, partial(_begun, source, run_config, options, symbols), events)
+        total = getattr(source, "frames", 0) or None
+        spec = StreamSpec(
+            *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
+            *(TIP_TABLE, _identity(source, run_config, options), total, stream.prime),
+        )
+        with closing(StreamRun(_limited(source, options), spec)) as run:
+            return _tracked(source, stream, run, run_config, options)
+
+
+def _begun(source: Any, run_config: RunConfig, options: argparse.Namespace, symbols: SymbolsFile) -> Begun:
+    """The user, from images of the recording, and a session for the user's hands; a live camera's images are gone."""
+    images = source.sample(OPEN_HAND_IMAGES)
+    try:
+        user = estimate_user(images, run_config.mask)
+    except ValueError as error:
+        raise InputError(f"{source.name}: {error}") from None
     if not user.has_open_hand:
         usual = "no open hand in the first images; thumbs are recognised by the usual angles"
         warn(f"{source.name}: {usual}{_advice(run_config, options)}")
@@ -70,39 +85,21 @@ def track(options: argparse.Namespace) -> str:
         method=method,
         recogniser=recogniser_of(symbols),
     )
-    with closing(EventFile(options.out / "events.jsonl")) as events:
-        stream = FingertipStream(source, partial(_observed, user, run_config.hands), session, events)
-        total = getattr(source, "frames", 0) or None
-        spec = StreamSpec(
-            *([source], _moments(source, options.seconds), lambda: [*filter(None, [source.trouble()])], stream),
-            *(TIP_TABLE, _identity(source, run_config, options), total),
-        )
-        with closing(StreamRun(_limited(source, options), spec)) as run:
-            return _tracked(source, user, session, stream, run, run_config, options)
-
-
-def _observed(user: User, num_hands: int, image: Any) -> HandObservation:
-    return as_input_error(partial(hands_in, image, user, num_hands))
+    return Begun(user, lambda image: as_input_error(partial(hands_in, image, user, run_config.hands)), session)
 
 
 def _tracked(
-    source: Any,
-    user: User,
-    session: FingertipSession,
-    stream: FingertipStream,
-    run: StreamRun,
-    config: RunConfig,
-    options: argparse.Namespace,
+    source: Any, stream: FingertipStream, run: StreamRun, config: RunConfig, options: argparse.Namespace
 ) -> str:
     began = time.perf_counter()
     result = run.follow()
     stream.finish()
     results = run.writer.results
-    report = _report(source, user, session, stream.tally, result, config, options, time.perf_counter() - began) | {
+    report = _report(source, stream, result, config, options, time.perf_counter() - began) | {
         "innovations": innovation_share(results.innovations, results.frame).report()
     }
     run.writer.finish(report, status_names=np.asarray(STATUS))
-    write_summary(options.out / "summary.png", results, stream.tally, session.events, source.image_size)
+    write_summary(options.out / "summary.png", results, stream.tally, stream.begun.session.events, source.image_size)
     return run.conclude(result, format_report(report, options))
 
 
@@ -134,14 +131,6 @@ def _symbols(path: str) -> SymbolsFile:
     return file
 
 
-def _user(source: Any, mask: str) -> User:
-    """The user, from images of the recording; of a live camera the first ones, which are then gone."""
-    try:
-        return estimate_user(source.sample(OPEN_HAND_IMAGES), mask)
-    except ValueError as error:
-        raise InputError(f"{source.name}: {error}") from None
-
-
 def _identity(source: Any, config: RunConfig, options: argparse.Namespace) -> dict[str, Any]:
     """What two runs must share for one to continue the other."""
     given = {name: str(value) for name, value in dataclasses.asdict(config).items()}
@@ -169,14 +158,13 @@ def _limited(source: Any, options: argparse.Namespace) -> argparse.Namespace:
 
 def _report(
     source: Any,
-    user: User,
-    session: FingertipSession,
-    tally: Tally,
+    stream: FingertipStream,
     result: RunResult,
     config: RunConfig,
     options: argparse.Namespace,
     seconds: float,
 ) -> dict[str, Any]:
+    (user, _, session), tally = stream.begun, stream.tally
     right = tally.right_counts / tally.frames if isinstance(source, DemoHand) else math.nan
     return {
         "input": source.name,

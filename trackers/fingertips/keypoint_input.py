@@ -24,6 +24,7 @@ from jaxfilters.trackers.articulated.recording import looks_normalized
 from jaxfilters.trackers.io.errors import InputError, shortened
 from jaxfilters.trackers.io.input_files import exists
 from jaxfilters.trackers.io.keypoints import read_hands
+from jaxfilters.trackers.io.recording import check_times
 from jaxfilters.trackers.io.video_input import DEFAULT_FPS, LiveCamera, VideoSource, open_video, spread
 
 _THUMB, _INDEX = 0, 1
@@ -75,9 +76,8 @@ class KeypointSource:
         self._points, self._confidence = found.points * scale, found.confidence
         self._numbers, self._times_s = found.frames, found.frames / fps if fps else found.times_s
         self.began_s = float(self._times_s[0])
+        check_times(self._times_s, str(path))
         steps = np.diff(self._times_s)
-        if len(steps) and not (np.isfinite(steps).all() and steps.min() > 0):
-            raise InputError(f"{path}: times must increase from frame to frame.")
         self.fps = float(1 / np.median(steps)) if len(steps) else fps or DEFAULT_FPS
         self._length: int | None = None
 

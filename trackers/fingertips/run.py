@@ -1,13 +1,14 @@
 """Fingertips in a run: images in, rows, events and pictures out."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxfilters.models.fingertip.observation import HandObservation
 from jaxfilters.trackers.fingertips.events import Event
 from jaxfilters.trackers.fingertips.files import EventFile
+from jaxfilters.trackers.fingertips.images import User
 from jaxfilters.trackers.fingertips.input import DemoHand, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures
 from jaxfilters.trackers.fingertips.session import FingertipSession
@@ -17,25 +18,43 @@ from jaxfilters.trackers.fingertips.tally import Tally
 from jaxfilters.trackers.io.video_input import FrameSet
 
 
+class Begun(NamedTuple):
+    """What a run has once images of the recording have shown the user."""
+
+    user: User
+    observe: Callable[[Any], HandObservation]
+    """What hands there are in an image."""
+    session: FingertipSession
+    """What follows them."""
+
+
 class FingertipStream:
     """The session of hands, as `jaxfilters.trackers.app.stream` runs it."""
 
-    def __init__(
-        self, source: Any, observe: Callable[[Any], HandObservation], session: FingertipSession, events: EventFile
-    ):
-        """Before the first image.
+    def __init__(self, source: Any, begin: Callable[[], Begun], events: EventFile):
+        """Before any image is read.
 
         Args:
             source: Of the images.
-            observe: What hands there are in an image.
-            session: What follows them.
+            begin: Reads images of the source to know the user.
             events: Where lines for events go.
         """
         self.tally = Tally()
-        self._source, self._observe, self._session, self._file = source, observe, session, events
+        self._source, self._begin, self._file = source, begin, events
+        self._begun: Begun | None = None
         self._pictures, self._reported = FingertipPictures(), 0
         self._report: HandReport | None = None
         self._events: list[Event] = []
+
+    @property
+    def begun(self) -> Begun:
+        """The user and the session; not before `prime` or `restore`."""
+        assert self._begun is not None
+        return self._begun
+
+    def prime(self) -> None:
+        """Know the user."""
+        self._begun = self._begin()
 
     @property
     def status(self) -> str:
@@ -49,7 +68,7 @@ class FingertipStream:
     def process(self, moments: Sequence[FrameSet]) -> TimedTips:
         """A row for every fingertip."""
         ((time_s, (image,)),) = moments
-        found = self._session.process(self._observe(image), np.array([time_s]))
+        found = self.begun.session.process(self.begun.observe(image), np.array([time_s]))
         self._report = HandReport(*(field[0] for field in found))
         rows = tip_rows(self.tally.frames, time_s, self._report)
         self._write_events()
@@ -66,19 +85,21 @@ class FingertipStream:
 
     def finish(self) -> None:
         """End what is under way: nothing more comes."""
-        self._session.finish()
+        self.begun.session.finish()
         self._write_events()
 
     def saved(self) -> Any:
         """What the next image needs."""
-        return {"session": self._session.saved(), "tally": self.tally, "event_bytes": self._file.size()}
+        return {"session": self.begun.session.saved(), "tally": self.tally, "event_bytes": self._file.size()}
 
     def restore(self, saved: Any, rows: TimedTips) -> None:  # noqa: ARG002
-        """Go on from what `saved` gave."""
+        """Go on from what `saved` gave; the user, who is not in it, is known from the recording once more."""
+        self.prime()
         self.tally = saved["tally"]
-        self._session.restore(saved["session"], self._file.cut(saved["event_bytes"]))
-        self._reported = len(self._session.events)
+        self.begun.session.restore(saved["session"], self._file.cut(saved["event_bytes"]))
+        self._reported = len(self.begun.session.events)
 
     def _write_events(self) -> None:
-        self._events, self._reported = self._session.events[self._reported :], len(self._session.events)
+        events = self.begun.session.events
+        self._events, self._reported = events[self._reported :], len(events)
         self._file.append(self._events)

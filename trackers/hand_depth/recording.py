@@ -1,12 +1,12 @@
 """A depth recording: camera, times and frames."""
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from jaxfilters.models.camera import Pinhole
+from jaxfilters.trackers.io.content_hash import content_hash
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.recording import check_times
 
@@ -46,10 +46,7 @@ class DepthSequence:
 
     def fingerprint(self) -> str:
         """A hash of camera, times and the first frame: equal for the same recording wherever it lies."""
-        digest = hashlib.sha256()
-        for part in (np.asarray(self.camera.matrix(), np.float64), self.times_s, self[0]):
-            digest.update(repr(part.shape).encode() + np.ascontiguousarray(part).tobytes())
-        return digest.hexdigest()[:16]
+        return content_hash(self.camera.matrix(), self.times_s, self[0])
 
 
 def from_array(camera: Pinhole, times_s: np.ndarray, depth: np.ndarray, name: str = "array") -> DepthSequence:

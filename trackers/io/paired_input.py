@@ -5,10 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxfilters.trackers.io.input_files import check_rate
-from jaxfilters.trackers.io.video_input import FrameSet, ImageFolder, VideoSource
-
-_SAME_STEP = 0.1
-"""Names of two folders count alike if their usual steps differ by no more than this share."""
+from jaxfilters.trackers.io.video_input import FrameSet, VideoSource, on_one_clock
 
 
 class PairedInput:
@@ -26,7 +23,7 @@ class PairedInput:
         self.moments = self.incomplete = 0
 
     def __iter__(self) -> Iterator[FrameSet]:
-        streams = _streams(self._sources)
+        streams = on_one_clock(self._sources)
         waiting = [self._next(i, stream) for i, stream in enumerate(streams)]
         began = min((item[0] for item in waiting if item is not None), default=0.0)
         while not self._is_over(waiting):
@@ -74,26 +71,3 @@ class PairedInput:
         if without:
             self.incomplete += 1
             self._first_gap = self._first_gap or (time_s, ", ".join(without))
-
-
-def _streams(sources: list[VideoSource]) -> list[Iterator[tuple[float, np.ndarray | None]]]:
-    """The images of all sources, on the clock of their names where folders are numbered alike."""
-    streams = [source.images() for source in sources]
-    folders = [source for source in sources if isinstance(source, ImageFolder)]
-    numbers = [found for folder in folders if (found := folder.numbers()) is not None and len(found) > 1]
-    if len(numbers) < len(sources):
-        return streams
-    # A quartile: dropped frames make steps longer, and may be many.
-    steps = [float(np.quantile(np.diff(found), 0.25, method="lower")) for found in numbers]
-    overlap = min(found[-1] for found in numbers) >= max(found[0] for found in numbers)
-    if not overlap or max(steps) > (1 + _SAME_STEP) * min(steps):
-        return streams
-    first, pace = min(found[0] for found in numbers), min(steps) * max(source.fps for source in sources)
-    return [_timed(stream, (found - first) / pace) for stream, found in zip(streams, numbers, strict=True)]
-
-
-def _timed(
-    stream: Iterator[tuple[float, np.ndarray | None]], times_s: np.ndarray
-) -> Iterator[tuple[float, np.ndarray | None]]:
-    for (_, image), time_s in zip(stream, times_s, strict=True):
-        yield float(time_s), image

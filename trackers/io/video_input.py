@@ -23,6 +23,8 @@ _MOST_DIGITS = 4
 """Of a live camera's number: OpenCV's largest ones, which begin with that of a backend, have as many."""
 SILENT_S = 2.0
 """A live camera that delivers nothing for so long has stopped."""
+_SAME_STEP = 0.1
+"""Names of two folders count alike if their usual steps differ by no more than this share."""
 
 
 @runtime_checkable
@@ -120,15 +122,22 @@ class VideoFile:
                 image = _next_image(capture)
                 if image is None:
                     break
-                time_s = stamps.next(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
-                yield (time_s if self._is_stamped else done / self.fps), image
+                stamp_s = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
+                yield (stamps.next(stamp_s) if self._is_stamped else done / self.fps), image
                 done += 1
         finally:
             capture.release()
         if done == 0:
             raise InputError(f"{self.name}: no frame can be decoded.")
+        said = []
         if self.frames > 0 and done < self.frames:
-            self._trouble = f"{self.name}: ends after {done} of {self.frames} frames (cut off or damaged)"
+            said.append(f"ends after {done} of {self.frames} frames (cut off or damaged)")
+        if stamps.late and self._is_stamped:
+            said.append(
+                f"{stamps.late} time stamps do not increase; these frames were taken to follow the one before by "
+                f"1/{self.fps:g} s (--fps takes the place of all stamps)"
+            )
+        self._trouble = f"{self.name}: {', and '.join(said)}" if said else None
 
     def trouble(self) -> str | None:
         return self._trouble
@@ -151,27 +160,41 @@ def _next_image(capture: Any) -> np.ndarray | None:
 class _Stamps:
     """Times of the frames of a video as its file says them, from the first one.
 
-    Where it says nothing of use, a frame is one period after the one before.
+    Where it says nothing, for which OpenCV gives 0, or a time that is not after that of the frame before, a frame is
+    one period after that frame: images are decoded in their order, whatever their stamps.
     """
 
     def __init__(self, period_s: float):
-        self._period_s, self._first_s, self._last_s = period_s, 0.0, -period_s
+        self._period_s, self._first_s, self._last_s, self._claimed_s = period_s, 0.0, -period_s, -math.inf
+        self.late = 0
+        """Frames whose stamps were not after those of the frames before them."""
 
     def next(self, claimed_s: float) -> float:
         if self._last_s < 0:
             self._first_s = claimed_s
-        claimed_s -= self._first_s
-        is_later = np.isfinite(claimed_s) and claimed_s > self._last_s
-        self._last_s = claimed_s if is_later else self._last_s + self._period_s
+        since_s = claimed_s - self._first_s
+        is_later = math.isfinite(since_s) and since_s > self._last_s
+        self._last_s = since_s if is_later else self._last_s + self._period_s
+        if math.isfinite(claimed_s) and claimed_s > 0:
+            # Frames without a stamp may have been counted further than the next stamp is, which is then not late.
+            self.late += claimed_s <= self._claimed_s
+            self._claimed_s = claimed_s
         return self._last_s
 
 
 class ImageFolder:
-    """Images of one size in a folder, in the order of their names."""
+    """Images of one size in a folder, in the order of their names, or of the numbers that are all that differs in them.
+
+    Numbers that grow, counters or time stamps, are the clock of the images: what was dropped leaves a gap. The usual
+    step from one to the next is one period of the frame rate.
+
+    Raises:
+        InputError: nothing that can be read, or two images of one number.
+    """
 
     def __init__(self, path: Path, fps: float):
         self.name, self.fps = str(path), check_rate(fps)
-        self._files = images_in(path)
+        self._files = _by_number(images_in(path), path)
         rows, cols = read_image(self._files[0]).shape[:2]
         self.image_size, self.frames = (cols, rows), len(self._files)
 
@@ -185,14 +208,42 @@ class ImageFolder:
         return [read_image(file) for file in spread(self._files, most)]
 
     def images(self) -> Iterator[tuple[float, np.ndarray | None]]:
-        for i, file in enumerate(self._files):
+        numbers = self.numbers()
+        numbers = np.arange(float(self.frames)) if numbers is None else numbers
+        times_s = (numbers - numbers[0]) / (_usual_step(numbers) * self.fps)
+        for time_s, file in zip(times_s, self._files, strict=True):
             image = read_image(file)
             if image.shape[1::-1] != self.image_size:
                 raise InputError(f"{file}: {image.shape[1]}x{image.shape[0]} pixels; the first has {self.image_size}.")
-            yield i / self.fps, image
+            yield float(time_s), image
 
     def trouble(self) -> str | None:
         return None
+
+
+def _usual_step(numbers: np.ndarray) -> float:
+    """From one number to the next; a quartile, since dropped frames make steps longer, and may be many."""
+    return float(np.quantile(np.diff(numbers), 0.25, method="lower")) if len(numbers) > 1 else 1.0
+
+
+def _by_number(files: list[Path], folder: Path) -> list[Path]:
+    """The images in the order of the numbers with which their names end, where nothing else differs in the names.
+
+    Raises:
+        InputError: two of them have one number.
+    """
+    ends = [re.fullmatch(r"(.*?)(\d+)", file.stem, re.ASCII | re.DOTALL) for file in files]
+    found = [(end[1], int(end[2])) for end in ends if end is not None]
+    if len(found) < len(files) or len({before for before, _ in found}) > 1:
+        return files
+    order = sorted(range(len(files)), key=lambda i: found[i][1])
+    for one, other in itertools.pairwise(order):
+        if found[one][1] == found[other][1]:
+            raise InputError(
+                f"{folder}: {files[one].name} and {files[other].name} have one frame number; a folder must hold one "
+                "recording."
+            )
+    return [files[i] for i in order]
 
 
 class LiveCamera:
@@ -285,7 +336,7 @@ def together(sources: list[VideoSource]) -> Iterator[FrameSet]:
     Ends when the last recording ends; one that ends earlier has nothing new from then on.
     """
     half = 0.5 / max(check_rate(source.fps, f"{source.name}: fps") for source in sources)
-    streams = [source.images() for source in sources]
+    streams = on_one_clock(sources)
     waiting = [next(stream, None) for stream in streams]
     began = min((item[0] for item in waiting if item is not None), default=0.0)
     while any(item is not None for item in waiting):
@@ -297,3 +348,25 @@ def together(sources: list[VideoSource]) -> Iterator[FrameSet]:
             if due:
                 waiting[i] = next(streams[i], None)
         yield FrameSet(now - began, tuple(images))
+
+
+def on_one_clock(sources: Sequence[VideoSource]) -> list[Iterator[tuple[float, np.ndarray | None]]]:
+    """The images of all sources with their seconds, on one clock where folders are numbered alike."""
+    streams = [source.images() for source in sources]
+    folders = [source for source in sources if isinstance(source, ImageFolder)]
+    numbers = [found for folder in folders if (found := folder.numbers()) is not None and len(found) > 1]
+    if len(numbers) < len(sources):
+        return streams
+    steps = [_usual_step(found) for found in numbers]
+    overlap = min(found[-1] for found in numbers) >= max(found[0] for found in numbers)
+    if not overlap or max(steps) > (1 + _SAME_STEP) * min(steps):
+        return streams
+    first, pace = min(found[0] for found in numbers), min(steps) * max(source.fps for source in sources)
+    return [_timed(stream, (found - first) / pace) for stream, found in zip(streams, numbers, strict=True)]
+
+
+def _timed(
+    stream: Iterator[tuple[float, np.ndarray | None]], times_s: np.ndarray
+) -> Iterator[tuple[float, np.ndarray | None]]:
+    for (_, image), time_s in zip(stream, times_s, strict=True):
+        yield float(time_s), image

@@ -10,11 +10,12 @@ import pytest
 
 from jaxfilters.models.synthetic.desk_hand import desk_video
 from jaxfilters.models.synthetic.strokes import drawn, tracked
-from jaxfilters.trackers.app import stream
+from jaxfilters.trackers.app import cli, stream
 from jaxfilters.trackers.app.cli import main
+from jaxfilters.trackers.app.output_folder import OutputFolder
 from jaxfilters.trackers.fingertips.command import recogniser_of
 from jaxfilters.trackers.fingertips.events import ROTATE, SYMBOL, Event, Stroke
-from jaxfilters.trackers.fingertips.input import DepthVideo, LiveHands, shown
+from jaxfilters.trackers.fingertips.input import DemoHand, DepthVideo, LiveHands, shown
 from jaxfilters.trackers.fingertips.pictures import FingertipPictures, in_words
 from jaxfilters.trackers.fingertips.state import HandReport
 from jaxfilters.trackers.fingertips.table import TIP_TABLE, tip_rows
@@ -261,3 +262,16 @@ def test_strokes_are_named_by_the_model_of_a_file():
 def test_more_hands_than_a_person_has_are_refused(tmp_path, capsys):
     assert main(["track", "fingertips", "--hands", "3", "--out", str(tmp_path / "out")]) == 2
     assert "hands must be 1 or 2; got 3" in capsys.readouterr().err
+
+
+def test_two_runs_in_one_folder_end_in_one_line_before_an_image_is_read(tmp_path, monkeypatch, capsys):
+    """Both begin at once: the folder was free when the second one looked, and is locked when it would read images."""
+    monkeypatch.setenv("XLA_FLAGS", "")  # `main` sets it
+    monkeypatch.setattr(cli, "check_free", lambda path: None)
+    for name in ("sample", "images"):
+        monkeypatch.setattr(DemoHand, name, lambda *_: pytest.fail("an image was read"))
+    first = OutputFolder(tmp_path)
+    assert main(["track", "fingertips", "--out", str(tmp_path)]) == 2
+    first.close()
+    line = f"jaxfilters: error: {tmp_path}: another run writes into it; choose another --out."
+    assert capsys.readouterr().err.splitlines() == [line]

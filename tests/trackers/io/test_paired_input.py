@@ -137,6 +137,20 @@ def test_a_video_without_stamps_goes_on_at_its_pace(tmp_path, monkeypatch):
     np.testing.assert_allclose(times, [0, 0.04, 0.08, 0.12, 0.16, 0.2])
 
 
+@pytest.mark.parametrize("last", [80, 70], ids=["repeated", "late"])
+def test_a_frame_whose_stamp_does_not_increase_follows_the_one_before_and_is_counted(last, tmp_path, monkeypatch):
+    monkeypatch.setattr(Capture, "stamps", (40, 80, last, 160))
+    monkeypatch.setattr(VideoFile, "_open", lambda self: Capture())
+    (tmp_path / "a.mp4").touch()
+    video, given = VideoFile(tmp_path / "a.mp4"), VideoFile(tmp_path / "a.mp4", 10.0)
+    np.testing.assert_allclose([t for t, _ in video.images()], [0, 0.04, 0.08, 0.12])
+    assert (
+        "1 time stamps do not increase; these frames were taken to follow the one before by 1/25 s" in video.trouble()
+    )
+    np.testing.assert_allclose([t for t, _ in given.images()], [0, 0.1, 0.2, 0.3])
+    assert "time stamps" not in given.trouble()
+
+
 class Camera:
     """Delivers an image every 20 ms, its number in it, and stops after thirty."""
 

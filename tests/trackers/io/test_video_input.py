@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxfilters.trackers.io.errors import InputError
-from jaxfilters.trackers.io.video_input import ImageFolder, VideoFile, open_video, together
+from jaxfilters.trackers.io.video_input import ImageFolder, VideoFile, on_one_clock, open_video, together
 
 
 def _video(path, frames=12, fps=10.0, size=(64, 48)):
@@ -84,6 +84,32 @@ def test_a_folder_of_images_is_read_in_order_and_must_be_of_one_size(tmp_path):
     empty.mkdir()
     with pytest.raises(InputError, match="no images"):
         open_video(str(empty))
+
+
+def test_images_are_in_the_order_of_their_numbers_which_are_their_clock(tmp_path):
+    """Numbered without leading zeros, every fifth frame of a video, two of them missing."""
+    for number in (95, 100, 105, 120, 125):
+        cv2.imwrite(str(tmp_path / f"frame_{number}.png"), np.full((4, 6, 3), number, np.uint8))
+    (stream,) = on_one_clock([open_video(str(tmp_path), fps=10.0)])
+    assert [int(image[0, 0, 0]) for _, image in stream] == [95, 100, 105, 120, 125]
+    np.testing.assert_allclose([t for t, _ in open_video(str(tmp_path), fps=10.0).images()], [0, 0.1, 0.2, 0.5, 0.6])
+    cv2.imwrite(str(tmp_path / "frame_0100.png"), np.zeros((4, 6, 3), np.uint8))
+    with pytest.raises(InputError, match=r"frame_0100\.png and frame_100\.png have one frame number"):
+        open_video(str(tmp_path))
+    (tmp_path / "frame_0100.png").rename(tmp_path / "other.png")
+    assert [t for t, _ in open_video(str(tmp_path), fps=10.0).images()] == pytest.approx(np.arange(6) / 10)
+
+
+def test_folders_that_are_numbered_alike_are_on_one_clock(tmp_path):
+    """The second camera began two frames later, and has lost one."""
+    for name, numbers in (("a", range(6)), ("b", (2, 3, 5))):
+        (tmp_path / name).mkdir()
+        for number in numbers:
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), np.full((4, 6, 3), number, np.uint8))
+    moments = list(together([open_video(str(tmp_path / name), fps=10.0) for name in "ab"]))
+    found = [[None if image is None else int(image[0, 0, 0]) for image in moment.images] for moment in moments]
+    assert found == [[0, None], [1, None], [2, 2], [3, 3], [4, None], [5, 5]]
+    np.testing.assert_allclose([moment.time_s for moment in moments], np.arange(6) / 10, atol=1e-9)
 
 
 def test_a_slower_source_has_nothing_new_in_between():

@@ -35,7 +35,7 @@ class HeadTracker(Protocol):
         ...
 
     def process(self, images: np.ndarray, times: np.ndarray) -> Any:
-        """Track of the next frames, a row each, with the fields of `HeadTrack`."""
+        """Track of the next frames in metres and radians, a row each, with the fields of `HeadTrack`."""
         ...
 
     def saved(self) -> Any:
@@ -51,8 +51,6 @@ class RowsOf(NamedTuple):
     """How what a session returns becomes rows of its table."""
 
     table: TrackTable
-    in_metres: Callable[[Any], Any]
-    """Of a track in millimetres."""
     nothing: Callable[[int], Any]
     """`frames -> rows` of the right shapes and types."""
 
@@ -86,7 +84,6 @@ class HeadStream:
         self.frame_of += [self._frames + int(i) for i in np.flatnonzero(whole)]
         self._frames += len(moments)
         times_s = np.asarray([moment.time_s for moment in moments])
-        track = None if track is None else self._rows.in_metres(track)
         return with_gaps(track, times_s, whole, self._rows.nothing)
 
     def pictures(self, moments: Sequence[FrameSet], rows: HeadRows) -> Any:

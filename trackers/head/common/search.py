@@ -38,7 +38,7 @@ HIGH = np.array([40.0, 40.0, 40.0, 15.0, 15.0, 15.0]) * UNITS
 LEAST_STEPS = 0.1
 """Frame times between two images from which on they tell a velocity."""
 MODE_SCALE = 5.0
-"""Millimetres and degrees that count as one in the distance to the heaviest particle."""
+"""Millimetres and degrees that count as one in the distance to the particle of the highest weight."""
 
 
 @pytree_dataclass

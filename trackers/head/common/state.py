@@ -121,15 +121,18 @@ class HeadState(NamedTuple):
 
 
 class HeadTrack(NamedTuple):
-    """What is known of the head in each of `b` frames; NaN where it is not tracked."""
+    """What is known of the head in each of `b` frames; NaN where it is not tracked.
+
+    Lengths are metres in what a session and `track` return, and millimetres, those of the face, within the tracker.
+    """
 
     pose: Float[Array | np.ndarray, "b 6"]
-    """Millimetres and radians: x, y, z, roll, yaw, pitch."""
+    """x, y, z, and roll, yaw, pitch in radians."""
     pose_std: Float[Array | np.ndarray, "b 6"]
     deformation: Float[Array | np.ndarray, "b B"]
-    """Mode coefficients, millimetres."""
+    """Mode coefficients, lengths."""
     shape: Float[Array | np.ndarray, "b K 3"]
-    """Landmarks in the model frame, millimetres."""
+    """Landmarks in the model frame."""
     image_points: Float[Array | np.ndarray, "b C K 2"]
     """Pixels."""
     score: Float[Array | np.ndarray, " b"]

@@ -27,7 +27,7 @@ DISPLAYED = ("x, mm", "y, mm", "z, mm", "roll, degrees", "pitch, degrees", "yaw,
 """What `displayed` gives, for pictures."""
 _DISPLAY_ORDER = [0, 1, 2, 3, 5, 4]
 _METRES = 1e-3
-"""The trackers compute in millimetres."""
+"""The trackers compute in millimetres, and their sessions return metres."""
 
 
 @runtime_checkable

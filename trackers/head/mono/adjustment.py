@@ -62,16 +62,19 @@ def frame_of(
 
 def informed(face: MultilinearFace, rig: CameraRig, window: Window, person: Person, prior: Prior) -> Window:
     """The window with what its frames tell of the person."""
+    found = of_frames(face, rig, window.views, window.bundle(person), prior)
+    return window._replace(information=found.information, gradient=found.gradient)
 
-    def one(inputs: tuple) -> tuple[Array, Array]:
-        view, pose, expression = inputs
-        alone = jax.tree.map(lambda leaf: leaf[None], view)
-        found = frame_information(face, rig, alone, Bundle(pose[None], expression[None], person), prior)
-        return found.information, found.gradient
+
+def of_frames(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> FrameInformation:
+    """What each of n frames tells of the person, with the frame axis first; arguments are those of `adjust`."""
+
+    def one(inputs: tuple) -> FrameInformation:
+        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
+        return frame_information(face, rig, view, Bundle(pose, expression, bundle.person), prior)
 
     # One by one: batches of factorisations can stand still on two cores.
-    information, gradient = jax.lax.map(one, (window.views, window.poses, window.expressions))
-    return window._replace(information=information, gradient=gradient)
+    return jax.lax.map(one, (views, bundle.poses, bundle.expressions))
 
 
 def uncertainty(

@@ -26,7 +26,7 @@ from jaxfilters.trackers.head.mono.config import VARIANTS, MonoConfig
 from jaxfilters.trackers.head.mono.dense import tracked
 from jaxfilters.trackers.head.mono.detectors import DETECTORS, Detector, best_detector
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres, mono_table
+from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_table
 from jaxfilters.trackers.io.enrolled_people import People, read_people, write_people
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.face_models import FaceModelFile, default_face_model, load_face_model, people_face_model
@@ -70,7 +70,7 @@ def track(options: argparse.Namespace) -> str:
             focal_log_std=place.focal_log_std,
         )
     )
-    rows = RowsOf(mono_table(face), mono_in_metres, partial(empty_mono_rows, face))
+    rows = RowsOf(mono_table(face), partial(empty_mono_rows, face))
     stream = HeadStream(place, session, rows, settings.chunk)
     files = {name: getattr(options, name) for name in _GIVEN} | {"detector": detected_by}
     contents = {"model": model.model, "people": gallery}

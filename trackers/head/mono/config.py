@@ -36,8 +36,8 @@ class MonoConfig:
     """Whether the face is adjusted while it is followed; otherwise at the start alone."""
     prior_weight: float = 1.0
     """Of the training set's statistics; 0 as published."""
-    offset_std: float = 0.7
-    """Millimetres by which a face may differ from what the model can form; 0 as published."""
+    offset_std: float = 0.7e-3
+    """Metres by which a face may differ from what the model can form; 0 as published."""
     eyes_apart_mm: float | None = None
     """Distance between the pupils in millimetres, as an optician measures it (default: unknown, so that size and
     distance have a relative standard deviation of 5.5 to 7 percent)."""
@@ -54,6 +54,11 @@ class MonoConfig:
         least, most = EYES_APART_MM
         if self.eyes_apart_mm is not None and not least <= self.eyes_apart_mm <= most:
             raise ValueError(f"eyes_apart_mm must be within {least:g} and {most:g}; got {self.eyes_apart_mm}.")
+
+    @property
+    def offset_std_mm(self) -> float:
+        """`offset_std` in millimetres, the unit of the face."""
+        return 1e3 * self.offset_std
 
     @property
     def is_published(self) -> bool:

@@ -41,6 +41,9 @@ class Detections(NamedTuple):
     """Widths of the irises, if they are visible."""
     errors: DetectorErrors | None = None
     """By how much the detector misplaces the points in all images alike, if it does."""
+    facing_std: Float[np.ndarray, " 3"] | None = None
+    """Standard deviation of roll, yaw and pitch of the faces that it finds from those of heads that look into the
+    camera, radians, if it is known."""
 
 
 class Collector:
@@ -133,7 +136,8 @@ class Collector:
         iris_px = None if len(widths) < NUM_FRAMES else np.stack(widths)
         errors = self._detector.errors
         std_px = DETECTED_PX if errors is None else noise_px(errors, points)
-        found = Detections(points, np.stack(self._images), time, std_px, dense, iris_px, errors)
+        facing_std = self._detector.facing_std
+        found = Detections(points, np.stack(self._images), time, std_px, dense, iris_px, errors, facing_std)
         self.clear()
         return found
 

@@ -10,15 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfilters._xla.compiled_quickly import compiled_quickly
-from jaxfilters.models.face.bundle import Bundle, Views, projected
-from jaxfilters.models.face.frame_selection import frame_information
+from jaxfilters.models.face.bundle import Views, projected
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.person_prior import Person, Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
 from jaxfilters.models.face.square_root_prior import SquareRootPrior, joined, of_measurements
-from jaxfilters.trackers.head.mono.adjustment import prior_information
+from jaxfilters.trackers.head.mono.adjustment import of_frames, prior_information
 from jaxfilters.trackers.head.mono.past import units
 from jaxfilters.trackers.head.mono.start import Start
 
@@ -74,23 +73,12 @@ def _resized(
     # The start is the likeliest without the irises; to first order this is the likeliest with them.
     past, unit = joined(past, more), units(face, prior)
     total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
-    total = total + _information_of_frames(face, rig, views, bundle, prior)
+    total = total + jnp.sum(of_frames(face, rig, views, bundle, prior).information, axis=0)
     moved = unit * jnp.linalg.solve(total, unit * jnp.pad(slope / jnp.square(std) * larger, (0, face.mean.size)))
     factor = jnp.exp(jnp.sum(slope * moved[:count]))
     person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
     bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
     return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), past
-
-
-def _information_of_frames(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundle, prior: Prior) -> Array:
-    """Information of all views about identity and offset, in standard deviations."""
-
-    def one(inputs: tuple) -> Array:
-        view, pose, expression = jax.tree.map(lambda leaf: leaf[None], inputs)
-        return frame_information(face, rig, view, Bundle(pose, expression, bundle.person), prior).information
-
-    # One by one: batches of factorisations can stand still on two cores.
-    return jnp.sum(jax.lax.map(one, (views, bundle.poses, bundle.expressions)), axis=0)
 
 
 def measured(

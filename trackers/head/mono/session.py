@@ -26,12 +26,14 @@ from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.dense import NUM_DENSE, start_densely, tracked
 from jaxfilters.trackers.head.mono.detections import Collector, Detections
 from jaxfilters.trackers.head.mono.detectors import CascadeDetector, DetectedFace, Detector, MeshGiver
+from jaxfilters.trackers.head.mono.facing import with_facing
 from jaxfilters.trackers.head.mono.focal import FocalLength, focal_length
 from jaxfilters.trackers.head.mono.irises import with_irises
 from jaxfilters.trackers.head.mono.mesh_rotation import MeshRotations
 from jaxfilters.trackers.head.mono.recognition import People, as_gallery, check_gallery, one_of, people, recognised
 from jaxfilters.trackers.head.mono.start import Start, begin, detected, initialise, prior_beside, search_of
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
+from jaxfilters.trackers.head.mono.table import mono_in_metres
 from jaxfilters.trackers.head.mono.tracking import System, advance
 from jaxfilters.trackers.head.stereo.session import check_at_origin, check_focal_log_std, check_points
 from jaxfilters.trackers.io.face_models import people_face_model
@@ -107,12 +109,12 @@ class MonoSession:
 
     @property
     def model(self) -> FaceModel | None:
-        """The person's face as adjusted so far; `None` before there was one."""
+        """The person's face as adjusted so far, in millimetres; `None` before there was one."""
         return None if self._following.state is None else self._following.state.model
 
     @property
     def person(self) -> Person | None:
-        """Who it is, as adjusted so far; `None` before there was a face."""
+        """Who it is, as adjusted so far, in millimetres; `None` before there was a face."""
         return None if self._following.state is None else self._following.state.person
 
     @property
@@ -133,7 +135,7 @@ class MonoSession:
         self._following.restore(saved)
 
     def process(self, images: UInt8[np.ndarray, "b 1 rows cols"], times: Float[np.ndarray, " b"]) -> MonoTrack:
-        """Track of the next frames, a row each.
+        """Track of the next frames, a row each, in metres and radians.
 
         Args:
             images: Grey, without lens distortion.
@@ -142,7 +144,7 @@ class MonoSession:
         Raises:
             ValueError: if images or times do not fit the rig and each other.
         """
-        return self._following.process(images, times)
+        return mono_in_metres(self._following.process(images, times))
 
 
 def track(
@@ -166,15 +168,13 @@ def track(
         known: `points`, `detections`, `detector`, `gallery` and `focal_log_std` of `MonoSession`.
 
     Returns:
-        The track: millimetres and radians, NaN where the head is not tracked.
+        The track: metres and radians, NaN where the head is not tracked.
 
     Raises:
         ValueError: as for `MonoSession` and its `process`, and for `checked_times`.
     """
-    seconds = checked_times(times_s, len(images))
-    face = people_face_model().model if face is None else face
-    session = MonoSession(monocular(camera), face, config, **known)
-    return session.process(images[:, None], seconds)
+    session = MonoSession(monocular(camera), face or people_face_model().model, config, **known)
+    return session.process(images[:, None], checked_times(times_s, len(images)))
 
 
 class _MonoTracker:
@@ -395,4 +395,6 @@ class _MonoTracker:
             views = views._replace(observed=jnp.zeros_like(views.observed))
         if detections.iris_px is not None and options.eyes_apart_mm is None:
             start, past = with_irises(self._face, self.rig, start, views, past, detections.iris_px, prior)
+        if detections.facing_std is not None and bool(views.observed.any()):
+            start, past = with_facing(self._face, self.rig, start, views, past, detections.facing_std, prior)
         return _Found(detections, start, views, prior._replace(past=past))

@@ -99,7 +99,7 @@ def prior_beside(errors: DetectorErrors | None, options: MonoConfig) -> Prior:
     if errors is None or options.is_published or not options.prior_weight:
         return prior_of(options)
     covariance = errors.covariance + UNRENDERED_MM**2 * np.eye(len(errors.covariance))
-    return prior_of(options)._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std))
+    return prior_of(options)._replace(misplaced=misplacement(errors.mean, covariance, options.offset_std_mm))
 
 
 @compiled_quickly

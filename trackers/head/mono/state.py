@@ -32,8 +32,8 @@ EYES_APART_STD_MM = 1.0
 def prior_of(config: MonoConfig) -> Prior:
     """What holds every adjustment."""
     if config.eyes_apart_mm is None:
-        return Prior(config.prior_weight, config.offset_std)
-    return Prior(config.prior_weight, config.offset_std, config.eyes_apart_mm, EYES_APART_STD_MM)
+        return Prior(config.prior_weight, config.offset_std_mm)
+    return Prior(config.prior_weight, config.offset_std_mm, config.eyes_apart_mm, EYES_APART_STD_MM)
 
 
 def reach_of(config: MonoConfig) -> Reach:
@@ -127,17 +127,18 @@ class MonoState(NamedTuple):
 class MonoTrack(NamedTuple):
     """What is known of the head in each of `b` frames; NaN where it is not tracked.
 
-    It has all fields of the tracker with several cameras.
+    It has all fields of the tracker with several cameras. Lengths are metres in what a session and `track` return, and
+    millimetres, those of the face, within the tracker.
     """
 
     pose: Float[Array | np.ndarray, "b 6"]
-    """Millimetres and radians: x, y, z, roll, yaw, pitch."""
+    """x, y, z, and roll, yaw, pitch in radians."""
     pose_std: Float[Array | np.ndarray, "b 6"]
     """What is not known of the person included."""
     deformation: Float[Array | np.ndarray, "b A"]
     """Expression, in standard deviations of the training set's about their mean."""
     shape: Float[Array | np.ndarray, "b K 3"]
-    """Landmarks in the model frame, millimetres. With a detector of meshes they are turned with the axes of `pose`;
+    """Landmarks in the model frame. With a detector of meshes they are turned with the axes of `pose`;
     identity and offset are about the axes of the tracker alone."""
     image_points: Float[Array | np.ndarray, "b 1 K 2"]
     """Pixels."""
@@ -150,7 +151,7 @@ class MonoTrack(NamedTuple):
     identity: Float[Array | np.ndarray, "b S"]
     """In standard deviations of the training set's about their mean."""
     offset: Float[Array | np.ndarray, "b K 3"]
-    """What the model lacks of this face, millimetres."""
+    """What the model lacks of this face, a length."""
     person_index: Int[Array | np.ndarray, " b"]
     """Index of the recognised person among those of the gallery, or -1 for an unknown person."""
     is_adjusted: Bool[Array | np.ndarray, " b"]

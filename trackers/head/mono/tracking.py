@@ -26,11 +26,11 @@ from jaxfilters.trackers.head.mono.claims import pose_variance
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.mono.estimate import FEWEST_SURE, Estimate, aligned, projected, recalculated
 from jaxfilters.trackers.head.mono.state import MonoState, MonoTrack
-from jaxfilters.trackers.head.mono.verdict import is_strange
+from jaxfilters.trackers.head.mono.verdict import is_outlier
 from jaxfilters.trackers.head.stereo.tracking import (
     LEAST_SCORE,
+    MOST_OUTLIERS,
     MOST_STEPS,
-    MOST_STRANGE,
     REGAINED_SCORE,
     at_last_good,
 )
@@ -95,9 +95,9 @@ def _step(
     score = score_at(state.model, templates, rig, belief.mean, images)
     likeness = jnp.maximum(score, score_at(state.model, looks, rig, belief.mean, images))
     fewer = jnp.maximum(state.num_outliers - 2, 0)
-    strange = is_strange(estimate.num_anchored, score, belief.mean[:POSE], state.window.poses[0])
-    num_outliers = jnp.where(strange & (not options.is_published), state.num_outliers + 1, fewer)
-    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
+    outlier = is_outlier(estimate.num_anchored, score, belief.mean[:POSE], state.window.poses[0])
+    num_outliers = jnp.where(outlier & (not options.is_published), state.num_outliers + 1, fewer)
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_OUTLIERS)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     if not options.is_published:
         # Far from the face few landmarks are turned to the camera, and two or three may correlate by chance.

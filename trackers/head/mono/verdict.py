@@ -16,7 +16,7 @@ had slipped off the face.
 """
 
 
-def is_strange(
+def is_outlier(
     num_anchored: Float[Array, ""],
     score: Float[Array, ""],
     pose: Float[Array, " 6"],

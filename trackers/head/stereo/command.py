@@ -17,7 +17,7 @@ from jaxfilters.trackers.head.common.input import Places, Setup, setup_of
 from jaxfilters.trackers.head.common.outcome import format_report, run_report
 from jaxfilters.trackers.head.common.run import HeadStream, RowsOf, stream_spec
 from jaxfilters.trackers.head.common.summary import write_summary
-from jaxfilters.trackers.head.common.table import HEAD_TABLE, TABLE_STATUS, empty_rows, in_metres
+from jaxfilters.trackers.head.common.table import HEAD_TABLE, TABLE_STATUS, empty_rows
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.io.errors import InputError, as_input_error
 from jaxfilters.trackers.io.video_input import is_live
@@ -39,7 +39,7 @@ def track(options: argparse.Namespace) -> str:
     if any(map(is_live, place.sources)):
         settings = dataclasses.replace(settings, chunk=1, live=True)
     session = as_input_error(lambda: _session(place, settings))
-    rows = RowsOf(HEAD_TABLE, in_metres, partial(empty_rows, place.rig.num_cameras))
+    rows = RowsOf(HEAD_TABLE, partial(empty_rows, place.rig.num_cameras))
     stream = HeadStream(place, session, rows, settings.chunk)
     files = {name: getattr(options, name) for name in ("camera", "rig", "points", "detector")}
     with closing(StreamRun(options, stream_spec(stream, rows, settings, files))) as run:

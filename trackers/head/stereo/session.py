@@ -19,6 +19,7 @@ from jaxfilters.trackers.head.common.following import UNUSED_POINTS, Beginning, 
 from jaxfilters.trackers.head.common.image_position import image_position
 from jaxfilters.trackers.head.common.search import first_diffusion, searches
 from jaxfilters.trackers.head.common.state import DOUBTFUL, INITIALISING, LOST, NUM_MODES, POSE, HeadState, HeadTrack
+from jaxfilters.trackers.head.common.table import in_metres
 from jaxfilters.trackers.head.stereo import redetection
 from jaxfilters.trackers.head.stereo.claims import with_assumptions
 from jaxfilters.trackers.head.stereo.known_face import pose_of_known_face
@@ -80,7 +81,7 @@ class HeadSession:
 
     @property
     def model(self) -> FaceModel | None:
-        """The face as estimated so far; `None` before registration."""
+        """The face as estimated so far, in millimetres; `None` before registration."""
         return None if self._following.state is None else self._following.state.model
 
     @property
@@ -101,7 +102,7 @@ class HeadSession:
         self._following.restore(saved)
 
     def process(self, images: UInt8[np.ndarray, "b C rows cols"], times: Float[np.ndarray, " b"]) -> HeadTrack:
-        """Track of the next frames, a row each.
+        """Track of the next frames, a row each, in metres and radians.
 
         Args:
             images: Grey, of all cameras at one moment each, without lens distortion.
@@ -110,7 +111,7 @@ class HeadSession:
         Raises:
             ValueError: if images or times do not fit the rig and each other.
         """
-        return self._following.process(images, times)
+        return in_metres(self._following.process(images, times))
 
 
 def track(
@@ -133,7 +134,7 @@ def track(
         focal_log_std: As for `HeadSession`.
 
     Returns:
-        The track: millimetres and radians, NaN where the head is not tracked.
+        The track: metres and radians, NaN where the head is not tracked.
 
     Raises:
         ValueError: as for `HeadSession` and its `process`, and for `checked_times`.

@@ -46,7 +46,7 @@ from jaxfilters.trackers.head.stereo.sharpening import first_slopes, sharpened
 from jaxfilters.trackers.head.stereo.variants import VARIANTS, Variant
 from jaxfilters.typing import AnyKey
 
-FEWEST_ANCHORED, FEWEST_PLACED, MOST_STRANGE = 2, 3, 60
+FEWEST_ANCHORED, FEWEST_PLACED, MOST_OUTLIERS = 2, 3, 60
 """Landmarks that must look as registered, and be where the model has them; in a doubtful pose, landmarks that must be
 found by their own patches; for how many frames either need not be: eyes may close while a mouth opens wide, but not for
 long."""
@@ -175,10 +175,10 @@ def _step(
     likenesses = jax.vmap(lambda views: score_at(model, views, rig, belief.mean, images))(jnp.stack([templates, looks]))
     score, likeness = likenesses[0], jnp.max(likenesses)
     doubt = jnp.maximum(DOUBTFUL_SCORE - score, 0.0) if variant.may_doubt else jnp.zeros_like(score)
-    is_strange = (estimate.num_anchored < FEWEST_ANCHORED) | (doubt > DOUBTFUL_SCORE - NOTHING_SCORE)
-    is_strange |= (doubt > 0) & (jnp.sum(jnp.any(estimate.is_placed, axis=0)) < FEWEST_PLACED)
-    num_outliers = jnp.where(is_strange, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
-    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_STRANGE)
+    is_outlier = (estimate.num_anchored < FEWEST_ANCHORED) | (doubt > DOUBTFUL_SCORE - NOTHING_SCORE)
+    is_outlier |= (doubt > 0) & (jnp.sum(jnp.any(estimate.is_placed, axis=0)) < FEWEST_PLACED)
+    num_outliers = jnp.where(is_outlier, state.num_outliers + 1, jnp.maximum(state.num_outliers - 2, 0))
+    missed = ~estimate.is_found | (likeness < LEAST_SCORE) | (num_outliers > MOST_OUTLIERS)
     missed |= (state.misses > 0) & (likeness < REGAINED_SCORE)
     innovations = jnp.where(missed, 0, pose_corrections(search, state.belief, moved, belief))
     state = state._replace(registered=registered)

@@ -7,7 +7,7 @@ import pytest
 from jaxfilters.models.face.landmarks import NAMES
 from jaxfilters.trackers.head.common.input import Places, setup_of_one
 from jaxfilters.trackers.head.common.run import HeadStream, RowsOf, stream_spec
-from jaxfilters.trackers.head.common.table import HEAD_TABLE, in_metres
+from jaxfilters.trackers.head.common.table import HEAD_TABLE
 from jaxfilters.trackers.head.mono.config import MonoConfig
 from jaxfilters.trackers.head.stereo.session import HeadSession
 from jaxfilters.trackers.io.cameras import write_camera
@@ -27,7 +27,7 @@ def identity(tmp_path):
         write_camera(places.camera, (COLS, ROWS), K=K, distortion=np.array([lens, 0, 0, 0, 0]))
         places.points.write_text("\n".join(["name,u,v", *(f"{name},{u},20" for name in NAMES)]))
         place = setup_of_one(str(tmp_path / "images"), places, 0)
-        rows = RowsOf(HEAD_TABLE, in_metres, lambda frames: None)
+        rows = RowsOf(HEAD_TABLE, lambda frames: None)
         contents = {"model": {"mean": np.full(3, model)}}
         return stream_spec(
             HeadStream(place, HeadSession(place.rig), rows, 8), rows, MonoConfig(), {}, contents

@@ -223,7 +223,7 @@ def test_uncertainty_is_the_spread_over_persons_that_are_as_likely(rig, face, ob
     response = frame.about_person.response
     found = np.asarray(jax.jit(uncertainty)(face, window, prior_of(USUAL), mean_person(face), response), float)
 
-    units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std)])
+    units = np.concatenate([face.identity_std, np.full(face.mean.size, USUAL.offset_std_mm)])
     root = np.linalg.cholesky(np.linalg.inv(np.asarray(face.expression_covariance, float))).T
 
     def rows(who, own):

@@ -20,7 +20,7 @@ from jaxfilters.trackers.head.common.table import SKIPPED, with_gaps
 from jaxfilters.trackers.head.mono import command as mono_command
 from jaxfilters.trackers.head.mono.focal import FocalLength
 from jaxfilters.trackers.head.mono.state import MonoTrack
-from jaxfilters.trackers.head.mono.table import empty_mono_rows
+from jaxfilters.trackers.head.mono.table import empty_mono_rows, mono_in_metres
 from jaxfilters.trackers.io.cameras import write_camera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.face_models import default_face_model, save_face_model
@@ -90,7 +90,8 @@ def fake(monkeypatch):
                 who = (self.face.identity_mean, self.face.identity_covariance, jnp.zeros((10, 3)))
                 self.gallery = Gallery(*(leaf[None] for leaf in who))
                 self.events.append((2, "registered"))
-            return made_track(images.mean(axis=(1, 2, 3)), times, np.where(index < 2, 0, 2).astype(np.int32), self.face)
+            status = np.where(index < 2, 0, 2).astype(np.int32)
+            return mono_in_metres(made_track(images.mean(axis=(1, 2, 3)), times, status, self.face))
 
     monkeypatch.setattr(mono_command, "MonoSession", FakeSession)
     return made

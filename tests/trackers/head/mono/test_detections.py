@@ -93,6 +93,7 @@ class Mesh:
 
     errors = None
     is_averaged = True
+    facing_std = None
 
     def __init__(self, dense):
         self.dense = dense

@@ -222,6 +222,7 @@ class Meshes:
     """A detector of true landmarks, and of meshes that are turned by `WRONG` in all frames."""
 
     is_averaged = True
+    facing_std = None
 
     def __init__(self, made, images, rig, vertices):
         self.errors = default_detector_errors()["mediapipe"]

@@ -20,7 +20,7 @@ from jaxfilters.trackers.head.mono.state import Window, prior_of
 
 NUM, KEPT = 8, 5
 REACH = Reach(np.array([60.0, 60, 100, 0.5, 0.5, 0.5]), 4.0, 4.0, 4.0)
-OPTIONS = MonoConfig(offset_std=0.7, past="marginalised")
+OPTIONS = MonoConfig(offset_std=0.7e-3, past="marginalised")
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ class KnownLandmarks:
 
     errors = None
     is_averaged = True
+    facing_std = None
 
     def __init__(self, uv):
         self.uv, self.asked = uv, 0

@@ -8,30 +8,30 @@ from scipy.spatial.transform import Rotation
 from jaxfilters.models.face.patches import SKIN_NORMALS, patches_of
 from jaxfilters.trackers.head.common.state import LOST
 from jaxfilters.trackers.head.mono.session import MonoSession
-from jaxfilters.trackers.head.mono.verdict import is_strange
-from jaxfilters.trackers.head.stereo.tracking import MOST_STRANGE
+from jaxfilters.trackers.head.mono.verdict import is_outlier
+from jaxfilters.trackers.head.stereo.tracking import MOST_OUTLIERS
 
 
-def strange(num_anchored, score, turn_deg=0.0):
+def outlier(num_anchored, score, turn_deg=0.0):
     """With a random registered pose and another one that is turned by that angle from it, about a random axis."""
     draw = np.random.default_rng(4)
     registered = Rotation.from_euler("ZYX", draw.normal(0, 0.3, 3))
     axis = draw.normal(size=3)
     other = Rotation.from_rotvec(np.radians(turn_deg) * axis / np.linalg.norm(axis)) * registered
     poses = [jnp.asarray([*draw.normal(0, 50, 3), *one.as_euler("ZYX")], float) for one in (other, registered)]
-    return bool(is_strange(jnp.asarray(float(num_anchored)), jnp.asarray(score), *poses))
+    return bool(is_outlier(jnp.asarray(float(num_anchored)), jnp.asarray(score), *poses))
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 20.0, 44.0])
 def test_a_face_that_looks_as_at_registration_must_correlate_with_it(turn_deg):
-    assert strange(5, 0.3, turn_deg)
-    assert not strange(5, 0.4, turn_deg)
+    assert outlier(5, 0.3, turn_deg)
+    assert not outlier(5, 0.4, turn_deg)
 
 
 @pytest.mark.parametrize("turn_deg", [46.0, 90.0, 170.0])
 def test_a_face_that_is_turned_away_need_not(turn_deg):
-    assert not strange(5, 0.1, turn_deg)
-    assert strange(1, 0.9, turn_deg)
+    assert not outlier(5, 0.1, turn_deg)
+    assert outlier(1, 0.9, turn_deg)
 
 
 @pytest.mark.system
@@ -52,5 +52,5 @@ def test_what_has_slipped_off_the_registered_face_is_lost(rig, face, talking, de
     back_and_forth = np.resize(np.r_[24:56, 55:23:-1], 96)
     times = made.times[23] + np.arange(1, 97) / 30
     track = session.process(images[back_and_forth], times)
-    assert not np.any(track.status[:MOST_STRANGE] == LOST)
-    assert np.any(track.status[MOST_STRANGE:] == LOST)
+    assert not np.any(track.status[:MOST_OUTLIERS] == LOST)
+    assert np.any(track.status[MOST_OUTLIERS:] == LOST)

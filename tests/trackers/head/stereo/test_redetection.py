@@ -63,7 +63,8 @@ def gone_on(session, images):
 
 
 def worst_errors(track, made):
-    return np.abs((track.pose[-4:] - made.poses[AFTER][-4:]) / UNITS).max(axis=0)
+    """Millimetres and degrees."""
+    return np.abs((track.pose[-4:] * [1e3, 1e3, 1e3, 1, 1, 1] - made.poses[AFTER][-4:]) / UNITS).max(axis=0)
 
 
 def covered(count=PATIENCE):

@@ -66,7 +66,7 @@ def test_a_face_that_holds_still_is_detected_registered_and_followed(drawn):
     assert np.all(np.isnan(track.pose[waited]))
     assert np.all(np.isnan(track.score[waited]))
     # 0.2 px off in one image are 0.9 mm of depth.
-    np.testing.assert_allclose(track.pose[~waited][:, :3], np.tile([59.6, -11.9, 640], (8, 1)), atol=2)
+    np.testing.assert_allclose(track.pose[~waited][:, :3], np.tile([0.0596, -0.0119, 0.64], (8, 1)), atol=0.002)
     np.testing.assert_allclose(track.pose[~waited][:, 3:], 0, atol=np.radians(1))
     assert track.score[~waited].min() > 0.9
     assert session.events == [(STABLE_FRAMES - 1, "registered")]
@@ -89,9 +89,9 @@ def whole(moving):
 def test_given_points_register_the_first_frame(moving, whole):
     video, _ = moving
     np.testing.assert_array_equal(whole.status, [INITIALISING] + [RIGID] * 20)
-    error = (whole.pose - video.poses)[1:]
-    assert np.abs(error[:, :2]).max() < 0.2
-    assert np.abs(error[:, 2]).max() < 1
+    error = (whole.pose - video.poses * [1e-3, 1e-3, 1e-3, 1, 1, 1])[1:]
+    assert np.abs(error[:, :2]).max() < 0.0002
+    assert np.abs(error[:, 2]).max() < 0.001
     assert np.abs(error[:, 3:]).max() < np.radians(0.5)
     shapes = whole.pose, whole.deformation, whole.shape, whole.image_points
     assert [a.shape for a in shapes] == [(21, 6), (21, NUM_MODES), (21, 10, 3), (21, 2, 10, 2)]
@@ -110,7 +110,8 @@ def test_pieces_of_any_size_give_the_same_rows(moving, whole, sizes):
         done += size
     pieces = jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
     np.testing.assert_array_equal(pieces.status, whole.status)
-    np.testing.assert_allclose(pieces.pose, whole.pose, atol=2e-3)
+    np.testing.assert_allclose(pieces.pose[:, :3], whole.pose[:, :3], atol=2e-6)
+    np.testing.assert_allclose(pieces.pose[:, 3:], whole.pose[:, 3:], atol=2e-3)
     np.testing.assert_allclose(pieces.image_points, whole.image_points, atol=0.01)
 
 
@@ -133,7 +134,8 @@ def test_a_clock_that_counts_from_long_ago_does_not_matter(moving, whole):
     """Single precision has steps of 128 s at this time."""
     video, images = moving
     late = HeadSession(video.rig, points=video.uv[0, 0].astype(float)).process(images, video.times + 1.7e9)
-    np.testing.assert_allclose(late.pose, whole.pose, atol=2e-3)
+    np.testing.assert_allclose(late.pose[:, :3], whole.pose[:, :3], atol=2e-6)
+    np.testing.assert_allclose(late.pose[:, 3:], whole.pose[:, 3:], atol=2e-3)
 
 
 @pytest.mark.system
