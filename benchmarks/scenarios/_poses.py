@@ -13,7 +13,10 @@ _LENGTHS = ("shape", "offset")
 
 
 def in_millimetres(track: Any) -> Any:
-    """A track of a head, which is in metres, in the unit of synthetic faces; with the fields of `HeadTrack`."""
+    """A track of a head, which is in metres, in the unit of synthetic faces; with the fields of `HeadTrack`.
+
+    All but `deformation`, which is a length with two cameras and a number of standard deviations with one.
+    """
     scale = np.repeat(np.array([1e3, 1.0]), 3)
     poses = {name: scale * np.asarray(getattr(track, name)) for name in ("pose", "pose_std")}
     others = {name: 1e3 * np.asarray(getattr(track, name)) for name in _LENGTHS if name in track._fields}

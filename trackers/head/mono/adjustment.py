@@ -15,7 +15,7 @@ from jaxfilters.models.face.multilinear import MultilinearFace
 from jaxfilters.models.face.patches import patches_of
 from jaxfilters.models.face.person_prior import Person, Prior, posed_shape
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.models.face.square_root_prior import joined
+from jaxfilters.models.face.square_root_prior import SquareRootPrior, joined, of_measurements
 from jaxfilters.optimize.least_squares import cauchy, huber
 from jaxfilters.trackers.head.common.state import POSE
 from jaxfilters.trackers.head.mono.config import MonoConfig
@@ -75,6 +75,46 @@ def of_frames(face: MultilinearFace, rig: CameraRig, views: Views, bundle: Bundl
 
     # One by one: batches of factorisations can stand still on two cores.
     return jax.lax.map(one, (views, bundle.poses, bundle.expressions))
+
+
+def with_measurement(
+    face: MultilinearFace,
+    person: Person,
+    frames: FrameInformation,
+    past: SquareRootPrior,
+    J: Float[Array, "m d"],
+    residuals: Float[Array, " m"],
+    prior: Prior,
+) -> tuple[Float[Array, " d"], SquareRootPrior]:
+    """How a person moves once something else was measured of the face, and what is then known beside the frames.
+
+    One step of Newton's method from the person that is the most probable one without the measurement.
+
+    Args:
+        face: Model.
+        person: As estimated without the measurement.
+        frames: What each frame tells of the person.
+        past: What is known beside the frames.
+        J: Derivative of the residuals by identity and offset, in units of their standard deviations.
+        residuals: Of the measurement at the person, in standard deviations.
+        prior: What holds the face.
+
+    Returns:
+        The step, in standard deviations of identity and offset, and `past` with the measurement.
+    """
+    unit = units(face, prior)
+    rows = J * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
+    values = jnp.matmul(rows, person_prior.parameters(person), precision="highest") - residuals
+    past = joined(past, of_measurements(rows, values))
+    total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
+    total = total + jnp.sum(frames.information, axis=0)
+    return -jnp.linalg.solve(total, jnp.matmul(J.T, residuals, precision="highest")), past
+
+
+def moved_person(face: MultilinearFace, person: Person, step: Float[Array, " d"], prior: Prior) -> Person:
+    """The person after a step in standard deviations of identity and offset."""
+    change, count = units(face, prior) * step, face.num_identities
+    return Person(person.identity + change[:count], person.offset + change[count:].reshape(face.mean.shape))
 
 
 def uncertainty(

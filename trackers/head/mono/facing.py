@@ -15,12 +15,11 @@ from jaxtyping import Array, Float
 from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import Bundle, Views, projected
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Person, Prior, nothing_past, parameters
+from jaxfilters.models.face.person_prior import Prior, nothing_past
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.models.face.square_root_prior import SquareRootPrior, joined, of_measurements
+from jaxfilters.models.face.square_root_prior import SquareRootPrior
 from jaxfilters.trackers.head.common.state import POSE
-from jaxfilters.trackers.head.mono.adjustment import of_frames, prior_information
-from jaxfilters.trackers.head.mono.past import units
+from jaxfilters.trackers.head.mono.adjustment import moved_person, of_frames, with_measurement
 from jaxfilters.trackers.head.mono.start import Start
 
 
@@ -66,20 +65,12 @@ def _turned(
     std: Array,
     prior: Prior,
 ) -> tuple[Start, SquareRootPrior]:
-    bundle, person, count = start.bundle, start.bundle.person, face.num_identities
-    each = of_frames(face, rig, views, bundle, prior)
+    bundle, frames = start.bundle, of_frames(face, rig, views, start.bundle, prior)
     by_pose = jax.vmap(jax.jacfwd(turned_away))(bundle.poses)
-    by_person = jnp.mean(jnp.matmul(by_pose, each.response[:, :POSE], precision="highest"), axis=0) / std[:, None]
-    away = jnp.mean(jax.vmap(turned_away)(bundle.poses), axis=0) / std
-    unit = units(face, prior)
-    rows = by_person * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1.0), 0.0)
-    past = joined(past, of_measurements(rows, jnp.matmul(rows, parameters(person), precision="highest") - away))
-    total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
-    total = total + jnp.sum(each.information, axis=0)
-    # One step of Newton's method from the start, which is the most probable one without this measurement.
-    moved = -jnp.linalg.solve(total, jnp.matmul(by_person.T, away, precision="highest"))
-    own = jnp.matmul(each.response, moved, precision="highest")
-    change = unit * moved
-    person = Person(person.identity + change[:count], person.offset + change[count:].reshape(face.mean.shape))
+    by_person = jnp.mean(jnp.matmul(by_pose, frames.response[:, :POSE], precision="highest"), axis=0)
+    away = jnp.mean(jax.vmap(turned_away)(bundle.poses), axis=0)
+    step, past = with_measurement(face, bundle.person, frames, past, by_person / std[:, None], away / std, prior)
+    own = jnp.matmul(frames.response, step, precision="highest")
+    person = moved_person(face, bundle.person, step, prior)
     bundle = Bundle(bundle.poses + own[:, :POSE], bundle.expressions + own[:, POSE:], person)
     return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), past

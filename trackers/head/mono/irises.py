@@ -13,12 +13,11 @@ from jaxfilters._xla.compiled_quickly import compiled_quickly
 from jaxfilters.models.face.bundle import Views, projected
 from jaxfilters.models.face.landmarks import EYES
 from jaxfilters.models.face.multilinear import MultilinearFace
-from jaxfilters.models.face.person_prior import Person, Prior, log_size, nothing_past, posed_shape
+from jaxfilters.models.face.person_prior import Prior, log_size, nothing_past, posed_shape
 from jaxfilters.models.face.pose import place
 from jaxfilters.models.face.rig import CameraRig
-from jaxfilters.models.face.square_root_prior import SquareRootPrior, joined, of_measurements
-from jaxfilters.trackers.head.mono.adjustment import of_frames, prior_information
-from jaxfilters.trackers.head.mono.past import units
+from jaxfilters.models.face.square_root_prior import SquareRootPrior
+from jaxfilters.trackers.head.mono.adjustment import moved_person, of_frames, with_measurement
 from jaxfilters.trackers.head.mono.start import Start
 
 IRIS_MM, IRIS_STD_MM = 11.7, 0.5
@@ -64,20 +63,15 @@ def _resized(
     iris_px: Array,
     prior: Prior,
 ) -> tuple[Start, SquareRootPrior]:
-    bundle, count = start.bundle, face.num_identities
-    person = bundle.person
+    bundle, person = start.bundle, start.bundle.person
     larger, std = measured(face, rig, start, iris_px)
     slope = jax.grad(lambda identity: log_size(face, identity))(person.identity)
-    size = (larger + jnp.sum(slope * person.identity)) / std
-    more = of_measurements(jnp.pad(slope / std, (0, face.mean.size))[None], size[None])
-    # The start is the likeliest without the irises; to first order this is the likeliest with them.
-    past, unit = joined(past, more), units(face, prior)
-    total = prior_information(face, person, prior) + unit[:, None] * past.information * unit
-    total = total + jnp.sum(of_frames(face, rig, views, bundle, prior).information, axis=0)
-    moved = unit * jnp.linalg.solve(total, unit * jnp.pad(slope / jnp.square(std) * larger, (0, face.mean.size)))
-    factor = jnp.exp(jnp.sum(slope * moved[:count]))
-    person = Person(person.identity + moved[:count], person.offset + moved[count:].reshape(face.mean.shape))
-    bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=person)
+    J = jnp.pad(face.identity_std * slope / std, (0, face.mean.size))[None]
+    frames = of_frames(face, rig, views, bundle, prior)
+    step, past = with_measurement(face, person, frames, past, J, -larger[None] / std, prior)
+    moved = moved_person(face, person, step, prior)
+    factor = jnp.exp(jnp.sum(slope * (moved.identity - person.identity)))
+    bundle = bundle._replace(poses=bundle.poses.at[:, :3].multiply(factor), person=moved)
     return start._replace(bundle=bundle, uv=projected(face, rig, bundle)), past
 
 

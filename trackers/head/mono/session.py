@@ -173,7 +173,7 @@ def track(
     Raises:
         ValueError: as for `MonoSession` and its `process`, and for `checked_times`.
     """
-    session = MonoSession(monocular(camera), face or people_face_model().model, config, **known)
+    session = MonoSession(monocular(camera), people_face_model().model if face is None else face, config, **known)
     return session.process(images[:, None], checked_times(times_s, len(images)))
 
 
