@@ -10,7 +10,7 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 SCRIPTS = sorted((DOCS / "examples").glob("*.py"))
-LONG = {"bearings_only", "neural_observation", "stochastic_volatility"}
+LONG = {"bearings_only", "hand_fit", "neural_observation", "stochastic_volatility"}
 """Which run for longer than they compile."""
 LARGEST_PICTURE = 80 * 1024
 
