@@ -71,7 +71,7 @@ result = np.median(errors, axis=1)
 
 # %%
 figure, axes = plt.subplots(2, 4, figsize=(10, 5), layout="constrained")
-for row, i in zip(axes, (0, 1), strict=True):
+for row, i in zip(axes, (1, 2), strict=True):
     titles = [f"{n}: {e[i]:.1f} mm" for n, e in zip(("start", "gradient", "climbing"), errors, strict=True)]
     for ax, title, image in zip(row, ["observed", *titles], [y[i], *(depth(f[i]) for f in found)], strict=True):
         ax.imshow(np.where(image < WALL - 0.02, image, np.nan), cmap="viridis_r", vmin=0.42, vmax=0.6)
