@@ -126,6 +126,7 @@ def _metrics(scores: MultiObjectScores, suffix: str) -> dict[str, Metric]:
         f"mota{suffix}": Metric(scores.mota, "%", "higher"),
         f"idf1{suffix}": Metric(scores.idf1, "%", "higher"),
         f"mean_error_m{suffix}": Metric(scores.mean_error_m, "m", "lower"),
+        f"localisation_error_m{suffix}": Metric(scores.localisation_error_m, "m", "lower"),
         f"id_switches{suffix}": Metric(float(scores.id_switches), "", "lower"),
         f"transfers{suffix}": Metric(float(scores.transfers), "", "lower"),
     }

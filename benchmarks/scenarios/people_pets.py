@@ -35,7 +35,14 @@ FRAMES_PER_SECOND = 7.0
 """Of the camera; the file says 10."""
 PRIME_EVERY = 20
 QUICK_FRAMES = 40
-IN_METRES = ("mean_error_m", "radial_error_m", "lateral_error_m", "radial_bias_m", "lateral_bias_m")
+IN_METRES = (
+    "mean_error_m",
+    "localisation_error_m",
+    "radial_error_m",
+    "lateral_error_m",
+    "radial_bias_m",
+    "lateral_bias_m",
+)
 """Biases are best at zero."""
 COUNTED = ("id_switches", "transfers", "false_positives", "misses", "fragmentations")
 

@@ -129,6 +129,18 @@ def test_whoever_is_within_reach_keeps_the_identity_although_another_is_nearer()
     assert evaluate(truth, estimate).id_switches == 0
 
 
+def test_localisation_does_not_depend_on_identities():
+    """Side by side, 0.6 m apart; only identity 8 is found in the first frame, 0.7 m from person 1."""
+    truth = tracks([(0, 1, 0, 0), *((t, who, t, 0.6 * (who - 1)) for t in range(1, 5) for who in (1, 2))])
+    beside = [(t, who + 6, t, 0.6 * (who - 1) + 0.1) for t in range(1, 5) for who in (1, 2)]
+    estimate = tracks([(0, 8, 0, 0.7), *beside])
+    scores = evaluate(truth, estimate)
+    np.testing.assert_allclose(scores.mean_error_m, (0.7 + 4 * (0.7 + 0.5)) / 9)
+    np.testing.assert_allclose(scores.localisation_error_m, (0.7 + 8 * 0.1) / 9)
+    renamed = evaluate(truth, estimate._replace(identity=np.arange(len(estimate.frame))))
+    assert renamed.localisation_error_m == scores.localisation_error_m
+
+
 def test_as_many_as_possible_are_paired():
     """The nearest pair alone would leave the second person without a partner."""
     truth, estimate = tracks([(0, 1, 0, 0), (0, 2, 0.9, 0)]), tracks([(0, 5, 0.1, 0), (0, 6, -0.9, 0)])

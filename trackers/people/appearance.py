@@ -1,13 +1,13 @@
 """What people wear, and identities that were exchanged while two people were close, put right by it.
 
-Clothes are colour histograms of the upper and the lower half of silhouettes.
+Clothes are joint histograms of the three colours in the upper and the lower half of silhouettes.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfilters._full_precision import einsum
+from jaxfilters._full_precision import dot
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person import foreground
 from jaxfilters.models.person.ellipsoid import VISIBLE, ellipse_of, outline
@@ -23,7 +23,9 @@ from jaxfilters.trackers.people.state import (
     PeopleScene,
 )
 
-BINS = 8
+STEPS = 4
+"""Of each colour, whose values are divided between the two nearest."""
+BINS = STEPS**3
 GRID = (24, 12)
 LEAST_PIXELS = 12.0
 """Effective samples below which a half says nothing."""
@@ -42,7 +44,7 @@ def appearances(
     places: Float[Array, "slots shape"],
     active: Bool[Array, " slots"],
     frames: tuple[CameraFrame, ...],
-) -> tuple[Float[Array, "slots 48"], Bool[Array, " slots"]]:
+) -> tuple[Float[Array, "slots 128"], Bool[Array, " slots"]]:
     """Histograms of everybody, and whose are worth something; of the first camera that sees enough of a person."""
     histograms, good = jnp.full((len(places), APPEARANCE), 1 / BINS), jnp.zeros(len(places), bool)
     for camera, depth, frame in zip(scene.cameras, scene.furniture, frames, strict=True):
@@ -52,8 +54,8 @@ def appearances(
     return histograms, good
 
 
-def dissimilarity(a: Float[Array, "*#batch 48"], b: Float[Array, "*#batch 48"]) -> Float[Array, "*_"]:
-    """Mean Hellinger distance of the six histograms, from 0 to 1."""
+def dissimilarity(a: Float[Array, "*#batch 128"], b: Float[Array, "*#batch 128"]) -> Float[Array, "*_"]:
+    """Mean Hellinger distance of the two histograms, from 0 to 1."""
     common = jnp.sum(jnp.sqrt(a * b).reshape(*jnp.broadcast_shapes(a.shape, b.shape)[:-1], -1, BINS), axis=-1)
     return jnp.mean(jnp.sqrt(jnp.maximum(1 - common, 0.0)), axis=-1)
 
@@ -95,9 +97,11 @@ def _histogram(colors, weight, upper):
     """Of both halves, and whether both hold enough pixels."""
     halves = jnp.stack([weight * upper, weight * ~upper])
     # Equal steps of the square root: clothes are mostly dark.
-    bins = jax.nn.one_hot((BINS * jnp.sqrt(colors / 256)).astype(jnp.int32), BINS)
+    level = jnp.clip(STEPS * jnp.sqrt(colors / 256) - 0.5, 0, STEPS - 1)
+    blue, green, red = jnp.moveaxis(jnp.maximum(1 - jnp.abs(level[..., None] - jnp.arange(STEPS)), 0), 1, 0)
+    joint = (blue[:, :, None, None] * green[:, None, :, None] * red[:, None, None, :]).reshape(-1, BINS)
     sizes = jnp.sum(halves, axis=1)
-    histogram = einsum("hs,scb->hcb", halves, bins) / jnp.maximum(sizes, 1e-6)[:, None, None]
+    histogram = dot(halves, joint) / jnp.maximum(sizes, 1e-6)[:, None]
     return histogram.ravel(), jnp.all(sizes > LEAST_PIXELS)
 
 
@@ -108,7 +112,7 @@ def is_meeting(meetings: Meetings) -> Bool[Array, " slots"]:
 
 def identity_switch_correction(
     people: People,
-    histograms: Float[Array, "slots 48"],
+    histograms: Float[Array, "slots 128"],
     good: Bool[Array, " slots"],
     dt: Float[Array, ""],
 ) -> People:
@@ -150,6 +154,7 @@ def _exchanged(people: People, evidence: Array) -> tuple[People, Array]:
     swapped = people._replace(
         identity=people.identity[order],
         appearance=people.appearance[order],
+        appearance_frames=people.appearance_frames[order],
         belief=_with_height_of(order, people.belief),
     )
     return swapped, order != jnp.arange(slots)

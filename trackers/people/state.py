@@ -17,8 +17,8 @@ from jaxfilters.trackers.people.config import PeopleConfig as PeopleConfig
 FREE, TENTATIVE, TRACKED, DORMANT = range(4)
 MODE_NAMES = ("free", "tentative", "tracked", "dormant")
 """Slots: unused; a person who may be a mistake; a person; a person who was lost sight of and may come back."""
-APPEARANCE = 48
-"""Numbers that describe clothes: histograms of eight bins of three colours, of the upper and the lower half."""
+APPEARANCE = 128
+"""Numbers that describe clothes: joint histograms of three colours in four steps, of the upper and the lower half."""
 NUM_BIASES = 3
 STATE = 6 + NUM_BIASES
 """X, Y, velocity along X and Y, height, width: metres and metres per second; normalised biases of the silhouette."""
@@ -114,7 +114,9 @@ class People(NamedTuple):
     """Of being a person."""
     unseen_s: Float[Array, " slots"]
     """Seconds since an image showed anything of them."""
-    appearance: Float[Array, "slots 48"]
+    appearance: Float[Array, "slots 128"]
+    appearance_frames: Int32[Array, " slots"]
+    """How many frames went into it."""
     meetings: Meetings
     next_identity: Int32[Array, ""]
     shift: Float[Array, "slots cameras 2"]
@@ -162,7 +164,8 @@ def _empty(n: int, cameras: int) -> People:
         jnp.full(n, -1, jnp.int32),
         jnp.zeros(n),
         jnp.zeros(n),
-        jnp.full((n, APPEARANCE), 1 / 8, float),
+        jnp.full((n, APPEARANCE), 2 / APPEARANCE, float),
+        jnp.zeros(n, jnp.int32),
         no_meetings(n),
         jnp.zeros((), jnp.int32),
         jnp.zeros((n, cameras, 2)),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilters.trackers.people.appearance import BINS, appearances, dissimilarity
+from jaxfilters.trackers.people.appearance import BINS, STEPS, appearances, dissimilarity
 from jaxfilters.trackers.people.state import APPEARANCE, CameraFrame, PeopleConfig
 from jaxfilters.trackers.people.tracker import people_scene
 
@@ -16,14 +16,14 @@ SHIRTS, TROUSERS = ((250, 10, 10), (10, 250, 10)), ((10, 10, 250), (90, 90, 90))
 
 
 def random_appearances(seed, n):
-    counts = np.random.default_rng(seed).gamma(0.3, size=(n, 6, BINS))
+    counts = np.random.default_rng(seed).gamma(0.3, size=(n, 2, BINS))
     return jnp.asarray((counts / counts.sum(axis=-1, keepdims=True)).reshape(n, APPEARANCE), jnp.float32)
 
 
 def test_dissimilarity_is_the_mean_hellinger_distance():
     a, b = random_appearances(0, 50), random_appearances(1, 50)
     found = np.asarray(dissimilarity(a, b))
-    p, q = (np.asarray(x, np.float64).reshape(50, 6, BINS) for x in (a, b))
+    p, q = (np.asarray(x, np.float64).reshape(50, 2, BINS) for x in (a, b))
     expected = np.sqrt(0.5 * ((np.sqrt(p) - np.sqrt(q)) ** 2).sum(axis=-1)).mean(axis=-1)
     np.testing.assert_allclose(found, expected, atol=1e-3)
     np.testing.assert_allclose(dissimilarity(b, a), found, atol=1e-6)
@@ -33,7 +33,7 @@ def test_dissimilarity_is_the_mean_hellinger_distance():
 def test_dissimilarity_is_zero_for_the_same_and_one_for_what_has_nothing_in_common():
     a = random_appearances(2, 20)
     np.testing.assert_allclose(dissimilarity(a, a), 0, atol=2e-3)
-    low, high = (jnp.tile(jax.nn.one_hot(i, BINS), 6) for i in (0, 7))
+    low, high = (jnp.tile(jax.nn.one_hot(i, BINS), 2) for i in (0, 7))
     np.testing.assert_allclose(dissimilarity(low, high), 1, atol=1e-6)
 
 
@@ -61,13 +61,18 @@ def found(camera, draw, floor):
     def run(active=(True, False, True), present=(True, True), places=places, observed=mask):
         frames = tuple(CameraFrame(observed, image, np.bool_(here)) for here in present)
         histograms, good = look(scene, places, jnp.array(active), frames)
-        return np.asarray(histograms).reshape(-1, 2, 3, BINS), np.asarray(good)
+        return np.asarray(histograms).reshape(-1, 2, STEPS, STEPS, STEPS), np.asarray(good)
 
     return run, mask
 
 
-def bin_of(value):
-    return int(BINS * np.sqrt(value / 256))
+def histogram_of(color):
+    """(4, 4, 4) of one colour: each of its values is divided linearly between the two nearest of four steps."""
+    middles = (np.arange(STEPS) + 0.5) / STEPS
+    shares = [
+        [np.interp(np.sqrt(value / 256), middles, np.eye(STEPS)[step]) for step in range(STEPS)] for value in color
+    ]
+    return np.einsum("i,j,k->ijk", *shares)
 
 
 def test_shirts_and_trousers_are_told_apart(found):
@@ -76,9 +81,9 @@ def test_shirts_and_trousers_are_told_apart(found):
     assert good.tolist() == [True, False, True]
     for slot, number in ((0, 0), (2, 1)):
         for half, colors in enumerate((SHIRTS[number], TROUSERS[number])):
-            for channel, value in enumerate(colors):
-                assert histograms[slot, half, channel, bin_of(value)] > 0.8
-    np.testing.assert_allclose(histograms.sum(axis=-1), 1, atol=1e-4)
+            common = np.minimum(histograms[slot, half], histogram_of(colors)).sum()
+            assert common > 0.8
+    np.testing.assert_allclose(histograms.sum(axis=(-3, -2, -1)), 1, atol=1e-4)
 
 
 def test_another_camera_does_where_the_first_delivers_nothing(found):

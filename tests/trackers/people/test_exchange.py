@@ -7,6 +7,7 @@ import pytest
 
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.trackers.people.appearance import (
+    BINS,
     CLOSE_M,
     HIDING_M,
     LONGEST_S,
@@ -16,7 +17,7 @@ from jaxfilters.trackers.people.appearance import (
 from jaxfilters.trackers.people.state import HEIGHT, STATE, TRACKED, WIDTH, PeopleConfig, nobody
 
 DT = jnp.asarray(0.1)
-RED, BLUE, GREY = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3, 6))
+RED, BLUE, GREY = (jnp.tile(jax.nn.one_hot(i, BINS), 2) for i in (3, 48, 42))
 CLEARLY = jnp.array([True, True, True])
 settle = jax.jit(identity_switch_correction)
 
@@ -32,6 +33,7 @@ def three(*, apart, first=RED, second=BLUE, mode=(TRACKED,) * 3):
         mode=jnp.array(mode, jnp.int32),
         identity=jnp.array([10, 11, 12], jnp.int32),
         appearance=jnp.stack([first, second, GREY]),
+        appearance_frames=jnp.array([5, 6, 7], jnp.int32),
     )
 
 
@@ -55,6 +57,7 @@ def test_whoever_wears_the_other_s_clothes_is_the_other():
     np.testing.assert_allclose(people.belief.mean[:, WIDTH], [0.40, 0.45, 0.50], rtol=1e-6)
     np.testing.assert_allclose(people.belief.mean[:, 0], [0, 2, 9])
     np.testing.assert_array_equal(people.appearance[:2], jnp.stack([BLUE, RED]))
+    assert people.appearance_frames.tolist() == [6, 5, 7]
     assert not is_meeting(people.meetings).any()
 
 

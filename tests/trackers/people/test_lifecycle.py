@@ -8,6 +8,7 @@ import pytest
 from jaxfilters.gaussian.belief import Gaussian
 from jaxfilters.models.person.foreground import Quadratic
 from jaxfilters.trackers.people import lifecycle
+from jaxfilters.trackers.people.appearance import BINS, dissimilarity
 from jaxfilters.trackers.people.fit import Fit
 from jaxfilters.trackers.people.lifecycle import Birth, stride
 from jaxfilters.trackers.people.state import (
@@ -24,7 +25,7 @@ from jaxfilters.trackers.people.tracker import people_scene, step
 
 SLOTS = 4
 CONFIG = PeopleConfig(capacity=SLOTS, cell_m=2.0)
-RED, BLUE = (jnp.tile(jax.nn.one_hot(i, 8), 6) for i in (0, 3))
+RED, BLUE = (jnp.tile(jax.nn.one_hot(i, BINS), 2) for i in (3, 48))
 judge, name, confirm = (jax.jit(one) for one in (lifecycle.existence, lifecycle.named, lifecycle.confirm))
 
 
@@ -230,28 +231,46 @@ def test_two_who_come_at_once_are_not_the_same_old_one():
     assert name(people).identity.tolist() == [2, -1, 9, -1]
 
 
+def test_of_two_who_left_in_the_same_clothes_neither_comes_back():
+    unseen_s = [0, 3, 3, 0]
+    people = people_of(TRACKED, DORMANT, DORMANT, identity=[-1, 2, 3, -1], unseen_s=unseen_s, next_identity=9)
+    alike = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
+    assert name(alike).identity.tolist() == [9, 2, 3, -1]
+    half = 0.99 * RED + 0.01 * BLUE
+    apart = alike._replace(appearance=alike.appearance.at[2].set(half))
+    assert 0.04 < float(dissimilarity(RED, half)) < lifecycle.LIKENESS
+    assert name(apart).identity.tolist() == [2, -1, 3, -1]
+
+
 @pytest.mark.system
-def test_clothes_are_taken_at_first_and_then_followed_slowly():
+def test_clothes_are_the_mean_of_the_first_ten_frames_and_then_followed_slowly():
     people, good = people_of(TRACKED, TRACKED), jnp.array([True, False, False, False])
     first = lifecycle.with_appearances(people, jnp.tile(RED, (SLOTS, 1)), good)
     np.testing.assert_array_equal(first.appearance[0], RED)
     np.testing.assert_array_equal(first.appearance[1], people.appearance[1])
-    later = lifecycle.with_appearances(first, jnp.tile(BLUE, (SLOTS, 1)), good)
-    np.testing.assert_allclose(later.appearance[0], 0.9 * RED + 0.1 * BLUE, atol=1e-6)
+    later = first
+    for _ in range(9):
+        later = lifecycle.with_appearances(later, jnp.tile(BLUE, (SLOTS, 1)), good)
+    np.testing.assert_allclose(later.appearance[0], 0.1 * RED + 0.9 * BLUE, atol=1e-6)
+    assert later.appearance_frames.tolist() == [10, 0, 0, 0]
+    eleventh = lifecycle.with_appearances(later, jnp.tile(RED, (SLOTS, 1)), good)
+    np.testing.assert_allclose(eleventh.appearance[0], 0.19 * RED + 0.81 * BLUE, atol=1e-6)
     open_ = first.meetings._replace(is_open=first.meetings.is_open.at[0, 1].set(True).at[1, 0].set(True))
     during = lifecycle.with_appearances(first._replace(meetings=open_), jnp.tile(BLUE, (SLOTS, 1)), good)
     np.testing.assert_array_equal(during.appearance[0], RED)
+    assert during.appearance_frames[0] == 1
 
 
 def test_a_newcomer_gets_the_first_free_slot_and_nothing_of_who_had_it(scene):
     people = people_of(TRACKED, FREE, TRACKED, FREE, identity=[4, -1, 5, -1], log_odds=[8.0, 3.0, 8.0, 0.0])
-    people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)))
+    people = people._replace(appearance=jnp.tile(RED, (SLOTS, 1)), appearance_frames=jnp.full(SLOTS, 20))
     found = Birth(jnp.array([1.5, 2.5]), jnp.array(True))
     after = confirm(scene, people, found)
     assert after.mode.tolist() == [TRACKED, TENTATIVE, TRACKED, FREE]
     np.testing.assert_allclose(after.belief.mean[1], [1.5, 2.5, 0, 0, CONFIG.height_m, CONFIG.width_m, 0, 0, 0])
     assert after.log_odds.tolist() == [8, 0, 8, 0]
-    np.testing.assert_allclose(after.appearance[1], 1 / 8)
+    np.testing.assert_allclose(after.appearance[1], 1 / BINS)
+    assert after.appearance_frames.tolist() == [20, 0, 20, 20]
     np.testing.assert_array_equal(after.belief.mean[2], people.belief.mean[2])
     unchanged = confirm(scene, people, found._replace(found=jnp.array(False)))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(unchanged), jax.tree.leaves(people), strict=True))

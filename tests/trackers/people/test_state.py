@@ -36,7 +36,7 @@ def test_before_anybody_has_come_all_slots_are_free():
     assert np.all(people.identity == -1)
     assert people.belief.covariance.shape == (3, STATE, STATE)
     # Six histograms that are blank, and each a distribution.
-    np.testing.assert_allclose(people.appearance.reshape(3, 6, -1).sum(axis=-1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(people.appearance.reshape(3, 2, -1).sum(axis=-1), 1.0, rtol=1e-6)
     assert people.appearance.shape[1] == APPEARANCE
     assert not people.meetings.is_open.any()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(people))
