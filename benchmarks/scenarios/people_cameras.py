@@ -10,8 +10,9 @@ narrow views, another camera became the nearest of those that see a person whole
 Where JAXFILTERS_DATA names a folder with `pom_lab_2cam`, two real cameras follow, by their silhouettes. There is no
 truth for them: `pom_agreement` is the share of the people that a published method found (Fleuret et al. 2008, on a grid
 of 0.2 m) within 0.5 m of a person who is tracked. Where it has `pets09_s2l1_two_views` as well, `_two` are scores of
-two real cameras of a street together and `_one` those of the better one alone, and `_two_refit` and `_one_refit` the
-same with another calibration, each of which is off by some decimetres somewhere.
+two real cameras of a street together and `_one` those of the better one alone (means over runs between which grey
+levels differ by one), and `_two_refit` and `_one_refit` the same with another calibration, each of which is off by some
+decimetres somewhere.
 """
 
 import sys
@@ -93,7 +94,10 @@ def run(*, quick: bool, seed: int, out: Path | None) -> dict[str, Metric]:
     real = (
         lambda: pom_metrics(recording_folder("pom_lab_2cam")),
         lambda: two_view_metrics(
-            recording_folder("pets09_s2l1_two_views"), recording_folder("pets09_s2l1_view001"), quick=quick
+            recording_folder("pets09_s2l1_two_views"),
+            recording_folder("pets09_s2l1_view001"),
+            quick=quick,
+            seed=seed,
         ),
     )
     for measured in real:

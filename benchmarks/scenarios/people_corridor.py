@@ -16,8 +16,6 @@ linked to the nearest.
 import csv
 import itertools
 import sys
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +25,7 @@ import numpy as np
 from jaxfilters.benchmarks.metrics import Direction, Metric
 from jaxfilters.benchmarks.multi_object import FloorTracks, evaluate, floor_tracks, match
 from jaxfilters.benchmarks.recordings import RecordingError, recording_folder
+from jaxfilters.benchmarks.scenarios._grey_levels import Disturbance, disturbances
 from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
 from jaxfilters.benchmarks.scenarios.people_pets import positions
 from jaxfilters.models.calibration import calibrate_floor
@@ -129,11 +128,10 @@ def backwards(corridor: Corridor) -> Corridor:
 
 def _runs(corridor: Corridor, number: int, seed: int) -> list[dict[str, float]]:
     """Scores of several runs, all but the first with disturbed images."""
-    scene, rng = people_scene([corridor.camera], corridor.floor), np.random.default_rng(seed)
-    disturbed = partial(_changed_by_a_level, rng)
+    scene = people_scene([corridor.camera], corridor.floor)
     return [
-        _scores(corridor, _followed(scene, corridor.samples, corridor.moments, disturbed if run else _unchanged))
-        for run in range(number)
+        _scores(corridor, _followed(scene, corridor.samples, corridor.moments, disturb))
+        for disturb in disturbances(number, seed)
     ]
 
 
@@ -141,7 +139,7 @@ def _followed(
     scene: PeopleScene,
     samples: list[np.ndarray],
     moments: list[tuple[float, np.ndarray]],
-    disturb: Callable[[np.ndarray], np.ndarray],
+    disturb: Disturbance,
 ) -> list[tuple[int, int, float, float]]:
     """Frame, identity, X and Y of smoothed tracks of disturbed images."""
     session = PeopleSession(scene)
@@ -149,15 +147,6 @@ def _followed(
     for time_s, image in moments:
         session.process([disturb(image)], time_s)
     return positions(session.tracks.smoothed())
-
-
-def _unchanged(image: np.ndarray) -> np.ndarray:
-    return image
-
-
-def _changed_by_a_level(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Every grey level by -1, 0 or 1 at random."""
-    return np.clip(image + rng.integers(-1, 2, image.shape), 0, 255).astype(np.uint8)
 
 
 def corridor_camera(path: Path, shape: tuple[int, int]) -> FloorCamera:

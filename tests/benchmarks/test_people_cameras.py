@@ -111,12 +111,34 @@ def test_the_better_view_is_scored_with_merged_identities_as_well(monkeypatch, t
     monkeypatch.setattr(_pets_two, "_area", lambda folder: None)
     monkeypatch.setattr(_pets_two, "_annotated", lambda path, area, frames: truth)
     monkeypatch.setattr(_pets_two, "follow", lambda folder, views, *more: lost if views == (6,) else one)
-    metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False)
+    metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False, seed=0)
     value = {name: metric.value for name, metric in metrics.items()}
     for suffix in ("_two", "_one", "_two_refit", "_one_refit"):
         assert (value[f"mota{suffix}"], value[f"idf1{suffix}"], value[f"transfers{suffix}"]) == (100, 50, 1)
         assert (value[f"idf1_merged{suffix}"], value[f"transfers_merged{suffix}"]) == (100, 0)
         assert value[f"id_switches_merged{suffix}"] == 0
+
+
+def test_scores_of_two_views_are_means_over_runs_with_other_grey_levels(monkeypatch, tmp_path):
+    """Each run loses as many of the last positions as the grey levels of its image differ in places."""
+    truth = floor_tracks(range(100), np.full(100, 3), [(float(i), 0.0) for i in range(100)])
+    image = np.full((5, 5, 3), 128, np.uint8)
+    losses = []
+
+    def follow(folder, views, calibration, area, frames, disturb):
+        losses.append(int((disturb(image) != image).sum()))
+        return floor_tracks(*(column[: 100 - losses[-1]] for column in truth))
+
+    monkeypatch.setattr(_pets_two, "_area", lambda folder: None)
+    monkeypatch.setattr(_pets_two, "_annotated", lambda path, area, frames: truth)
+    monkeypatch.setattr(_pets_two, "follow", follow)
+    metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False, seed=0)
+    first = losses[: _pets_two.RUNS]
+    assert first[0] == 0
+    assert 0 < first[1] != first[2] > 0
+    np.testing.assert_allclose(metrics["mota_two"].value, 100 - np.mean(first))
+    np.testing.assert_allclose(metrics["mota_least_two"].value, 100 - max(first))
+    assert metrics["mota_most_two"].value == 100
 
 
 @pytest.mark.data
