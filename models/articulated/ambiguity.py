@@ -7,7 +7,6 @@ opposite part along the line of sight; it has the same image exactly where the f
 A = 1. In perspective the line of sight is that of the link's first point.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -50,24 +49,11 @@ class MirroredLink(NamedTuple):
     amplitude: Float[Array, ""]
 
 
-TurnLink = Callable[[Float[Array, " n"], Layout, Index, Index, Float[Array, ""]], Float[Array, " n"]]
-"""`(x, layout, finger, link, angle) -> x`, with a link turned by an angle."""
-
-
 def turn_link(
     x: Float[Array, " n"], layout: Layout, finger: Index, link: Index, angle: Float[Array, ""]
 ) -> Float[Array, " n"]:
     """The state with the joint before a link turned; the links beyond it turn along, as in the paper."""
     return x.at[layout.flexion_index(finger, link)].add(angle)
-
-
-def turn_link_alone(
-    x: Float[Array, " n"], layout: Layout, finger: Index, link: Index, angle: Float[Array, ""]
-) -> Float[Array, " n"]:
-    """The state with a link turned and the next joint turned back, so that the links beyond keep their direction."""
-    joint = layout.flexion_index(finger, link)
-    back = jnp.where(jnp.asarray(link) < LINKS - 1, -angle, 0.0)
-    return x.at[joint].add(angle).at[joint + 1].add(back)
 
 
 def depth_mirrors(x: Float[Array, " n"], hand: ArticulatedHand) -> DepthMirrors:
@@ -87,12 +73,6 @@ def depth_mirror(x: Float[Array, " n"], hand: ArticulatedHand, finger: Index, li
     """The state with one link mirrored in depth by its own joint alone; finger and link counted from 0."""
     change, amplitude = (value[finger, link] for value in depth_mirrors(x, hand))
     return MirroredLink(turn_link(x, hand.layout, finger, link, change), change, amplitude)
-
-
-def depth_mirror_alone(x: Float[Array, " n"], hand: ArticulatedHand, finger: Index, link: Index) -> MirroredLink:
-    """As `depth_mirror`, with the next joint turned back, so that the links beyond keep their direction."""
-    change, amplitude = (value[finger, link] for value in depth_mirrors(x, hand))
-    return MirroredLink(turn_link_alone(x, hand.layout, finger, link, change), change, amplitude)
 
 
 def shows_length(x: Float[Array, " n"], hand: ArticulatedHand) -> Bool[Array, "fingers 3"]:
@@ -119,13 +99,7 @@ def mirror_trigger(x: Float[Array, " n"], std: Float[Array, " n"], hand: Articul
 
 
 def separated_points(
-    x: Float[Array, " n"],
-    std: Float[Array, " n"],
-    hand: ArticulatedHand,
-    finger: Index,
-    link: Index,
-    *,
-    turn: TurnLink = turn_link,
+    x: Float[Array, " n"], std: Float[Array, " n"], hand: ArticulatedHand, finger: Index, link: Index
 ) -> Float[Array, "2 n"]:
     """Where to linearise for the two poses of a link: first on the side of `x`, then on the mirrored side.
 
@@ -137,7 +111,7 @@ def separated_points(
     half = jnp.maximum(0.5 * jnp.abs(change), jnp.minimum(sigma, LARGEST_SEPARATION))
     half = jnp.where(change < 0, -half, half)
     turns = (0.5 * change - half, 0.5 * change + half)
-    return jnp.stack([turn(x, hand.layout, finger, link, angle) for angle in turns])
+    return jnp.stack([turn_link(x, hand.layout, finger, link, angle) for angle in turns])
 
 
 def reverse_depth(x: Float[Array, " n"], hand: ArticulatedHand) -> Float[Array, " n"]:

@@ -18,15 +18,12 @@ With the palm to the camera and the fingers up, z points to the right of the ima
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
-
-from jaxfilters.math import linalg
 
 LINKS = 3
 """Links of a finger."""
@@ -226,22 +223,3 @@ def white_acceleration_root(
     """
     static = jnp.zeros((layout.size - layout.static.start, layout.num_moving), std.dtype)
     return jnp.concatenate([jnp.diag(0.5 * dt**2 * std), jnp.diag(dt * std), static])
-
-
-def white_acceleration_noise(
-    layout: Layout, std: Float[Array, " m"], dt: float | Float[Array, ""] = 1.0
-) -> Float[Array, "n n"]:
-    """Process noise U [6] of white accelerations, zero for what is constant; arguments as `white_acceleration_root`."""
-    G = white_acceleration_root(layout, std, dt)
-    return linalg.matmul(G, G.T)
-
-
-def check_state(x: Float[Array, "..."], layout: Layout) -> None:
-    """Raise `ValueError` for a (concrete) state of the wrong size, not finite, or with a zero quaternion."""
-    if jnp.shape(x) != (layout.size,):
-        raise ValueError(f"x must be ({layout.size},) for {layout.num_fingers} fingers; got {jnp.shape(x)}.")
-    if not bool(jnp.all(jnp.isfinite(x))):
-        wrong = [name for name, value in zip(layout.names, x, strict=True) if not math.isfinite(value)]
-        raise ValueError(f"x must be finite; it is not in {', '.join(wrong)}.")
-    if not bool(jnp.linalg.norm(x[layout.quaternion]) > 1e-6):
-        raise ValueError(f"the quaternion of x must not be zero; got {x[layout.quaternion]}.")

@@ -150,16 +150,6 @@ def check_geometry(geometry: HandGeometry) -> None:
             raise ValueError(f"geometry.{name} must be positive (metres); its smallest entry is {smallest}.")
 
 
-def check_pose(pose: Float[Array, "..."]) -> None:
-    """Raise `ValueError` for a (concrete) pose that is not (22,), not finite, or has a zero quaternion."""
-    if jnp.shape(pose) != (POSE_SIZE,):
-        raise ValueError(f"pose must be ({POSE_SIZE},): position, quaternion, 15 angles; got {jnp.shape(pose)}.")
-    if not bool(jnp.all(jnp.isfinite(pose))):
-        raise ValueError("pose must be finite; got NaN or infinity.")
-    if not bool(jnp.linalg.norm(pose[3:7]) > 1e-6):
-        raise ValueError(f"pose[3:7] must be a quaternion (w, x, y, z) of unit norm; got {pose[3:7]}.")
-
-
 @jax.jit
 def open_palm(position: Float[Array, " 3"]) -> Float[Array, " 22"]:
     """The pose (22,) with the palm to the camera, fingers up and straight, wrist at `position` (metres)."""

@@ -8,14 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxfilters.models.articulated.ambiguity import (
     depth_mirror,
-    depth_mirror_alone,
     depth_mirrors,
     mirror_trigger,
     reversal_trigger,
     reverse_depth,
     separated_points,
     shows_length,
-    turn_link_alone,
 )
 from jaxfilters.models.articulated.hand import articulated_hand
 from jaxfilters.models.articulated.kinematics import pivot_wrist
@@ -90,31 +88,13 @@ def test_palm_to_the_camera_without_abduction_has_the_same_image():
 
 
 @pytest.mark.system
-def test_links_beyond_keep_their_direction_if_asked():
-    hand = articulated_hand(Layout(2))
-    x = hand_state([0, 30, 25, 15, 0, 20, 30, 10])
-    for link in range(3):
-        along, alone = depth_mirror(x, hand, 1, link), depth_mirror_alone(x, hand, 1, link)
-        before = link_vectors(hand, x)[1]
-        expected = before.copy()
-        expected[link, 2] *= -1
-        np.testing.assert_allclose(link_vectors(hand, alone.x)[1], expected, atol=1e-12)
-        np.testing.assert_allclose(observed(hand, alone.x), observed(hand, x), atol=1e-10)
-        np.testing.assert_array_equal(alone.change, along.change)
-        angles = np.asarray(alone.x - along.x)
-        changed = [hand.layout.names[i] for i in np.flatnonzero(angles)]
-        assert changed == ([f"theta_2{link + 2}"] if link < 2 else [])
-
-
-@pytest.mark.system
 def test_indices_may_be_traced(random_state):
     hand = articulated_hand(Layout(2))
     x = jnp.asarray(random_state(np.random.default_rng(1), hand.layout))
     fingers, links = jnp.array(LINKS).T
-    for mirror in (depth_mirror, depth_mirror_alone):
-        mapped = jax.jit(jax.vmap(lambda i, j, mirror=mirror: mirror(x, hand, i, j).x))(fingers, links)
-        for row, (finger, link) in zip(mapped, LINKS, strict=True):
-            np.testing.assert_allclose(row, mirror(x, hand, finger, link).x, atol=1e-12)
+    mapped = jax.jit(jax.vmap(lambda i, j: depth_mirror(x, hand, i, j).x))(fingers, links)
+    for row, (finger, link) in zip(mapped, LINKS, strict=True):
+        np.testing.assert_allclose(row, depth_mirror(x, hand, finger, link).x, atol=1e-12)
 
 
 @pytest.mark.system
@@ -166,8 +146,6 @@ def test_linearisation_points_lie_on_both_sides_of_the_middle(theta, sigma_deg, 
     found = np.asarray(separated_points(x, sigma, hand, 0, 0))
     np.testing.assert_allclose(np.rad2deg(found[:, 7]), [np.sign(theta) * half, -np.sign(theta) * half], atol=1e-10)
     np.testing.assert_array_equal(np.delete(found, 7, axis=1), np.stack([np.delete(x, 7)] * 2))
-    alone = np.asarray(separated_points(x, sigma, hand, 0, 0, turn=turn_link_alone))
-    np.testing.assert_allclose(alone[:, 7] + alone[:, 8], np.full(2, np.deg2rad(theta)), atol=1e-12)
 
 
 def test_linearisation_points_are_apart_at_the_critical_angle_itself():

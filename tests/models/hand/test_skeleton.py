@@ -11,7 +11,6 @@ from jaxfilters.models.hand.skeleton import (
     PART_NAMES,
     anatomical_hand,
     check_geometry,
-    check_pose,
     forward_kinematics,
     hand_center,
     hand_geometry,
@@ -212,19 +211,6 @@ def test_limits_follow_the_order_of_the_angles():
 
 
 @pytest.mark.parametrize(
-    ("pose", "message"),
-    [
-        (jnp.zeros(21), r"pose must be \(22,\)"),
-        (jnp.zeros(22), "quaternion"),
-        (open_palm(jnp.array([0.0, jnp.nan, 0.7])), "finite"),
-    ],
-)
-def test_bad_poses_are_refused(pose, message):
-    with pytest.raises(ValueError, match=message):
-        check_pose(pose)
-
-
-@pytest.mark.parametrize(
     ("field", "value", "message"),
     [
         ("lengths", jnp.zeros((5, 3)), "lengths must be positive"),
@@ -239,8 +225,7 @@ def test_bad_geometry_is_refused(field, value, message):
         check_geometry(replace(hand_geometry(), **{field: value}))
 
 
-def test_the_default_pose_and_geometry_are_accepted():
-    check_pose(open_palm(jnp.array([0.0, 0.09, 0.7])))
+def test_the_default_geometry_is_accepted():
     check_geometry(hand_geometry())
 
 

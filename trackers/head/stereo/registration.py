@@ -71,21 +71,6 @@ def register(
     return _registration(images, rig, world, np.eye(3), num_modes)
 
 
-def register_anatomical(
-    images: UInt8[np.ndarray, "C rows cols"],
-    points: Float[np.ndarray, "K 2"],
-    rig: CameraRig,
-    *,
-    num_modes: int = 0,
-) -> Registration:
-    """Face whose model frame has its own axes: x through the eyes, z normal to the plane of eyes and mouth.
-
-    Arguments and errors are those of `register`.
-    """
-    world = _triangulated(images, points, rig)
-    return _registration(images, rig, world, face_axes(world), num_modes)
-
-
 def register_monocular(
     image: UInt8[np.ndarray, "rows cols"],
     points: Float[np.ndarray, "K 2"],
