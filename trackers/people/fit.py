@@ -48,8 +48,9 @@ a person 40 m from a low camera with a standard deviation of one or two metres, 
 MOST_SHIFT_M = 0.2
 """A reading along a direction in which the score is flat is no farther than this from where the search ended."""
 PASSES = 2
-NEAR_M = 1.5
-"""Two who are nearer may be one."""
+NEAR_M, BESIDE_M = 1.5, 0.6
+"""Two who are nearer on the floor may be one, and two of whom the nearer to a camera is less than the second of these
+from its line of sight to the other: under a small angle, a silhouette fits to places that are metres apart."""
 BETWEEN = 5
 """Places from one to the other at which one alone is tried."""
 
@@ -79,7 +80,7 @@ class Fit(NamedTuple):
     flatness: Float[Array, " slots"]
     surplus: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel that a person explains which the nearest senior could not explain alone, in
-    the best place for that; `inf` without a senior near by."""
+    the best place for that; `inf` without a senior near by, on the floor or in an image."""
     shares_in_view: Float[Array, "slots cameras"]
     """Of the silhouette, how much lies in each image and before furniture, whoever else may be there."""
     crowding: Float[Array, "slots cameras"]
@@ -241,8 +242,12 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
 
 
 def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, score):
-    """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best."""
-    apart = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
+    """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best.
+
+    The nearest is so on the floor or in an image.
+    """
+    on_floor = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
+    apart = jnp.minimum(on_floor, _beside(scene, places[:, :2], places[k, :2]) * NEAR_M / BESIDE_M)
     apart = jnp.where(active & (seniority > seniority[k]), apart, jnp.inf)
     senior = jnp.argmin(apart)
 
@@ -259,6 +264,19 @@ def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, 
         return score - (jnp.max(values) - with_k) / scene.config.independent_patches
 
     return jax.lax.cond(apart[senior] < NEAR_M, alone, lambda: jnp.full_like(score, jnp.inf))
+
+
+def _beside(scene, places, place):
+    """Metres from the nearer of two places to the line of sight to the other, for the camera where it is least."""
+
+    def in_camera(center):
+        to_places, to_place = places - center, place - center
+        distances, distance = jnp.linalg.norm(to_places, axis=-1), jnp.linalg.norm(to_place)
+        sine = jnp.abs(to_places[:, 0] * to_place[1] - to_places[:, 1] * to_place[0]) / (distances * distance + 1e-6)
+        is_ahead = dot(to_places, to_place) > 0
+        return jnp.where(is_ahead, sine * jnp.minimum(distances, distance), jnp.inf)
+
+    return jnp.min(jax.vmap(in_camera)(scene.centers()), axis=0)
 
 
 class Readings(NamedTuple):

@@ -99,7 +99,8 @@ def found(camera, draw, floor):
     def run(order, shown=frame):
         mean = np.zeros((SLOTS, STATE), np.float32)
         for slot, k in order.items():
-            mean[slot, :6] = [*(PLACES[k][:2] + OFF_M[k]), 0, 0, 1.72, 0.45]
+            at = PLACES[k][:2] + OFF_M[k] if isinstance(k, int) else k
+            mean[slot, :6] = [*at, 0, 0, 1.72, 0.45]
         sd = np.array([0.15, 0.15, 0.5, 0.5, 0.05, 0.05, 0.1, 0.1, 0.1], np.float32)
         belief = Gaussian(jnp.asarray(mean), jnp.broadcast_to(jnp.diag(sd**2), (SLOTS, STATE, STATE)))
         active = jnp.array([slot in order for slot in range(SLOTS)])
@@ -172,6 +173,16 @@ def test_two_in_one_silhouette_are_one(found):
     assert np.isinf(fit.surplus[0])
     assert fit.surplus[1] < 0.5
     assert np.isinf(run({0: 0, 1: 1}).surplus[0])
+
+
+def test_two_in_line_with_the_camera_are_one_though_metres_apart(found, camera):
+    """A junior two metres behind the only person; one who is as far to the side is nobody whom the senior explains."""
+    run, *_ = found
+    away = np.array(PLACES[0][:2]) - np.asarray(camera.position())[:2]
+    away /= np.linalg.norm(away)
+    behind, aside = PLACES[0][:2] + 2 * away, PLACES[0][:2] + 2 * away[::-1] * (-1, 1)
+    assert run({0: 0, 1: behind}).surplus[1] < 0.5
+    assert np.isinf(run({0: 0, 1: aside}).surplus[1])
 
 
 def test_without_an_image_nothing_is_said(found):
