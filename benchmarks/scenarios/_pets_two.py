@@ -15,7 +15,9 @@ from jaxfilters.benchmarks.multi_object import FloorTracks, MultiObjectScores, e
 from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._grey_levels import Disturbance, disturbances
 from jaxfilters.benchmarks.scenarios._pets import merged, merged_metrics
-from jaxfilters.trackers.io.cameras import open_camera
+from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
+from jaxfilters.models.floor_camera import FloorCamera
+from jaxfilters.trackers.io.cameras import CameraFile, open_camera
 from jaxfilters.trackers.io.errors import InputError
 from jaxfilters.trackers.io.scenes import furniture_of, open_scene
 from jaxfilters.trackers.io.video_input import VideoFile
@@ -31,14 +33,19 @@ CALIBRATION_ERROR = 0.005
 """Both are known to disagree by decimetres; chosen on frames 0 to 199."""
 QUICK_FRAMES = 40
 RUNS, QUICK_RUNS = 3, 1
+LOW_VIEW = 6
+"""Of a camera 2.2 m above the floor."""
+MIDDLE_M = 0.9
+"""Height of the middle of a body."""
 
 
 def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool, seed: int) -> dict[str, Metric]:
     """Scores with both cameras, and of the better one alone (the one of larger MOTA), for each calibration.
 
     They are means over runs between which the grey levels of the images differ by one; `mota_least` and `mota_most` are
-    the worst and the best of these runs. `_merged` metrics count people who return under another identity as the same
-    (`_pets.RETURNED_AS`).
+    the worst and the best of these runs. `_low_view` are scores of the view of a low camera alone, against the people
+    in its image, and `_low_view_simple` of blobs in that view, projected to the floor. `_merged` metrics count people
+    who return under another identity as the same (`_pets.RETURNED_AS`).
 
     Args:
         folder: `pets09_s2l1_two_views`.
@@ -72,7 +79,27 @@ def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool, seed: int
             mota = [one.mota for one in scores[views]]
             metrics[f"mota_least{name}{suffix}"] = Metric(min(mota), "%", "higher")
             metrics[f"mota_most{name}{suffix}"] = Metric(max(mota), "%", "higher")
+        metrics |= _low_view(folder, calibration, annotated, tracks[(LOW_VIEW,)], area, frames, suffix)
     return metrics
+
+
+def _low_view(folder, calibration, annotated, tracks, area, frames, suffix) -> dict[str, Metric]:
+    try:
+        camera = _camera(folder, LOW_VIEW, calibration)
+    except InputError as error:
+        raise RecordingError(str(error)) from error
+    true = in_image(annotated, camera.camera)
+    simple = evaluate(true, blobs(folder, LOW_VIEW, camera, area, frames))
+    sys.stderr.write(f"  blobs in view {LOW_VIEW}, {calibration}: {simple}\n")
+    metrics = _means([_metrics(evaluate(true, run), f"_low_view{suffix}") for run in tracks])
+    return metrics | _metrics(simple, f"_low_view_simple{suffix}")
+
+
+def in_image(tracks: FloorTracks, camera: FloorCamera) -> FloorTracks:
+    """The rows whose middle of the body is in the image."""
+    uv, depth = (np.asarray(leaf) for leaf in camera.project(np.insert(tracks.xy_m, 2, MIDDLE_M, axis=1)))
+    is_inside = (depth > 0) & np.all((uv >= 0) & (uv <= np.array(camera.shape[::-1]) - 1), axis=1)
+    return FloorTracks(*(column[is_inside] for column in tracks))
 
 
 def _means(runs: list[dict[str, Metric]]) -> dict[str, Metric]:
@@ -97,10 +124,7 @@ def follow(
         RecordingError: The recordings cannot be read.
     """
     try:
-        files = [
-            open_camera(folder / f"cam{view}_{calibration}.json", image_size=(768, 576))  # of both videos
-            for view in views
-        ]
+        files = [_camera(folder, view, calibration) for view in views]
         described = open_scene(folder / "scene.json")
         videos = [VideoFile(folder / f"View_{view:03d}.mp4", FRAMES_PER_SECOND) for view in views]
         # Outlines of furniture are drawn on view 1, camera 0 of the scene.
@@ -125,6 +149,31 @@ def follow(
         for identity, track in session.tracks.smoothed().items()
         for one in track
     ]
+    return _inside(rows, area)
+
+
+def blobs(folder: Path, view: int, file: CameraFile, area: np.ndarray, frames: tuple[int, int]) -> FloorTracks:
+    """What the simplest method finds in one view: blobs, projected to the floor and linked.
+
+    Raises:
+        RecordingError: The recordings cannot be read.
+    """
+    try:
+        video = VideoFile(folder / f"View_{view:03d}.mp4", FRAMES_PER_SECOND)
+    except InputError as error:
+        raise RecordingError(str(error)) from error
+    straight = file.undistortion.apply
+    empty = np.median(np.stack([straight(image) for image in video.sample(PRIMING_IMAGES)]), axis=0).astype(np.uint8)
+    images = (straight(image) for _, image in itertools.islice(video.images(), frames[0], frames[1] + 1))
+    return _inside([(frames[0] + row[0], *row[1:]) for row in followed_blobs(images, empty, file.camera)], area)
+
+
+def _camera(folder: Path, view: int, calibration: str) -> CameraFile:
+    return open_camera(folder / f"cam{view}_{calibration}.json", image_size=(768, 576))  # of both videos
+
+
+def _inside(rows: list[tuple], area: np.ndarray) -> FloorTracks:
+    """Of frame, identity, X and Y in metres; places within the area."""
     table = np.array(rows, float).reshape(-1, 4)
     inside = np.all((table[:, 2:] >= area[0]) & (table[:, 2:] <= area[1]), axis=-1)
     return floor_tracks(table[:, 0], table[:, 1], table[:, 2:], in_area=inside)

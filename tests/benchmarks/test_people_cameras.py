@@ -110,6 +110,7 @@ def test_the_better_view_is_scored_with_merged_identities_as_well(monkeypatch, t
     lost = one._replace(frame=one.frame[:4], identity=one.identity[:4], xy_m=one.xy_m[:4])
     monkeypatch.setattr(_pets_two, "_area", lambda folder: None)
     monkeypatch.setattr(_pets_two, "_annotated", lambda path, area, frames: truth)
+    monkeypatch.setattr(_pets_two, "_low_view", lambda *_: {})
     monkeypatch.setattr(_pets_two, "follow", lambda folder, views, *more: lost if views == (6,) else one)
     metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False, seed=0)
     value = {name: metric.value for name, metric in metrics.items()}
@@ -131,6 +132,7 @@ def test_scores_of_two_views_are_means_over_runs_with_other_grey_levels(monkeypa
 
     monkeypatch.setattr(_pets_two, "_area", lambda folder: None)
     monkeypatch.setattr(_pets_two, "_annotated", lambda path, area, frames: truth)
+    monkeypatch.setattr(_pets_two, "_low_view", lambda *_: {})
     monkeypatch.setattr(_pets_two, "follow", follow)
     metrics = _pets_two.two_view_metrics(tmp_path, tmp_path, quick=False, seed=0)
     first = losses[: _pets_two.RUNS]
@@ -139,6 +141,19 @@ def test_scores_of_two_views_are_means_over_runs_with_other_grey_levels(monkeypa
     np.testing.assert_allclose(metrics["mota_two"].value, 100 - np.mean(first))
     np.testing.assert_allclose(metrics["mota_least_two"].value, 100 - max(first))
     assert metrics["mota_most_two"].value == 100
+
+
+def test_people_outside_the_image_do_not_count():
+    """The middles of their bodies are in the middle of the image, left of it, below it, in a corner, and behind it."""
+    camera = demo_room(0, frames=1).cameras[0]
+    (rows, cols), P = camera.shape, np.asarray(camera.P, float)
+    pixels = np.array([[cols / 2, rows / 2], [-2, rows / 2], [cols / 2, rows + 1], [cols - 2, rows - 2]])
+    homography = np.stack([P[:, 0], P[:, 1], P[:, 2] * _pets_two.MIDDLE_M + P[:, 3]], axis=1)
+    places = np.linalg.solve(homography, np.pad(pixels, ((0, 0), (0, 1)), constant_values=1).T).T
+    behind = 2 * np.asarray(camera.position())[:2] - places[0, :2] / places[0, 2]
+    xy = np.vstack([places[:, :2] / places[:, 2:], behind])
+    kept = _pets_two.in_image(floor_tracks(np.zeros(5), range(5), xy), camera)
+    assert kept.identity.tolist() == [0, 3]
 
 
 @pytest.mark.data

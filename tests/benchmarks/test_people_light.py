@@ -105,6 +105,7 @@ def test_two_cameras_are_judged_beside_the_better_one(tmp_path, monkeypatch):
         kept = np.arange(40)[:: {(1, 6): 1, (1,): 2, (6,): 4}[views]]
         return floor_tracks(kept, np.full(len(kept), 8), np.stack([0.1 * kept + 0.1, np.full(len(kept), 2.0)], -1))
 
+    monkeypatch.setattr(_pets_two, "_low_view", lambda *_: {})
     monkeypatch.setattr(_pets_two, "follow", follow)
     value = {k: m.value for k, m in _pets_two.two_view_metrics(tmp_path, tmp_path, quick=True, seed=0).items()}
     assert value["mota_two"] == pytest.approx(100)

@@ -78,6 +78,9 @@ class Fit(NamedTuple):
     shares_seen: Float[Array, "slots cameras"]
     """Of the silhouette, how much each camera shows."""
     flatness: Float[Array, " slots"]
+    superfluous: Int32[Array, " slots"]
+    """Slot of a person or of the nearest senior: who of the two would be one too many, if one of them explained nearly
+    all. The senior is where that one would have to stand far from the senior's place, near the person's."""
     surplus: Float[Array, " slots"]
     """Mean log likelihood ratio a pixel that a person explains which the nearest senior could not explain alone, in
     the best place for that; `inf` without a senior near by, on the floor or in an image."""
@@ -212,7 +215,7 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
             shifts[k],
             shares_seen(scene, places[k], mine, unexplained),
             scores[middle] - jnp.maximum(scores[-2], scores[-1]),
-            _surplus(scene, places, detected, active, seniority, views, axes, steps, k, scores[middle]),
+            *_surplus(scene, places, detected, active, seniority, views, axes, steps, k, scores[middle]),
             shares_seen(scene, places[k], mine, jnp.ones_like(unexplained)),
             crowding(scene, places[k], mine, unexplained),
             detected[k],
@@ -231,6 +234,7 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
         jnp.zeros((n, cameras, 2)),
         jnp.zeros((n, cameras)),
         jnp.zeros(n),
+        jnp.arange(n, dtype=jnp.int32),
         jnp.full(n, jnp.inf),
         jnp.zeros((n, cameras)),
         jnp.zeros((n, cameras)),
@@ -242,9 +246,10 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
 
 
 def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, score):
-    """What k explains beyond what the nearest senior could explain in k's absence, from wherever that is best.
+    """Who is one too many, and what k explains beyond what the nearest senior could explain in k's absence.
 
-    The nearest is so on the floor or in an image.
+    That is from wherever it is best, between both places; the nearest is so on the floor or in an image. A senior who
+    would have to be far away, near k, has a wrong place, which the search within reach does not leave.
     """
     on_floor = jnp.linalg.norm(places[:, :2] - places[k, :2], axis=-1)
     apart = jnp.minimum(on_floor, _beside(scene, places[:, :2], places[k, :2]) * NEAR_M / BESIDE_M)
@@ -261,9 +266,14 @@ def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, 
         candidates = places[senior] + with_stride((between[:, None] + offsets).reshape(-1, 4))
         values = jax.vmap(log_likelihood, in_axes=(None, 0, None, None))(scene, candidates, theirs, contrasts)
         with_k = log_likelihood(scene, places[senior], theirs, contrasts)
-        return score - (jnp.max(values) - with_k) / scene.config.independent_patches
+        is_nearer_k = jnp.argmax(values) // len(offsets) > BETWEEN // 2
+        superfluous = jnp.where(is_nearer_k & (on_floor[senior] > NEAR_M), senior, k).astype(jnp.int32)
+        return superfluous, score - (jnp.max(values) - with_k) / scene.config.independent_patches
 
-    return jax.lax.cond(apart[senior] < NEAR_M, alone, lambda: jnp.full_like(score, jnp.inf))
+    def nobody_near():
+        return jnp.asarray(k, jnp.int32), jnp.full_like(score, jnp.inf)
+
+    return jax.lax.cond(apart[senior] < NEAR_M, alone, nobody_near)
 
 
 def _beside(scene, places, place):

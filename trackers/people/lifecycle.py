@@ -61,6 +61,8 @@ HIDDEN_COST = 0.5
 """Log odds per second lost by a person of whom nothing is visible: people can be hidden, but not for ever."""
 LEAST_SURPLUS = 0.5
 """Mean log likelihood ratio a pixel in view that two people explain beyond what one of them explains alone."""
+MOST_GAIN = 2.0
+"""Log odds a frame: the most that a person loses to a candidate who explains the same silhouette better."""
 SUPERFLUOUS_COST = 2.0
 """Log odds per second lost by a person who is all in view and explains less than that."""
 AWAY_SD = 2.0
@@ -255,13 +257,7 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     config, active = scene.config, is_active(people.mode)
     hidden = fit.share_seen < HIDDEN_SHARE
     change = jnp.where(hidden, -HIDDEN_COST * dt, jnp.clip(fit.score, -2.0, 1.0))
-    # A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
-    # not speak for nobody: of a person who is tracked, less is expected, and less follows. Holes do not either.
-    tracked, in_view = people.mode == TRACKED, fit.share_in_view
-    superfluous = fit.surplus < LEAST_SURPLUS * jnp.where(tracked, in_view * fit.detectability, 1.0)
-    a_second = HIDDEN_COST + (SUPERFLUOUS_COST - HIDDEN_COST) * in_view
-    cost = jnp.where(tracked, a_second * dt, LEAST_SURPLUS - fit.surplus)
-    change = jnp.where(superfluous, jnp.minimum(change, -cost), change) * looked
+    change = jnp.minimum(change, -_costs_of_pairs(people.mode == TRACKED, fit, dt)) * looked
     log_odds = jnp.where(active, jnp.minimum(people.log_odds + change, MOST_LOG_ODDS), people.log_odds)
     unseen = jnp.where(active & ~hidden & looked, 0.0, people.unseen_s + dt)
     sd = _largest_sd(people.belief.covariance[:, :2, :2])
@@ -274,6 +270,23 @@ def existence(scene: PeopleScene, people: People, fit: Fit, dt: Float[Array, ""]
     mode = jnp.where((mode == DORMANT) & (unseen > config.memory_s + config.hidden_s), FREE, mode)
     mode = jnp.where((mode == TENTATIVE) & (log_odds > config.confirmed), TRACKED, mode)
     return people._replace(log_odds=log_odds, unseen_s=unseen, mode=mode)
+
+
+def _costs_of_pairs(is_tracked: Bool[Array, " slots"], fit: Fit, dt: Float[Array, ""]) -> Float[Array, " slots"]:
+    """Log odds lost by each person who is one too many of two; minus infinity, that is nothing, by all others.
+
+    A person whom one other person explains as well is hidden behind that person, or nobody. What furniture hides does
+    not speak for nobody: of a person who is tracked, less is expected, and less follows. Holes do not either. A senior
+    whose silhouette a candidate explains better from elsewhere loses the evidence that speaks for the candidate.
+    """
+    slots, in_view = jnp.arange(len(is_tracked)), fit.share_in_view
+    one_suffices = fit.surplus < LEAST_SURPLUS * jnp.where(is_tracked, in_view * fit.detectability, 1.0)
+    a_second = (HIDDEN_COST + (SUPERFLUOUS_COST - HIDDEN_COST) * in_view) * dt
+    of_junior = jnp.where(is_tracked, a_second, LEAST_SURPLUS - fit.surplus)
+    gain = jnp.clip(fit.score - fit.surplus, 0.0, MOST_GAIN)
+    of_senior = jnp.maximum(a_second, jnp.where(is_tracked, 0.0, gain)[:, None])  # of each pair, by slot of the senior
+    cost = jnp.where(jnp.eye(len(slots), dtype=bool), of_junior[:, None], of_senior)
+    return jnp.max(jnp.where(one_suffices[:, None] & (fit.superfluous[:, None] == slots), cost, -jnp.inf), axis=0)
 
 
 def _largest_sd(covariance: Float[Array, "slots 2 2"]) -> Float[Array, " slots"]:

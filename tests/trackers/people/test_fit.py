@@ -37,9 +37,11 @@ def parabolas(seed, n):
     quadratic = Quadratic(none[:, None], jnp.asarray(gradient)[:, None], jnp.asarray(curvature)[:, None])
     steps = jnp.broadcast_to(jnp.array([0.12, 0.06, 0.06, 0.05]), (len(place), 4))
     place, axes, shift = jnp.asarray(place), jnp.asarray(axes), jnp.zeros((n, 1, 2))
-    share = none[:, None]
+    share, slots = none[:, None], jnp.arange(n)
     return (
-        Fit(place, shift[:, 0], axes, steps, quadratic, none, shift, share, none, none, share, share, none, share),
+        Fit(
+            place, shift[:, 0], axes, steps, quadratic, none, shift, share, none, slots, none, share, share, none, share
+        ),
         mean,
         precision,
     )
@@ -181,7 +183,10 @@ def test_two_in_line_with_the_camera_are_one_though_metres_apart(found, camera):
     away = np.array(PLACES[0][:2]) - np.asarray(camera.position())[:2]
     away /= np.linalg.norm(away)
     behind, aside = PLACES[0][:2] + 2 * away, PLACES[0][:2] + 2 * away[::-1] * (-1, 1)
-    assert run({0: 0, 1: behind}).surplus[1] < 0.5
+    junior, senior = run({0: 0, 1: behind}), run({0: behind, 1: 0})
+    for fit, superfluous in ((junior, 1), (senior, 0)):
+        assert fit.surplus[1] < 0.5
+        assert fit.superfluous[1] == superfluous
     assert np.isinf(run({0: 0, 1: aside}).surplus[1])
 
 
