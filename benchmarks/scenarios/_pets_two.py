@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfilters.benchmarks.metrics import Metric
@@ -97,7 +98,7 @@ def _low_view(folder, calibration, annotated, tracks, area, frames, suffix) -> d
 
 def in_image(tracks: FloorTracks, camera: FloorCamera) -> FloorTracks:
     """The rows whose middle of the body is in the image."""
-    uv, depth = (np.asarray(leaf) for leaf in camera.project(np.insert(tracks.xy_m, 2, MIDDLE_M, axis=1)))
+    uv, depth = (np.asarray(leaf) for leaf in camera.project(jnp.asarray(np.insert(tracks.xy_m, 2, MIDDLE_M, axis=1))))
     is_inside = (depth > 0) & np.all((uv >= 0) & (uv <= np.array(camera.shape[::-1]) - 1), axis=1)
     return FloorTracks(*(column[is_inside] for column in tracks))
 
@@ -164,7 +165,8 @@ def blobs(folder: Path, view: int, file: CameraFile, area: np.ndarray, frames: t
         raise RecordingError(str(error)) from error
     straight = file.undistortion.apply
     empty = np.median(np.stack([straight(image) for image in video.sample(PRIMING_IMAGES)]), axis=0).astype(np.uint8)
-    images = (straight(image) for _, image in itertools.islice(video.images(), frames[0], frames[1] + 1))
+    moments: Iterator = itertools.islice(video.images(), frames[0], frames[1] + 1)
+    images = (straight(image) for _, image in moments)
     return _inside([(frames[0] + row[0], *row[1:]) for row in followed_blobs(images, empty, file.camera)], area)
 
 
