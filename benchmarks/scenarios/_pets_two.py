@@ -44,9 +44,9 @@ def two_view_metrics(folder: Path, truth_folder: Path, *, quick: bool, seed: int
     """Scores with both cameras, and of the better one alone (the one of larger MOTA), for each calibration.
 
     They are means over runs between which the grey levels of the images differ by one; `mota_least` and `mota_most` are
-    the worst and the best of these runs. `_low_view` are scores of the view of a low camera alone, against the people
-    in its image, and `_low_view_simple` of blobs in that view, projected to the floor. `_merged` metrics count people
-    who return under another identity as the same (`_pets.RETURNED_AS`).
+    the worst and the best of these runs. `_low_view` are scores of the view of a low camera alone, of places in its
+    image, and `_low_view_simple` of blobs in that view, projected to the floor. `_merged` metrics count people who
+    return under another identity as the same (`_pets.RETURNED_AS`).
 
     Args:
         folder: `pets09_s2l1_two_views`.
@@ -90,9 +90,10 @@ def _low_view(folder, calibration, annotated, tracks, area, frames, suffix) -> d
     except InputError as error:
         raise RecordingError(str(error)) from error
     true = in_image(annotated, camera.camera)
-    simple = evaluate(true, blobs(folder, LOW_VIEW, camera, area, frames))
+    simple = evaluate(true, in_image(blobs(folder, LOW_VIEW, camera, area, frames), camera.camera))
     sys.stderr.write(f"  blobs in view {LOW_VIEW}, {calibration}: {simple}\n")
-    metrics = _means([_metrics(evaluate(true, run), f"_low_view{suffix}") for run in tracks])
+    scores = [evaluate(true, in_image(run, camera.camera)) for run in tracks]
+    metrics = _means([_metrics(one, f"_low_view{suffix}") for one in scores])
     return metrics | _metrics(simple, f"_low_view_simple{suffix}")
 
 
