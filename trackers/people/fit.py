@@ -223,8 +223,15 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
         )
         return jax.tree.map(lambda all_fits, one_fit: all_fits.at[k].set(one_fit), fits, fit)
 
-    n, cameras = len(places), len(scene.cameras)
-    empty = Fit(
+    empty = _unfitted(places, axes, steps, readings, len(scene.cameras))
+    order = jnp.argsort(~active)
+    return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
+
+
+def _unfitted(places, axes, steps, readings: int, cameras: int) -> Fit:
+    """Of people of whom the images say nothing."""
+    n = len(places)
+    return Fit(
         places[:, : STRIDE.start],
         places[:, STRIDE],
         axes,
@@ -241,8 +248,6 @@ def _curvature(scene, places, shifts, detectability, active, seniority, views, a
         jnp.ones(n),
         jnp.zeros((n, len(DETECTABILITIES))),
     )
-    order = jnp.argsort(~active)
-    return jax.lax.fori_loop(0, jnp.sum(active), lambda turn, fits: one(order[turn], fits), empty)
 
 
 def _surplus(scene, places, detected, active, seniority, views, axes, steps, k, score):
