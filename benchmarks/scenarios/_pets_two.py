@@ -17,6 +17,7 @@ from jaxfilters.benchmarks.recordings import RecordingError
 from jaxfilters.benchmarks.scenarios._grey_levels import Disturbance, disturbances
 from jaxfilters.benchmarks.scenarios._pets import merged, merged_metrics
 from jaxfilters.benchmarks.scenarios._simplest import followed_blobs
+from jaxfilters.benchmarks.scenarios.people_pets import positions
 from jaxfilters.models.floor_camera import FloorCamera
 from jaxfilters.trackers.io.cameras import CameraFile, open_camera
 from jaxfilters.trackers.io.errors import InputError
@@ -146,12 +147,7 @@ def follow(
     for i, moment in enumerate(itertools.islice(moments, first, last + 1)):
         images = [file.undistortion.apply(disturb(image)) for file, (_, image) in zip(files, moment, strict=True)]
         session.process(images, i / FRAMES_PER_SECOND)
-    rows = [
-        (first + one.frame, identity, *one.mean[:2])
-        for identity, track in session.tracks.smoothed().items()
-        for one in track
-    ]
-    return _inside(rows, area)
+    return _inside([(first + row[0], *row[1:]) for row in positions(session.tracks.smoothed())], area)
 
 
 def blobs(folder: Path, view: int, file: CameraFile, area: np.ndarray, frames: tuple[int, int]) -> FloorTracks:
